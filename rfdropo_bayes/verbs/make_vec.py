@@ -28,9 +28,13 @@ from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
-from rfdropo_bayes.robots import OBJECT
+from rfdropo_bayes.robots import OBJECT, Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import changed, parse_table
+
+LONGER = 0.15
+"""Of a task's robot, how much longer or shorter one may be that takes its goals: these are 115 to 150 mm from the base
+of a trunk whose tip rests at 184 mm, so that an arm of 166 to 224 mm ends 7 to 100 mm beyond them."""
 
 
 def make_vec(
@@ -68,7 +72,7 @@ def training_of(model: Model) -> tuple[TrainingTable, Task, AnySimulator]:
     """What [training] says, the task, and the simulator that it is played on.
 
     Raises:
-        InputError: no such table, or a black box without a box of goals of its own, or for a task with a cube.
+        InputError: no such table, or no box of goals for a black box or a robot that is not as long as the task's.
     """
     table = model.settings.training
     if table is None:
@@ -78,13 +82,28 @@ def training_of(model: Model) -> tuple[TrainingTable, Task, AnySimulator]:
     task = task_named(table.task)
     if table.goals is not None:
         task = replace(task, goal_low=table.goals[0], goal_high=table.goals[1])
+    else:
+        _check_length(task, model.robot)
     if isinstance(model.robot, BlackBox):
-        if table.goals is None:
-            remedy = "give goals = [[x, y, z], [x, y, z]] [m]: the task's own are of the paper's trunk"
-            raise InputError("nobody knows where its goals are", where="[training]", remedy=remedy)
         return table, task, build_simulator(model.spec)
     pushing = changed(model.spec.simulator, where="[simulator]", push=task.push)
     return table, task, build_robot_simulator(replace(model.spec, simulator=pushing))
+
+
+def _check_length(task: Task, robot: Robot | BlackBox) -> None:
+    """See that a task's own goals are within the reach of a robot: those of the paper's trunk, which ends in front of
+    them, are no places for an arm that is much longer or shorter.
+
+    Raises:
+        InputError: they are not.
+    """
+    remedy = "give goals = [[x, y, z], [x, y, z]] [m] under [training], the corners of a box; or --goal X,Y,Z"
+    if isinstance(robot, BlackBox):
+        raise InputError("nobody knows where its goals are", where="[training]", remedy=remedy)
+    wanted, own = (float(each.body.station_m[-1]) for each in (Robot.load(task.robot), robot))
+    if abs(own - wanted) > LONGER * wanted:
+        lengths = f"those of a trunk of {1e3 * wanted:.0f} mm, and {robot.name} has {1e3 * own:.0f} mm"
+        raise InputError(f"the goals of {task.name} are {lengths}", where="[training]", remedy=remedy)
 
 
 def episode_settings(table: TrainingTable) -> Settings:

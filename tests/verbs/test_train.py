@@ -15,6 +15,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
+from rfdropo_bayes.robots import Robot
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -36,6 +37,15 @@ def rfdropo(*words: object) -> None:
 
 
 @pytest.mark.slow
+def test_an_arm_of_another_length_needs_goals_of_its_own() -> None:
+    long = Robot.outline(name="long", length=0.3, radius=0.01, markers={"tip": 0.3})
+    with pytest.raises(rb.InputError, match="a trunk of 195 mm, and long has 300 mm"):
+        rb.make_vec("TrunkReach-v0", rb.Model(long), n=1)
+    venv = rb.make_vec("TrunkReach-v0", rb.Model(long), n=1, goals=[[0.0, 0.0, 0.25], [0.02, 0.02, 0.27]])
+    venv.reset()
+    assert 0.25 <= venv.episodes.goal[0, 2] <= 0.27
+
+
 @pytest.mark.parametrize("task", ["TrunkReach-v0", "TrunkPush-v0"])
 def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
