@@ -9,6 +9,7 @@ import numpy as np
 
 from rfdropo_bayes.audit.described import Described, coefficients
 from rfdropo_bayes.audit.gain import noise_distance
+from rfdropo_bayes.audit.inadequacy import POOR
 from rfdropo_bayes.audit.law_search import Refit
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.port_evidence import PortEvidence
@@ -156,6 +157,9 @@ def ports_sentence(answer: Answer) -> str:
     rows = described.found.significant(answer.problem.rules.family)
     if not rows:
         return ""
+    left = answer.extended.residual
+    if left @ left > POOR * np.count_nonzero(left):  # every signal is sure then, and none of the size it is found with
+        return f" Of all ports, a signal at {rows[0].port.name} explains most of it; no law of it holds."
     size = f"{rows[0].amplitude:.2g}" + ("" if rows[0].port.unit == "-" else f" {rows[0].port.unit}")
     others = ", ".join(row.port.name for row in rows[1 : 1 + MOST_TIES])
     beside = f" ({others} explain less)" if others else ""

@@ -73,6 +73,7 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert "What acts, and where" in render_audit(shown(answer), content, "toy", "")
 
 
+@pytest.mark.slow
 def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     """A search whose second term brings nothing: it is the first one again."""
     question = asked(5, Pushed())

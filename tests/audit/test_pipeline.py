@@ -644,7 +644,7 @@ def test_the_recording_that_speaks_against_an_extension_is_named(groups):
     """Groups are to be compared where they have not been."""
     gain = replace(GAIN, elpd_p=None, differences=OPPOSED)
     said = {"validation": SimpleNamespace(gain=gain), "causes": SimpleNamespace(unsupported=[])}
-    answer = SimpleNamespace(adopted=[], problem=SimpleNamespace(groups=groups), **said)
+    answer = SimpleNamespace(adopted=[], problem=SimpleNamespace(compared=groups), **said)
     assert _adoption(answer).startswith(" b is clearly less likely with this (2e+03 mm without, 2.1e+03 mm with it)")
     assert ("otherwise in b: compare groups of recordings with --between" in _doubt(answer)) == (groups is None)
 

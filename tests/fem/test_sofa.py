@@ -77,7 +77,9 @@ def error_mm(position: np.ndarray, recorded: np.ndarray) -> np.ndarray:
     return 1e3 * np.linalg.norm(np.asarray(position) - recorded, axis=2)
 
 
-@pytest.mark.parametrize(("name", "rows"), [("reach_1", 100), ("push_2", 100), ("push_1", 10)])
+@pytest.mark.parametrize(
+    ("name", "rows"), [pytest.param("reach_1", 100, marks=pytest.mark.slow), ("push_2", 100), ("push_1", 10)]
+)
 def test_follows_sofa_to_its_last_digit_before_contact(scene, datasets, name, rows):
     """The trunk of push_2 never meets the cube; that of push_1 does in the eleventh action."""
     command, recorded = recording(datasets, name)

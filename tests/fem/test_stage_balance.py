@@ -40,6 +40,7 @@ def momenta(system, prepared, states) -> np.ndarray:
     return np.asarray(jax.vmap(lambda v: mass_times(system, prepared, v).sum(axis=0))(states.velocity))
 
 
+@pytest.mark.slow
 def test_base_and_weight_change_the_momentum_of_a_body_that_is_let_go(trunk):
     """Slack cables, no drag: in every step, to rounding; and nothing is said to touch it."""
     prepared = fem.prepare(trunk, fem.material(trunk, **SILICONE, rayleigh_stiffness=0.01))

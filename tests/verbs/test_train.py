@@ -46,7 +46,7 @@ def test_an_arm_of_another_length_needs_goals_of_its_own() -> None:
     assert 0.25 <= venv.episodes.goal[0, 2] <= 0.27
 
 
-@pytest.mark.parametrize("task", ["TrunkReach-v0", "TrunkPush-v0"])
+@pytest.mark.parametrize("task", ["TrunkReach-v0", pytest.param("TrunkPush-v0", marks=pytest.mark.slow)])
 def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
     rfdropo("train", REACH, "--out", tmp_path / "policy", *settings)
