@@ -43,7 +43,7 @@ class Effect(NamedTuple):
         torques: what becomes of the torques (step, motor) on their way.
         late: that the camera's clock is behind [s].
         mechanisms: any of which names it; their beginnings.
-        ports: at which a law describes it; their beginnings.
+        ports: where it enters, if no mechanism names it.
     """
 
     change: Callable[[Any], None] = lambda model: None

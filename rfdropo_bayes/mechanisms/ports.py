@@ -134,7 +134,7 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     if robot is None:
         left_out["cables, command delay"] = "the simulator takes no signals"
     else:
-        ports += _of_actuation(channels, getattr(simulator, "command_unit", "m"))
+        ports += _of_actuation(channels, getattr(simulator, "command_unit", "m"), wound=engine is not None)
     gravity, places = (0.0, 0.0, 0.0), 0
     if engine is not None and robot is not None and engine.carries_loads:
         places = len(engine.load_stations)
@@ -147,9 +147,9 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     return PortMap(tuple(ports), left_out, len(channels), places, gravity)
 
 
-def _of_actuation(channels: Sequence[str], unit: str) -> list[Port]:
+def _of_actuation(channels: Sequence[str], unit: str, *, wound: bool) -> list[Port]:
+    """Ports of drives that wind cables, or of the commands of a simulator of one's own."""
     size = 1e-3 if unit == "m" else 0.05
-    wound = unit in ("m", "rad")  # else of a simulator of one's own, whose commands may be forces or torques
     look = "guide, spool and tension of cable {0}, and what it shares with other cables"
     look = look if wound else "the drive of {0}, what it moves, and what it shares with other drives"
     found = [

@@ -98,7 +98,7 @@ class Episodes:
         self.layout = layout_of(task, self.robot, settings.actions, settings.observed, settings.period, settings.step)
         self._specs = {spec.name: spec for spec in simulator.parameters}
         self.randomisation = fitting(randomisation, simulator.parameters)
-        self.session: Session = simulator.session(lanes, settings.period)
+        self.session = Session(simulator, lanes, settings.period)
         self.redrawn = 0
         self.generators = [np.random.default_rng(child) for child in np.random.SeedSequence().spawn(lanes)]
         self.parameters: list[dict[str, float]] = [{} for _ in range(lanes)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,11 +16,11 @@ from rfdropo_bayes.audit.described import NamedModel, describe
 from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
 from rfdropo_bayes.audit.inadequacy import as_measured
 from rfdropo_bayes.audit.law_search import law_search
-from rfdropo_bayes.audit.law_words import law_tables
+from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.mechanisms.ports import port_map
+from rfdropo_bayes.mechanisms.ports import Port, port_map
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.residual_file import residual_dataset
 
@@ -71,6 +72,17 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert float((left.residual_last**2).mean()) < float((left.residual_base**2).mean())
     assert left.signal.sel(port="marker m3 x").shape == (2, left.sizes["signal_time"])
     assert "What acts, and where" in render_audit(shown(answer), content, "toy", "")
+
+
+@pytest.mark.parametrize(("left", "said"), [(1.0, "at marker tip x, of 0.002 m"), (30.0, "at marker tip x explains")])
+def test_a_model_that_is_far_off_is_told_no_size_of_a_signal(left, said):
+    """There every signal is sure, and none of the size that a linear model gives it."""
+    row = SimpleNamespace(port=Port("marker tip x", "sensing", "marker", 0, 0, "m", 1e-3, ""), amplitude=0.002)
+    found = SimpleNamespace(significant=lambda family: [row])
+    causes = SimpleNamespace(described=SimpleNamespace(holds=False, found=found))
+    problem = SimpleNamespace(rules=SimpleNamespace(family=0.02))
+    answer = SimpleNamespace(causes=causes, problem=problem, extended=SimpleNamespace(residual=np.full(9, left)))
+    assert said in ports_sentence(answer)
 
 
 @pytest.mark.slow

@@ -11,6 +11,9 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.policies.episodes import Episodes, Settings
+from rfdropo_bayes.policies.randomisation import Point
+from rfdropo_bayes.policies.tasks import task_named
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
@@ -72,6 +75,12 @@ def test_markers_start_at_the_mean_of_the_guides_and_the_first_stays(sofa):
     assert float(jnp.abs(observation.position[-1, -1] - observation.position[0, -1]).max()) > 1e-3
     assert int(observation.status) == Result.OK
     assert float(observation.tension.max()) > 0.1
+
+
+def test_it_has_no_episodes_and_says_so(sofa):
+    task, settings = task_named("TrunkReach-v0"), Settings()
+    with pytest.raises(InputError, match="a body of tetrahedra does not step"):
+        Episodes(sofa, task, 1, Point({}), settings)
 
 
 @pytest.mark.slow
