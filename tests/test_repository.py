@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import tomllib
@@ -73,6 +74,27 @@ def test_every_dependency_is_pinned_inside_its_range(extra: str | None) -> None:
 
 def test_no_accelerator_packages_are_pinned() -> None:
     assert not [name for name in constraints() if re.search(r"nvidia|cuda|triton|rocm", name)]
+
+
+def test_documents_link_to_what_is_in_git() -> None:
+    """A folder that git ignores is there for its author alone."""
+    texts = dict(tracked_text())
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    files = set(filter(None, listed.stdout.split("\0")))
+    if not files:
+        pytest.skip("this is no checkout, so that nothing says which files are in git")
+    folders = {str(parent) for file in files for parent in Path(file).parents}
+    lost = []
+    for name, text in texts.items():
+        if not name.endswith(".md"):
+            continue
+        for link in re.findall(r"\]\(([^)\s#]+)", re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)):
+            if re.match(r"[a-z]+:", link):
+                continue
+            target = os.path.normpath(Path(name).parent / link)
+            if target not in files | folders:
+                lost.append(f"{name}: {link}")
+    assert not lost
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
