@@ -311,8 +311,8 @@ class LawSearch:
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
-        law = f"{best.term.port.name}: {best.term.feature.formula(names)}"
-        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.name} {where.log_evidence:.1f} nats")
+        law = f"{best.term.port.words}: {best.term.feature.formula(names)}"
+        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
         """Whitened residuals of simulated data sets that lack nothing."""
@@ -380,7 +380,7 @@ class LawSearch:
             better = max(others, key=lambda refit: refit.score, default=best)
             if better.square >= best.square - 2.0:
                 break
-            self.report(f"instead: {better.term.port.name}: {better.term.feature.formula(self.units[0])}")
+            self.report(f"instead: {better.term.port.words}: {better.term.feature.formula(self.units[0])}")
             best = self._climbed(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
         best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
@@ -405,7 +405,7 @@ class LawSearch:
         for row in dict.fromkeys(chosen):
             found = self._refit(known, terms, fit, row)
             refits.append(found)
-            words = f"{row.port.name}: {row.feature.formula(self.units[0])}"
+            words = f"{row.port.words}: {row.feature.formula(self.units[0])}"
             self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
         return sorted(refits, key=lambda refit: -refit.score)
 
