@@ -152,20 +152,33 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     return _distinct_names(recordings, sources)
 
 
-def find_data_file(name: str | Path, base: Path) -> Path:
+def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Path:
     """A file beside the recordings, e.g. a mesh, looked for as they are: in RFDROPO_DATA if set, then in ``base``.
 
+    Args:
+        name: of the file; a pattern that one file alone matches will do.
+        base: folder that it is relative to.
+        folders: whether a folder may stand for the files in it.
+
     Raises:
-        InputError: no such file.
+        InputError: no such file, or a pattern that several match.
     """
-    return find_files(str(name), base)[0]
+    found = find_files(str(name), base, folders=folders)
+    if len(found) > 1:
+        raise InputError(
+            f"matches {len(found)} files ({', '.join(file.name for file in found[:3])}{', ...' if found[3:] else ''}) "
+            "where one is meant",
+            where=str(name),
+            remedy="name the file; where every recording has commands of its own, give an entry for each recording",
+        )
+    return found[0]
 
 
 def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
     for entry in entries:
         commands = None
         if entry.commands not in (None, NO_COMMANDS):
-            commands = find_files(str(entry.commands), base)[0]
+            commands = find_data_file(str(entry.commands), base)
         for match in find_files(entry.observations, base, folders=spec.format in FOLDERS):
             zero = entry.commands == NO_COMMANDS
             for episode in _episodes(spec, entry, match):
@@ -222,14 +235,22 @@ def _check_split(fit: list[_Source], test: list[_Source]) -> None:
 
 
 def _distinct_names(recordings: list[Trajectory], sources: list[_Source]) -> list[Trajectory]:
+    """Recordings of one name are called by as many of the folders that they are in as tell them apart."""
     names = [recording.name for recording in recordings]
-    distinct = []
-    for recording, source in zip(recordings, sources, strict=True):
-        if names.count(recording.name) > 1:
-            recording = recording.with_attributes(name=f"{source.observations.parent.name}/{recording.name}")
-        distinct.append(recording)
-    renamed = [recording.name for recording in distinct]
-    for name in renamed:
-        if renamed.count(name) > 1:
-            raise InputError("is listed twice", where=name, remedy="list each recording once")
-    return distinct
+    called = list(names)
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        places = [place for place, own in enumerate(names) if own == name]
+        folders = [sources[place].observations.absolute().parent.parts[1:] for place in places]
+        for count in range(1, 1 + max(map(len, folders))):
+            told = ["/".join([*parts[-count:], name]) for parts in folders]
+            if len(set(told)) == len(told):
+                break
+        else:
+            twice = next(own for own in told if told.count(own) > 1)
+            raise InputError("is listed twice", where=twice, remedy="list each recording once")
+        for place, own in zip(places, told, strict=True):
+            called[place] = own
+    return [
+        recording if own == recording.name else recording.with_attributes(name=own)
+        for recording, own in zip(recordings, called, strict=True)
+    ]
