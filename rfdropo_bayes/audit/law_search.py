@@ -275,13 +275,17 @@ class LawSearch:
                     break
                 ties = ties if terms else _tied(best, others)
                 judge, fit = judged_anew(best.target, best.fit)
-                terms.append(replace(best, target=judge, fit=fit))
+                anew = judge is not best.target
+                best = replace(best, target=judge, fit=fit)
+                terms.append(best)
                 found, known = under(found, known, judge), judge.on(target.forward)
                 found = _relinearised(known, found, fit)
                 null = self._null(known, fit, found)
                 where = evidences(found, null)
                 afterwards.append(where[0])
                 self._say(best, where[0])
+                if anew and len(terms) == 1:
+                    ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
         except OutOfTime:
             self.report("the time was up before the law was found")
         # The time may be up between a term and what is left beside it.
@@ -445,6 +449,14 @@ def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
         found.setdefault((refit.term.port, refit.term.feature), refit)
     found.pop((best.term.port, best.term.feature), None)
     return [refit for refit in found.values() if refit.score > best.score - TIED]
+
+
+def _under_noise_of(best: Refit, tie: Refit) -> Refit:
+    """A refit of another term under the noise that the best one leaves: that of a model far off tells less apart."""
+    target = best.target.on(tie.target.forward)
+    fit = climb(target, tie.fit.x, tie.fit.free, evaluations=GLANCE)
+    found = replace(tie, target=target, fit=fit)
+    return replace(found, score=best.score - 0.5 * (found.square - best.square))
 
 
 def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,8 @@ REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
 FITTED = REPEATS + OTHERS
 LEDGER, TABLE, BASE = "engines.jsonl", "engines.md", "engine_difference"
 NOTHING = "nothing"
-STEPS = 3  # of the search for a size: rho is proportional to it but for large effects
+STEPS = 8  # of the search for a size: rho is proportional to it but for large effects
+CLOSE = 0.1  # of rho, within which a size is the one that was looked for
 SETTING = Setting(audited={"refine": 2, "time_step": 0.005})
 CENTRE = {"young_modulus": 2e6, "trunk_mass": 0.0911, "rayleigh_stiffness": 0.05}
 
@@ -136,41 +137,54 @@ def _recorded(
     names = [*(f"fit_{k + 1}" for k in range(FITTED)), *(f"test_{k + 1}" for k in range(UNTOUCHED))]
     blank = blank_recordings(SETTING, rng, names, [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)])
     arm = MuJoCoArm(Robot.load(SETTING.robot), values, effect)
-    size = 0.0
+    size, reached = 0.0, 0.0
     if effect is not None:
-        reached = _size(base, arm, effect, rho, blank, out)
-        if reached is None:
+        sized = _sized(base, arm, effect, rho, blank, out)
+        if sized is None:
             return None
-        size = reached
+        size, reached = sized
     key = jax.random.key(int(np.random.SeedSequence(list(seed)).generate_state(1)[0]))
     for index, (recording, clean) in enumerate(zip(blank, arm.positions(blank, size), strict=True)):
         noisy(recording, clean, jax.random.fold_in(key, index), SETTING).save(out / f"{recording.name}.nc")
     tables = {**base, "seed": int(seed[-1])}
     (out / "audit.toml").write_text(describe(tables), encoding="utf-8")
-    told = {"size": size, "unit": effect.unit if effect else "-", "values": values}
+    told = {"size": size, "unit": effect.unit if effect else "-", "reached": reached, "values": values}
     (out / "hidden.json").write_text(json.dumps(told), encoding="utf-8")
     return out
 
 
-def _size(
+def _sized(
     base: Mapping[str, Any], arm: MuJoCoArm, effect: EngineEffect, rho: float, blank: Sequence[Any], out: Path
-) -> float | None:
+) -> tuple[float, float] | None:
     """The size of an effect that a refit of the base model cannot absorb, ``rho`` deviations of the noise of it."""
     fitted = list(blank[:FITTED])
     spec = spec_of(parse_table(Experiment, base, where=BASE), out)
     problem = build_problem(spec, AuditTable(), fitted, list(blank[FITTED:]), 0, workshop=_WORKSHOP)
     model = absorbing(problem, problem.coordinates.null, fitted)
     still = arm.positions(model.recordings, 0.0)
-    size = effect.usual
+    return size_of(lambda size: model.rho(arm.positions(model.recordings, size) - still), effect.usual, rho)
+
+
+def size_of(rho_at: Callable[[float], float], usual: float, rho: float) -> tuple[float, float] | None:
+    """The size at which an effect has ``rho``, within `CLOSE`, and what it has there; None where none is found.
+
+    Args:
+        rho_at: rho of a size; an `InputError` says that the engine does not bear the size.
+        usual: where the search begins.
+        rho: wanted.
+    """
+    size = usual
     for _ in range(STEPS):
         try:
-            found = model.rho(arm.positions(model.recordings, size) - still)
+            found = rho_at(size)
         except InputError:
             return None
+        if abs(found - rho) <= CLOSE * rho:
+            return size, found
         if found == 0.0:
             return None
         size *= rho / found
-    return size
+    return None
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> str:

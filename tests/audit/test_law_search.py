@@ -15,7 +15,7 @@ from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.described import NamedModel, describe
 from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
 from rfdropo_bayes.audit.inadequacy import as_measured, noise_share
-from rfdropo_bayes.audit.law_search import law_search
+from rfdropo_bayes.audit.law_search import TIED, law_search
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.port_responses import responses, under
@@ -34,10 +34,12 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 class Pushed(Toy):
     """Marker m3 moves along x by the product of both commands, which no candidate does."""
 
+    pushed = SIZE
+
     def rollout(self, parameters, commands, steps=None):
         seen = super().rollout(parameters, commands, steps)
         level = jnp.concatenate([commands.initial[None], commands.step])
-        return seen._replace(position=seen.position.at[:, 2, 0].add(SIZE * level[:, 0] * level[:, 1]))
+        return seen._replace(position=seen.position.at[:, 2, 0].add(self.pushed * level[:, 0] * level[:, 1]))
 
 
 REST, LARGE = 3e-3, 25e-3  # [m], and [m] per square of the command's unit
@@ -57,15 +59,21 @@ class Elsewhere(Toy):
         return seen._replace(position=position.at[:, 2, 0].add(self.pushed * level[:, 0] * level[:, 1]))
 
 
+class PushedFar(Pushed):
+    """The same by eight times as much, which leaves the base model far off."""
+
+    pushed = LARGE
+
+
 class PushedElsewhere(Elsewhere):
     """Marker m3 moves along x by the product of both commands, too."""
 
     pushed = LARGE
 
 
-def searched(toy):
+def searched(toy, alike=False):
     """Problem, judge, base model and the search's findings of recordings of a toy."""
-    question = asked(6, toy)
+    question = asked(6, toy, alike)
     target, base = base_model(question, question.seed)
     options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
     return question, target, base, law_search(target, *options).find(target, base)
@@ -161,6 +169,19 @@ def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
     assert target.known is not None
     assert found.terms == []
     assert found.significant(question.rules.family) == []
+
+
+def test_terms_are_told_apart_under_the_noise_that_the_model_with_the_best_one_leaves():
+    """With the law the model is no longer far off, and the noise is that of the measurement."""
+    _, target, _, found = searched(PushedFar(), alike=True)
+    assert target.known is not None
+    (best,), ties = found.terms, found.ties
+    assert best.target.known is None
+    assert {"u_a u_a", "u_a u_b", "u_b u_b"} <= {refit.term.feature.formula("ab") for refit in (best, *ties)}
+    for tie in ties:
+        assert tie.target.known is None
+        assert tie.score == pytest.approx(best.score - 0.5 * (tie.square - best.square))
+        assert 0.5 * (tie.square - best.square) < TIED
 
 
 def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():

@@ -9,7 +9,7 @@ import pytest
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.model.experiment import CommandsTable
-from rfdropo_bayes.studies.engine_study import CENTRE, as_table, run_engine_study
+from rfdropo_bayes.studies.engine_study import CENTRE, CLOSE, as_table, run_engine_study, size_of
 from rfdropo_bayes.studies.hidden_effects import Setting, blank_recordings
 from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, MuJoCoArm
 
@@ -54,6 +54,23 @@ def test_an_effect_of_no_size_changes_nothing_and_one_of_its_usual_size_does(arm
     assert moved.max() > 1e-4
     if name == "site moved":
         assert moved[:, :, [0, 1, 3]].max() < 1e-12
+
+
+@pytest.mark.parametrize("power", [0.6, 1.0, 1.5])
+def test_a_size_is_one_at_which_the_effect_has_what_was_asked_for(power):
+    size, reached = size_of(lambda size: (size / 3.0) ** power, 0.01, 0.5)
+    assert reached == (size / 3.0) ** power
+    assert abs(reached - 0.5) <= CLOSE * 0.5
+
+
+def test_no_size_is_given_where_none_has_what_was_asked_for():
+    """An effect of which a refit absorbs all but a part that does not grow never gets there."""
+
+    def breaks(size):
+        raise rb.InputError("MuJoCo warns of the motion")
+
+    for rho_at in (lambda size: 0.4 * size / (1.0 + size), lambda size: 0.0, breaks):
+        assert size_of(rho_at, 0.01, 0.5) is None
 
 
 def test_a_wrong_name_is_told_the_right_ones(tmp_path):
