@@ -191,7 +191,7 @@ def record_posterior(
     what speaks against the predictions."""
     model, tested = asked.model, asked.test
     prior_key, fit_key, test_key = jax.random.split(key, 3)
-    say_step(f"the fit is done: predicting the {len(asked.runs)} fitted recordings", show=show)
+    say_step(f"the fit is done: predicting the fitted recordings ({len(asked.runs)})", show=show)
     rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
     values = thin(result.draws, PREDICTIVE_DRAWS)
@@ -203,7 +203,7 @@ def record_posterior(
     slow = _unseen_days(asked, result, predictions, left, jax.random.fold_in(key, 3), show=show)
     cautions: list[Caution] = []
     if tested:
-        say_step(f"the fit is done: predicting the {len(tested)} test recordings", show=show)
+        say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
         known: dict[str, Any] = {"fitted": fitted, "left": left, "groups": model.spec.groups, "chunk": problem.chunk}
