@@ -11,6 +11,7 @@ import re
 import sys
 from pathlib import Path
 
+import nbformat
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -23,6 +24,7 @@ PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGEL
 """Pages of the site by their path in the repository; those of docs/ keep their names."""
 GROUPS = ("reports/**/README.md", "reports/*/details.md", "models/**/README.md", "notebooks/*.ipynb")
 LINK = re.compile(r"(?<!\\)(!?\[(?:[^\[\]]|\[[^\]]*\])*\]\()([^)\s#]+)?(#[^)\s]*)?(\))")
+MOVING = "image/gif"
 CODE = re.compile(r"(```.*?```)", re.DOTALL)
 
 
@@ -66,10 +68,16 @@ def text_of(path: str) -> str:
 def notebook(path: str) -> str:
     """A notebook with its outputs as Markdown, its pictures inside.
 
-    The theme lets tables scroll on a narrow screen, but not those that have a class, as pandas gives to its own.
+    The exporter knows no moving pictures; they become HTML. The theme lets tables scroll on a narrow screen, but not
+    those that have a class, as pandas gives to its own.
     """
+    content = nbformat.read(ROOT / path, as_version=4)
+    for output in (output for cell in content.cells for output in cell.get("outputs", ())):
+        data = output.get("data", {})
+        if MOVING in data:
+            data["text/html"] = f'<img alt="film" src="data:{MOVING};base64,{data[MOVING].strip()}">'
     exporter = MarkdownExporter(config=Config({"ExtractOutputPreprocessor": {"enabled": False}}))
-    text = str(exporter.from_filename(str(ROOT / path))[0])
+    text = str(exporter.from_notebook_node(content)[0])
     return re.sub(r'<table [^>]*class="dataframe"[^>]*>', "<table>", text)
 
 

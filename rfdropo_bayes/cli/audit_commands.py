@@ -34,13 +34,11 @@ def audit(
     base: Base = None,
     between: Annotated[
         tuple[str, str] | None,
-        typer.Option(
-            "--between", metavar="GROUP GROUP", help="two of [model.groups]: say what differs, all else being shared"
-        ),
+        typer.Option("--between", metavar="GROUP GROUP", help="name what differs between two of [model.groups]"),
     ] = None,
     separate: Annotated[
         bool,
-        typer.Option("--separate", help="say which mechanisms of [separation] the recordings tell apart, and no more"),
+        typer.Option("--separate", help="only say which mechanisms of [separation] the recordings tell apart"),
     ] = False,
     seed: Seed = None,
     resume: Resume = False,
@@ -49,7 +47,7 @@ def audit(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Say what the simulator lacks, by name: writes audit.json, extended.toml and report.html."""
+    """Name what the simulator lacks. Writes audit.json, extended.toml and report.html."""
     see_calibration(base, "--base")
     if separate and between is not None:
         raise InputError("groups are compared by the search only", where="--separate", remedy="leave --between out")
@@ -84,12 +82,15 @@ def design(
     out: OutFolder = None,
     base: Base = None,
     adapt: Annotated[
-        bool, typer.Option("--adapt", help="the shortest commands that determine another day, for rfdropo adapt")
+        bool, typer.Option("--adapt", help="propose the shortest recording of another day that rfdropo adapt needs")
     ] = False,
-    seconds: Annotated[float, typer.Option(help="with --adapt: no proposal is longer")] = 10.0,
+    seconds: Annotated[float, typer.Option(help="with --adapt: longest proposal, in seconds")] = 10.0,
     group: Annotated[
         str | None,
-        typer.Option("--group", help="with --adapt: recordings whose drives the day has; the last one's by default"),
+        typer.Option(
+            "--group",
+            help="with --adapt: the group of recordings with the drives of that day; by default the last group",
+        ),
     ] = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
@@ -97,7 +98,7 @@ def design(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
+    """Propose commands that tell causes apart. Writes next_commands.csv and design.json."""
     see_calibration(base, "--base")
     if adapt and base is None:
         raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --base")
@@ -122,20 +123,20 @@ def design(
 def benchmark_audit(
     datasets: Annotated[int, typer.Option(help="data sets per condition")] = 100,
     seed: Annotated[int, typer.Option(help="seed of the study")] = 0,
-    condition: Annotated[list[str] | None, typer.Option(help="one condition; may be given several times")] = None,
+    condition: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="only this condition; may be repeated")
+    ] = None,
     hide: Annotated[
-        list[str] | None, typer.Option(help="mechanism to hide, all by default; may be given several times")
+        list[str] | None, typer.Option(metavar="NAME", help="mechanism to hide; may be repeated; all by default")
     ] = None,
     exclude: Annotated[
-        list[str] | None, typer.Option(help="mechanism to leave out; may be given several times")
+        list[str] | None, typer.Option(metavar="NAME", help="mechanism to leave out; may be repeated")
     ] = None,
     cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
-    truth: Annotated[
-        str, typer.Option("--truth", help="engine that moves the arm: own, or mujoco, with effects by its own means")
-    ] = "own",
+    truth: Annotated[str, typer.Option("--truth", help="engine that makes the recordings: own or mujoco")] = "own",
     out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
 ) -> None:
-    """Hide effects in recordings, audit them, and count hits, misses and confusions; goes on where it was stopped."""
+    """Count how often audits are right. Effects are hidden in recordings; a study goes on where it was stopped."""
     if truth not in ("own", "mujoco"):
         raise InputError(f"unknown engine {truth!r}", where="--truth", remedy="own or mujoco")
     if truth == "mujoco":

@@ -25,8 +25,8 @@ def check(
         bool, typer.Option("--quick", help="read only: do not simulate what a fit could determine")
     ] = False,
 ) -> None:
-    """Say in words what was read (robot, markers, commands, units, rows, masks, model), draw every recording, and say
-    what time step and mesh move the markers by, and what a fit could determine, and at what cost."""
+    """Say what was read, before a fit. Names faults, draws every recording, measures the errors of time step and mesh,
+    and says what a fit could determine and how long it takes."""
     from rfdropo_bayes.verbs.check import run_check
 
     found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [], ahead=not quick)

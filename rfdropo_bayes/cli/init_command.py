@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -42,41 +43,50 @@ Recordings = Annotated[
     list[str] | None,
     typer.Option(
         "--recording",
-        help="CSV, Motive export, ROS bag, MCAP file or LeRobotDataset to fit, or a quoted pattern; may be given "
-        "several times",
+        metavar="FILE",
+        help="CSV, Motive export, ROS bag, MCAP file or LeRobotDataset to fit, or a quoted pattern; may be repeated",
     ),
 ]
 Commands = Annotated[
     list[str] | None,
-    typer.Option("--commands", help="CSV of each recording's commands, or a quoted pattern, if they are not in it"),
+    typer.Option(
+        "--commands",
+        metavar="FILE",
+        help="CSV with the commands of each recording, if the recording has none, or a quoted pattern; may be repeated",
+    ),
 ]
 Shape = Annotated[str | None, typer.Option(help="cylinder, cone, tube, or disks (on a backbone)")]
-Length = Annotated[float | None, typer.Option("--length-mm", help="length of the body")]
-Radius = Annotated[float | None, typer.Option("--radius-mm", help="its outer radius, at the base")]
-TipRadius = Annotated[float | None, typer.Option("--tip-radius-mm", help="that at the tip, of a cone or tube")]
+Length = Annotated[float | None, typer.Option("--length-mm", help="length of the body [mm]")]
+Radius = Annotated[float | None, typer.Option("--radius-mm", help="outer radius of the body at the base [mm]")]
+TipRadius = Annotated[
+    float | None, typer.Option("--tip-radius-mm", help="outer radius of a cone or tube at the tip [mm]")
+]
 InnerRadius = Annotated[
-    float | None, typer.Option("--inner-radius-mm", help="radius of a tube's hollow, or of the disks' backbone")
+    float | None,
+    typer.Option("--inner-radius-mm", help="radius of the hollow of a tube, or of the backbone of disks [mm]"),
 ]
 NumberOfDisks = Annotated[int, typer.Option("--disks", help="number of disks")]
-DiskThickness = Annotated[float, typer.Option("--disk-thickness-mm", help="their thickness")]
-Segments = Annotated[int | None, typer.Option(help="segments with cables of their own")]
-Cables = Annotated[int | None, typer.Option(help="cables of each segment")]
+DiskThickness = Annotated[float, typer.Option("--disk-thickness-mm", help="thickness of each disk [mm]")]
+Segments = Annotated[int | None, typer.Option(help="number of segments, each with its own cables")]
+Cables = Annotated[int | None, typer.Option(help="number of cables of each segment")]
 CableRadius = Annotated[
-    float | None, typer.Option("--cable-radius-mm", help="their distance from the axis, at the base")
+    float | None, typer.Option("--cable-radius-mm", help="distance of the cables from the axis, at the base [mm]")
 ]
 Pairs = Annotated[bool | None, typer.Option(help="opposite cables share a motor")]
 CommandUnit = Annotated[
     str | None, typer.Option(help="mm, cm or m of cable, or deg or rad of a motor; guessed from a recording")
 ]
 PositionUnit = Annotated[str | None, typer.Option(help="mm, cm or m; guessed from a recording")]
-SpoolRadius = Annotated[float | None, typer.Option("--spool-radius-mm", help="of the motors")]
+SpoolRadius = Annotated[float | None, typer.Option("--spool-radius-mm", help="radius of the motors' spools [mm]")]
 Gravity = Annotated[
-    str | None, typer.Option(help="where things fall: +z for a robot that hangs, -z for one that stands, -y, ...")
+    str | None,
+    typer.Option(help="direction of gravity: +z for a robot that hangs, -z for a robot that stands, -y, ..."),
 ]
-Mass = Annotated[float | None, typer.Option("--mass-g", help="of the body; silicone's by default")]
-Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's modulus of the body")]
+Mass = Annotated[float | None, typer.Option("--mass-g", help="mass of the body [g]; by default that of silicone")]
+Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's modulus of the body [MPa]")]
 Markers = Annotated[
-    str | None, typer.Option(help='heights in mm, in the order of the columns: "low=66,middle=133,tip=200"')
+    str | None,
+    typer.Option(help='heights of the markers in mm, in the order of the columns: "low=66,middle=133,tip=200"'),
 ]
 Target = Annotated[
     Path,
@@ -86,7 +96,7 @@ Target = Annotated[
         "into a folder of its name",
     ),
 ]
-Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing: take defaults, and mark them")]
+Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing, take defaults and mark them ASSUMED")]
 
 
 def init(
@@ -113,7 +123,7 @@ def init(
     markers: Markers = None,
     defaults: Defaults = False,
 ) -> None:
-    """Write a commented robot file and experiment file from a few answers, options, and the columns of a recording."""
+    """Write a first robot file and experiment file. Asks for what options and recordings do not say."""
     from rfdropo_bayes.verbs.init import (
         assumed_of_columns,
         guess_units,
@@ -149,7 +159,7 @@ def init(
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
     for line in assumed_of_columns(guess) if guess else []:
         typer.echo(f"look over in the experiment file: {line}")
-    typer.echo(f"next: rfdropo check {folder / 'experiment.toml'}")
+    typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(folder / 'experiment.toml')])}")
 
 
 def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
@@ -160,7 +170,7 @@ def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) ->
     typer.echo(f"wrote {path}")
     for line in assumed:
         typer.echo(f"assumed: {line}")
-    typer.echo(f"next: rfdropo check {path}")
+    typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(path)])}")
 
 
 def _body(

@@ -13,7 +13,7 @@ ROBOT_HELP = "name of a robot, or path of a robot file: say more of it"
 
 
 def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=ROBOT_HELP)] = None) -> None:
-    """List the robots that come with the package, or say what one is: geometry, cables, markers, parameters."""
+    """List the robots, or describe a robot. Its geometry, cables, markers and parameters."""
     from rfdropo_bayes.model.robot_listings import named_robot_facts, robot_rows
 
     if name is None:
@@ -27,7 +27,7 @@ def mechanisms(
     name: Annotated[str | None, typer.Argument(metavar="[MECHANISM]", help="say more of this one")] = None,
     robot: Annotated[str, typer.Option(help="robot to list parameters per cable for")] = "smooth_arm",
 ) -> None:
-    """List the mechanisms that a model can be extended by, or say what one is: cause, remedy, parameters, priors."""
+    """List the mechanisms, or describe a mechanism. Its cause, remedy, parameters and priors."""
     from rfdropo_bayes.model.mechanism_listings import mechanism_facts, mechanism_rows
 
     if name is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from rfdropo_bayes.cli import (
     policy_commands,
     posterior_commands,
     prediction_commands,
+    report_command,
 )
 from rfdropo_bayes.cli.options import (
     AsJson,
@@ -34,10 +36,13 @@ from rfdropo_bayes.cli.options import (
 )
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_simulation
 from rfdropo_bayes.errors import InputError, Interrupted
+from rfdropo_bayes.files import unwritten
 from rfdropo_bayes.interrupts import EXIT_STATUS, NOTHING_LOST, watch_interrupts
 from rfdropo_bayes.runtime import keep_compilations
 
 INPUT_ERROR = 2
+# What a disk or its rights keep a command from writing is no fault of the program.
+OF_THE_USER = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EISDIR, errno.ENOTDIR)
 
 # Typer carries its own copy of click, or uses the installed one, depending on its version.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
@@ -70,7 +75,8 @@ def calibrate(
     quiet: Quiet = False,
     as_json: AsJson = False,
     check: Annotated[
-        str | None, typer.Option(help="sbc: instead of fitting, check the method on simulated data")
+        str | None,
+        typer.Option(metavar="sbc", help="instead of fitting, check the method by simulation-based calibration"),
     ] = None,
     datasets: Annotated[int, typer.Option(help="number of data sets of a check")] = 200,
     start: Annotated[
@@ -79,7 +85,7 @@ def calibrate(
     ] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Fit the simulator to recordings: writes posterior.nc, summary.json and report.html."""
+    """Fit the simulator to recordings. Writes posterior.nc, summary.json and report.html."""
     if check is not None and start is not None:
         raise InputError("a check has no start", where="--from", remedy="leave it out")
     see_calibration(start, "--from")
@@ -101,13 +107,15 @@ def calibrate(
 def simulate(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    balance: Annotated[bool, typer.Option(help="also write base reaction, energies and work to the NetCDF")] = False,
+    balance: Annotated[
+        bool, typer.Option("--balance", help="also write base reaction, energies and work to the NetCDF")
+    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recordings."""
+    """Simulate the commands of an experiment. Writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.simulate import simulate_all
@@ -116,24 +124,9 @@ def simulate(
     show_simulation(found, quiet=quiet, as_json=as_json)
 
 
-@app.command()
-def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration or a deployment has written")],
-) -> None:
-    """Write report.html again from the files of a run."""
-    if (folder / "cycles.bin").is_file():  # a motor session's journal
-        from rfdropo_bayes.verbs.session_report import write_session_page
-
-        typer.echo(f"report: {write_session_page(folder)}")
-        return
-    see_calibration(folder, "DIR")
-    from rfdropo_bayes.report import rebuild_report
-
-    typer.echo(f"report: {rebuild_report(folder)}")
-
-
 app.command("init")(init_command.init)
 app.command("check")(check_command.check)
+app.command()(report_command.report)
 app.command()(audit_commands.audit)
 app.command()(audit_commands.design)
 app.command()(posterior_commands.export)
@@ -148,7 +141,7 @@ app.command()(listing_commands.formats)
 app.command()(listing_commands.methods)
 motor_commands.register(app)
 
-benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
+benchmark = typer.Typer(help="Comparisons that take hours. Each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(posterior_commands.table1)
 benchmark.command()(policy_commands.table2)
 benchmark.command("audit")(audit_commands.benchmark_audit)
@@ -174,6 +167,11 @@ def main() -> None:
             print(error)
             sys.exit(0)
         print(f"rfdropo: {error}; see rfdropo --help", file=sys.stderr)
+        sys.exit(INPUT_ERROR)
+    except OSError as error:
+        if error.filename is None or error.errno not in OF_THE_USER:
+            raise
+        print(f"rfdropo: {unwritten(error, Path(error.filename))}", file=sys.stderr)
         sys.exit(INPUT_ERROR)
     except (KeyboardInterrupt, typer.Abort) as stop:
         print(f"rfdropo: {_after(stop)}", file=sys.stderr)

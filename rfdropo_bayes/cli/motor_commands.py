@@ -31,14 +31,15 @@ def deploy(
     out: Annotated[
         Path | None, typer.Option("--out", help="folder of the session; reports/<name>-<time> by default")
     ] = None,
-    simulated: Annotated[bool, typer.Option(help="use simulated drives, whatever the mode")] = False,
+    simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="what to replay: a session's folder, or a trajectory")] = None,
-    quiet: Annotated[bool, typer.Option(help="no live view")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no live view")] = False,
     overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="key=value or table.key=value of the deployment file")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="key or table.key of the deployment file; may be repeated"),
     ] = None,
 ) -> None:
-    """Run a policy on drives, or try it: writes report.html, session.nc, the CAN frames, log.jsonl and summary.json."""
+    """Run a policy on drives, or try it. Writes report.html, session.nc, the CAN frames, log.jsonl and summary.json."""
     from rfdropo_bayes.deployment.session import Mode
     from rfdropo_bayes.deployment.session import deploy as run_session
     from rfdropo_bayes.deployment.settings import load_deployment
@@ -79,14 +80,14 @@ def _figures(figures: dict[str, Any]) -> list[str]:
 
 
 def drives(
-    robot: Annotated[str, typer.Argument(help="name or file of a robot with motors")],
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="name or file of a robot with motors")],
     interface: Interface = "hub",
     channel: Channel = "127.0.0.1:29536",
     plant: Annotated[str, typer.Option(help="springs, or MODULE:CALLABLE")] = "springs",
-    own_process: Annotated[bool, typer.Option(help="run the plant in a process of its own")] = False,
+    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in a process of its own")] = False,
     markers: Annotated[str, typer.Option(help="HOST:PORT to send markers to")] = "",
 ) -> None:
-    """Simulate the drives of a robot, and the bus they are on, until interrupted."""
+    """Simulate the drives of a robot and their bus. Runs until Ctrl-C."""
     from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, serve
     from rfdropo_bayes.deployment.bus import BusTable
 
@@ -96,10 +97,12 @@ def drives(
 
 
 def doctor(
-    deployment: Annotated[Path | None, typer.Argument(metavar="[DEPLOYMENT.toml]", help="whose bus to look at")] = None,
-    seconds: Annotated[float, typer.Option(help="of each of five idle runs")] = 2.0,
+    deployment: Annotated[
+        Path | None, typer.Argument(metavar="[DEPLOYMENT.toml]", help="deployment file that names the bus")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="length of each of five idle runs, in seconds")] = 2.0,
 ) -> None:
-    """Say what this machine, its clock and its bus are fit for, as JSON; status 1 where something is wrong."""
+    """Test this machine, its clock and its bus. Prints JSON; the exit status is 1 if something is wrong."""
     from rfdropo_bayes.deployment.doctor import examine
     from rfdropo_bayes.deployment.settings import load_deployment
 

@@ -19,12 +19,16 @@ OutFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="folder to write to; by default reports/<experiment>, and <experiment>_<command> for all but calibrate",
+        help="folder to write to  [default: reports/EXPERIMENT_COMMAND; of calibrate reports/EXPERIMENT]",
     ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", help="name=value: a parameter's value, or table.key=value of the experiment file"),
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="value of a parameter in SI units, or table.key=value of the experiment file; may be repeated",
+    ),
 ]
 Seed = Annotated[int | None, typer.Option(help="seed; that of the experiment file by default")]
 Resume = Annotated[bool, typer.Option("--resume", help="go on from the checkpoint of an interrupted run")]

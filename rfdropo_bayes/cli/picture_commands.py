@@ -21,10 +21,10 @@ def view(
         Path | None, typer.Option(help="file of the robot, where a NetCDF file has none beside it")
     ] = None,
     overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="name=value, as in `simulate`; for an experiment")
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="as in simulate; for an experiment")
     ] = None,
 ) -> None:
-    """Draw a rollout: simulates an experiment, or takes a NetCDF file that simulate or predict has written."""
+    """Draw a motion. Simulates an experiment, or reads a NetCDF file of simulate or predict."""
     from rfdropo_bayes.verbs.view import run_view
 
     written = run_view(source, out, overrides or [], recording, rate, robot)

@@ -43,7 +43,7 @@ def train(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Train a policy and play it: writes report.html, policy.onnx, its card, and how it learnt."""
+    """Train a policy and play it. Writes report.html, policy.onnx, its card and its learning curve."""
     if (experiment is None) == (calibration is None):
         raise InputError("takes an experiment file or --from DIR", where="train", remedy="give one of them")
     see_calibration(calibration, "--from")
@@ -93,17 +93,18 @@ def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
 def evaluate(
     experiment: ExperimentFile,
     policy: Annotated[
-        list[Path], typer.Option("--policy", help="policy.onnx, or the folder of a training; may be repeated")
+        list[Path],
+        typer.Option("--policy", metavar="FILE|DIR", help="policy.onnx, or the folder of a training; may be repeated"),
     ],
     out: OutFolder = None,
-    episodes: Annotated[int, typer.Option(help="of each policy, the same for all")] = 200,
-    seed: Annotated[int, typer.Option(help="of the episodes' parameters and goals")] = 0,
+    episodes: Annotated[int, typer.Option(help="number of episodes of each policy, the same for all")] = 200,
+    seed: Annotated[int, typer.Option(help="seed of the parameters and goals of the episodes")] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Play policies on the same episodes: writes success with intervals, every episode, a figure and animations."""
+    """Play policies on the same episodes. Writes success with intervals, every episode, a figure and animations."""
     folder = folder_for("evaluate", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.evaluate import TABLE, evaluation_table
@@ -126,20 +127,24 @@ def table2(
     / "truth.toml",
     audited: Annotated[Path, typer.Option("--audit", help="experiment file of the audit")] = VIRTUAL / "audit.toml",
     out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table2"),
-    seeds: Annotated[int, typer.Option(help="policies of every row")] = 3,
-    steps: Annotated[int, typer.Option(help="environment steps of a training")] = 1_000_000,
-    episodes: Annotated[int, typer.Option(help="of an evaluation, the same for all policies")] = 200,
-    budget: Annotated[int, typer.Option(help="rollouts of a fit")] = 10_000,
-    minutes: Annotated[float, typer.Option(help="bound of the audit")] = 65.0,
+    seeds: Annotated[int, typer.Option(help="number of policies trained for each row")] = 3,
+    steps: Annotated[int, typer.Option(help="number of environment steps of a training")] = 1_000_000,
+    episodes: Annotated[int, typer.Option(help="number of episodes of an evaluation, the same for all policies")] = 200,
+    budget: Annotated[int, typer.Option(help="number of rollouts of a fit")] = 10_000,
+    minutes: Annotated[float, typer.Option(help="time limit of the audit, in minutes")] = 65.0,
     exact_oracle: Annotated[
         bool, typer.Option("--exact-oracle", help="train the oracle on the target's own mesh and time step; slower")
     ] = False,
-    rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
-    resume: Annotated[bool, typer.Option(help="keep what an interrupted study has done")] = False,
-    only_done: Annotated[bool, typer.Option(help="tables of what an interrupted study has done")] = False,
+    rows: Annotated[
+        list[str] | None, typer.Option("--row", metavar="NAME", help="only this row; may be repeated")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with an interrupted study")] = False,
+    only_done: Annotated[
+        bool, typer.Option("--only-done", help="write the tables of an interrupted study as far as it is done")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """The paper's Table II: policies of every method on a robot they never touched: table2.json, .md and .png."""
+    """Make the paper's Table II. Plays policies of every method on a robot that they never touched."""
     check_folder(out, "benchmark table2", resume=resume or only_done, overwrite=overwrite)
     from rfdropo_bayes.studies.table2 import Table2Size, run_table2
 

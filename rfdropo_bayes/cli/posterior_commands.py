@@ -15,7 +15,7 @@ from rfdropo_bayes.model.run_folder import check_folder
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a calibration")],
     phi: Annotated[bool, typer.Option("--phi", help="the distribution to randomise over")] = False,
     posterior: Annotated[bool, typer.Option("--posterior", help="a posterior.nc without its predictions")] = False,
     model: Annotated[
@@ -24,8 +24,8 @@ def export(
     out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace what an earlier export wrote")] = False,
 ) -> None:
-    """Write the distribution to randomise over as tables with units, a posterior small enough to keep, or a calibrated
-    model."""
+    """Write parts of a calibration for other programs. The distribution to randomise over as tables with units, a
+    posterior small enough to keep, or a calibrated model."""
     if not phi and not posterior and not model:
         raise InputError("nothing to export was named", where="export", remedy="add --phi, --posterior or --model")
     see_calibration(folder, "DIR")
@@ -53,20 +53,30 @@ def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str],
 
 def table1(
     out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table1"),
-    truths: Annotated[int, typer.Option(help="truths of each kind for our rows")] = 100,
-    repeats: Annotated[int, typer.Option(help="data sets at the paper's truth for our rows")] = 20,
-    rival_truths: Annotated[int, typer.Option(help="truths of each kind for the other rows")] = 5,
-    budget: Annotated[int, typer.Option(help="rollouts per posterior")] = 10000,
+    truths: Annotated[int, typer.Option(help="number of true parameter sets of each kind, for our methods")] = 100,
+    repeats: Annotated[
+        int, typer.Option(help="number of data sets at the paper's true parameters, for our methods")
+    ] = 20,
+    rival_truths: Annotated[
+        int, typer.Option(help="number of true parameter sets of each kind, for the other methods")
+    ] = 5,
+    budget: Annotated[int, typer.Option(help="number of rollouts of a posterior")] = 10000,
     actions: Annotated[int, typer.Option(help="length of a recording, in actions of 50 ms")] = 100,
-    seed: Annotated[int, typer.Option(help="of everything")] = 0,
-    rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
-    tasks: Annotated[list[str] | None, typer.Option("--task", help="only this task; may be repeated")] = None,
-    resume: Annotated[bool, typer.Option(help="keep the fits that an interrupted run has done")] = False,
-    only_done: Annotated[bool, typer.Option(help="tables of the fits that an interrupted run has done")] = False,
+    seed: Annotated[int, typer.Option(help="seed of all random numbers")] = 0,
+    rows: Annotated[
+        list[str] | None, typer.Option("--row", metavar="NAME", help="only this row; may be repeated")
+    ] = None,
+    tasks: Annotated[
+        list[str] | None, typer.Option("--task", metavar="NAME", help="only this task; may be repeated")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with an interrupted run")] = False,
+    only_done: Annotated[
+        bool, typer.Option("--only-done", help="write the tables of an interrupted run as far as it is done")
+    ] = False,
     overwrite: Overwrite = False,
     cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
 ) -> None:
-    """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
+    """Make the paper's Table I, with rivals. Writes table1.json, table1.md and table1.png."""
     check_folder(out, "benchmark table1", resume=resume or only_done, overwrite=overwrite)
     from rfdropo_bayes.studies.table1 import ROWS, TASKS, Table1Size, run_table1
 

@@ -35,18 +35,20 @@ def predict(
         Path | None, typer.Option("--posterior", help="folder of its calibration; DIR by default")
     ] = None,
     start: Annotated[
-        str | None, typer.Option("--start", help="file whose first row is the start pose, where it is another file")
+        str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
     ] = None,
-    rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
+    rows: Annotated[
+        str | None, typer.Option("--rows", metavar="FIRST:LAST", help="observation rows, counted from 0, both included")
+    ] = None,
     episode: Episode = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
     group: PredictedGroup = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="as in calibrate")] = None,
+    overrides: Overrides = None,
 ) -> None:
-    """Predict commands that were never run: mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
+    """Predict the motion under new commands. Writes mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
     if experiment.is_dir():
         posterior, experiment = posterior or experiment, experiment / "config.toml"
     if posterior is None:
@@ -80,7 +82,9 @@ def adapt(
         str | None, typer.Option("--commands", help="file of its commands, where the format has one of their own")
     ] = None,
     episode: Episode = None,
-    seconds: Annotated[float | None, typer.Option(help="look at so much of its beginning; all by default")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="length of the beginning that is used, in seconds; all by default")
+    ] = None,
     group: Group = None,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="the experiment file, where DIR holds a posterior alone")
@@ -91,7 +95,7 @@ def adapt(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Move what a day changes to one short recording of it; the body keeps its posterior."""
+    """Adapt a calibration to another day. One short recording moves what days change; the body keeps its posterior."""
     see_calibration(run, "DIR")
     check_folder(out, "adapt", overwrite=overwrite)
     from rfdropo_bayes.data import RecordingEntry

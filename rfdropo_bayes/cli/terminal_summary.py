@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,7 +68,7 @@ def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
             console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
         for sentence in summary["details"].get("compared", ()):
             console.print(sentence, soft_wrap=True)
-        console.print(f"next: rfdropo predict {folder} --commands FILE --out OUT", soft_wrap=True)
+        console.print(f"next: rfdropo predict {shlex.quote(str(folder))} --commands FILE --out OUT", soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 
 

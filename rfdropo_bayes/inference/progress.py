@@ -1,6 +1,7 @@
 """What a long inference shows and keeps as it goes.
 
 - `Progress`: a bar with the time left for people, one JSON line per stage for programs.
+- `say_step`: what a run does after the work that a bar shows.
 - `Checkpoint`: a killed run goes on from its last whole stage and ends with the same draws.
 - `Logbook`: both of them, for a run or a part of one.
 """
@@ -81,6 +82,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.stop()
+        self._prints = False  # rollouts after the work, such as those of predictions, are no part of it
 
     def spend(self, rollouts: float) -> None:
         """Report rollouts as they are done, in full-length ones."""
@@ -130,6 +132,18 @@ class Progress:
 
     def _print(self, words: str) -> None:
         print(f"{self.title}: {words}", file=sys.stderr, flush=True)
+
+
+def say_step(words: str, *, show: bool | None = None) -> None:
+    """Say on stderr what a run does next, where no bar shows it, and answer Ctrl-C.
+
+    Args:
+        words: what is done, such as "drawing report.html".
+        show: False says nothing, see `Progress`.
+    """
+    check_interrupt()
+    if show is not False:
+        print(words, file=sys.stderr, flush=True)
 
 
 def clock(seconds: float) -> str:

@@ -16,7 +16,7 @@ from rfdropo_bayes.files import output_folder, unwritten, write_text
 from rfdropo_bayes.interrupts import interrupted, running
 from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe, self_contained
 
-RUN, CONFIG, LOG, CHECKPOINTS = "run.json", "config.toml", "log.jsonl", "checkpoints"
+RUN, CONFIG, LOG, CHECKPOINTS, PAGE = "run.json", "config.toml", "log.jsonl", "checkpoints", "report.html"
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
 SCHEMA_VERSION = 1
 NAMED_DIFFERENCES = 3
@@ -41,15 +41,15 @@ class RunKind(NamedTuple):
 
 
 COMMANDS = {
-    "calibrate": RunKind(("summary.json", "posterior.nc", "report.html"), resumable=True),
-    "adapt": RunKind(("summary.json", "posterior.nc", "report.html")),
+    "calibrate": RunKind(("summary.json", "posterior.nc", PAGE), resumable=True),
+    "adapt": RunKind(("summary.json", "posterior.nc", PAGE)),
     "check": RunKind(("sbc.json", "sbc.jsonl"), resumable=True),
     "simulate": RunKind(("simulation.json",)),
     "predict": RunKind(("prediction.json", "prediction.nc", "prediction.csv")),
-    "audit": RunKind(("audit.json", "extended.toml", "report.html"), resumable=True),
+    "audit": RunKind(("audit.json", "extended.toml", PAGE), resumable=True),
     "separate": RunKind(("separation.json", "separation.md", "separation.png"), resumable=True),
     "design": RunKind(("design.json", "next_commands.csv")),
-    "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl"), resumable=True),
+    "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl", PAGE), resumable=True),
     "evaluate": RunKind(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
     "benchmark table1": RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True),
     "benchmark table2": RunKind(("table2.json", "table2.md", "table2.png"), resumable=True),
@@ -128,6 +128,19 @@ def run_folder(
 def hashes(recordings: Iterable[Any]) -> dict[str, str]:
     """Hash of the content of each recording (`Trajectory`), by its name."""
     return {recording.name: recording.sha256[:12] for recording in recordings}
+
+
+def command_of(out: Path) -> str | None:
+    """The command that wrote a folder, by its run.json or else by its results; None for a folder of no run."""
+    found = _read(out / RUN)
+    if found is not None:
+        return str(found["command"])
+    firsts = [kind.results[0] for kind in COMMANDS.values()]
+    for name, kind in COMMANDS.items():
+        telling = kind.results[: 1 if firsts.count(kind.results[0]) == 1 else 2]
+        if all((out / result).is_file() for result in telling):
+            return name
+    return None
 
 
 def run_ended(out: Path) -> bool:

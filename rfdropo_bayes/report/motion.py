@@ -16,6 +16,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.report.style import ACCENT, POSTERIOR
 
 AROUND, ALONG = 16, 60
@@ -102,7 +103,7 @@ def silhouette(
 
 def save_vtk(motion: DrawnMotion, folder: Path) -> list[Path]:
     """Write trunk and cube at every instant as VTK files, and a .pvd that lists them with their times."""
-    folder.mkdir(parents=True, exist_ok=True)
+    output_folder(folder)
     written, entries = [], []
     for row, time in enumerate(motion.time):
         for part, (name, points, faces) in enumerate(_surfaces(motion, row)):
@@ -137,7 +138,7 @@ def save_frames(motion: DrawnMotion, folder: Path, frames_per_second: int) -> li
         pyvista: Any = importlib.import_module("pyvista")
     except ImportError:
         raise InputError("frames need PyVista", remedy="pip install 'rfdropo_bayes[view]'") from None
-    folder.mkdir(parents=True, exist_ok=True)
+    output_folder(folder)
     count = max(2, round(float(motion.time[-1] - motion.time[0]) * frames_per_second))
     rows = np.searchsorted(motion.time, np.linspace(motion.time[0], motion.time[-1], count))
     written = []

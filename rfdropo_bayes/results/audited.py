@@ -14,7 +14,7 @@ import xarray as xr
 
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import whole, write_json, write_text
+from rfdropo_bayes.files import output_folder, whole, write_json, write_text
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
@@ -169,8 +169,7 @@ class Audit:
 
     def save(self, folder: Path | str) -> Path:
         """Write audit.json, extended.toml, residuals.nc and report.html; return the path of the report."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = output_folder(Path(folder))
         write_json(folder / AUDIT, self.content, finite=True)
         write_text(folder / EXTENDED, describe(self.tables))
         if self.residuals is not None:

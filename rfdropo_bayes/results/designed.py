@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from rfdropo_bayes.files import whole, write_json
+from rfdropo_bayes.files import output_folder, whole, write_json
 
 COMMANDS, DESIGN = "next_commands.csv", "design.json"
 
@@ -34,8 +34,7 @@ class Design:
 
     def save(self, folder: Path | str) -> Path:
         """Write next_commands.csv and design.json; return the path of the commands."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = output_folder(Path(folder))
         with whole(folder / COMMANDS) as partial:
             self.commands.to_csv(partial, index=False, float_format="%.6f")
         write_json(folder / DESIGN, {**self.content, "commands": str(folder / COMMANDS)})

@@ -12,7 +12,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from rfdropo_bayes.cautions import Caution
-from rfdropo_bayes.files import whole
+from rfdropo_bayes.files import output_folder, whole
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report.trajectory_figures import AXES, draw_band
 from rfdropo_bayes.results.calibrated import axes_or_new
@@ -66,7 +66,7 @@ class Prediction:
     def save(self, folder: Path | str) -> list[Path]:
         """Write prediction.nc and prediction.csv; return their paths."""
         files = [Path(folder) / "prediction.nc", Path(folder) / "prediction.csv"]
-        files[0].parent.mkdir(parents=True, exist_ok=True)
+        output_folder(files[0].parent)
         with whole(files[0]) as partial:
             self.bands.to_netcdf(partial, engine="h5netcdf")
         with whole(files[1]) as partial:

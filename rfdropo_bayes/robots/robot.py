@@ -153,8 +153,15 @@ class Robot(RobotTable):
         for name, place in points.items():
             width = np.stack([np.interp(place[:, 2], station, half[:, axis]) for axis in (0, 1)], axis=1)
             outside = (place[:, 2] < station[0] - 1e-9) | (place[:, 2] > station[-1] + 1e-9)
-            if np.any(outside) or np.any(np.abs(place[:, :2]) > width + 1e-9):
-                raise ValueError(f"a {name} lies outside the body")
+            outside |= np.any(np.abs(place[:, :2]) > width + 1e-9, axis=1)
+            if np.any(outside):
+                row = int(np.argmax(outside))
+                x, y, z = place[row]
+                raise ValueError(
+                    f"a {name} lies outside the body: it is at x, y, z = {x:.4g}, {y:.4g}, {z:.4g} m, and the body "
+                    f"reaches {width[row, 0]:.4g} and {width[row, 1]:.4g} m across, and z from {station[0]:.4g} to "
+                    f"{station[-1]:.4g} m"
+                )
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Robot:

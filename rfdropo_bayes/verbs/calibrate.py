@@ -19,7 +19,7 @@ from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.assembly import integrator_of
 from rfdropo_bayes.model.experiment import InferenceTable
@@ -110,6 +110,7 @@ def calibrate(
     settings |= {"options": {"from": start.folder if isinstance(start, Calibration) else start}, "texts": model.texts()}
     with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
         found = fit(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
+        say_step("the fit is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
         found.save(folder)
     return found
 
@@ -190,6 +191,7 @@ def record_posterior(
     what speaks against the predictions."""
     model, tested = asked.model, asked.test
     prior_key, fit_key, test_key = jax.random.split(key, 3)
+    say_step(f"the fit is done: predicting the fitted recordings ({len(asked.runs)})", show=show)
     rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
     values = thin(result.draws, PREDICTIVE_DRAWS)
@@ -201,6 +203,7 @@ def record_posterior(
     slow = _unseen_days(asked, result, predictions, left, jax.random.fold_in(key, 3), show=show)
     cautions: list[Caution] = []
     if tested:
+        say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
         known: dict[str, Any] = {"fitted": fitted, "left": left, "groups": model.spec.groups, "chunk": problem.chunk}

@@ -10,6 +10,7 @@ import numpy as np
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
+from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
@@ -79,6 +80,7 @@ def train(
         found = learn(
             environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known, show=show
         )
+        say_step("the training is done: exporting the policy, playing it and drawing report.html", show=show)
         layout = found.model.get_env().get_attr("layout")[0]
         facts = {
             "rfdropo_version": software_versions()["rfdropo_bayes"],

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.trajectory import open_netcdf
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import robot_of
 from rfdropo_bayes.model.experiment_file import ROBOT_COPY
 from rfdropo_bayes.model.model import Model
@@ -55,7 +56,7 @@ def run_view(
     if out.suffix not in STILLS + ANIMATIONS:
         known = ", ".join((*STILLS, *ANIMATIONS, ".vtk"))
         raise InputError(f"unknown format {out.suffix!r}", where=str(out), remedy=f"use {known}, or a folder")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    output_folder(out.parent)
     if out.suffix in STILLS:
         save_still(motion, out)
     else:

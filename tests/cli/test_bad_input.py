@@ -100,6 +100,16 @@ def test_an_output_folder_that_cannot_be_made(tmp_path, monkeypatch, capsys):
     assert error.count("\n") == 1
 
 
+def test_what_the_disk_refuses_is_one_line_whichever_command_writes(tmp_path, monkeypatch, capsys):
+    """A folder stands where the picture would go: no right of any user changes that."""
+    (tmp_path / "taken.png").mkdir()
+    arguments = ["view", str(DEMO / "demo_1.nc"), "--robot", "smooth_arm", "--out", str(tmp_path / "taken.png")]
+    status, error = run(arguments, monkeypatch, capsys)
+    assert status == 2
+    assert "taken.png: cannot be written" in error
+    assert error.count("\n") == 1
+
+
 def test_a_missing_experiment_file(tmp_path, monkeypatch, capsys):
     status, error = run(["simulate", str(tmp_path / "none.toml")], monkeypatch, capsys)
     assert status == 2

@@ -9,7 +9,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import progress as module
-from rfdropo_bayes.inference.progress import Progress, clock
+from rfdropo_bayes.inference.progress import Progress, clock, say_step
 
 FULL = Path("/dev/full")  # a device that every write finds full
 
@@ -62,6 +62,17 @@ def test_nothing_is_said_when_nothing_is_to_be_shown(capsys):
     with Progress("smc", show=False) as progress:
         progress.stage(1.0)
     assert capsys.readouterr().err == ""
+
+
+def test_what_runs_after_the_work_is_said_and_no_longer_counted(seconds, capsys):
+    with Progress("smc", show=None, budget=100.0) as progress:
+        progress.stage(1.0)
+    capsys.readouterr()
+    seconds[0] += 100.0
+    progress.spend(50.0)
+    say_step("predicting", show=None)
+    say_step("nothing", show=False)
+    assert capsys.readouterr().err == "predicting\n"
 
 
 def test_a_log_that_cannot_be_written_is_one_line():

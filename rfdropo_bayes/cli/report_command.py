@@ -1,0 +1,64 @@
+"""The command that draws the page of a run again, or says where the results of a run without one are."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.run_folder import COMMANDS, CONFIG, PAGE, RUN, command_of, run_ended
+
+JOURNAL, POSTERIOR = "cycles.bin", "posterior.nc"
+TO_VIEW = {"predict": "prediction.nc"}
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder that a run has written")],
+) -> None:
+    """Draw the page of a calibration or a motor session again. Of other runs, say where their results are."""
+    if not folder.is_dir():
+        raise InputError("no such folder", where=str(folder), remedy="name the folder that --out gave a run")
+    if (folder / JOURNAL).is_file():
+        from rfdropo_bayes.verbs.session_report import write_session_page
+
+        typer.echo(f"report: {write_session_page(folder)}")
+        return
+    if (folder / POSTERIOR).is_file():
+        from rfdropo_bayes.report import rebuild_report
+
+        typer.echo(f"report: {rebuild_report(folder)}")
+        return
+    for line in _say_results(folder):
+        typer.echo(line)
+
+
+def _say_results(folder: Path) -> list[str]:
+    """What a folder without a posterior holds, in lines.
+
+    Raises:
+        InputError: no run, one that has not ended, or one whose page is gone.
+    """
+    command = command_of(folder)
+    if command is None or command not in COMMANDS:
+        raise InputError("holds no run", where=str(folder), remedy="name the folder that --out gave a run")
+    kind = COMMANDS[command]
+    if (folder / RUN).is_file() and not run_ended(folder):
+        remedy = "go on with it by --resume" if kind.resumable else "run it again with --overwrite"
+        raise InputError(f"holds a run of {command} that has not ended", where=str(folder), remedy=remedy)
+    if (folder / PAGE).is_file():
+        return [f"{command} draws its page once, while it runs; the page is as it was", f"report: {folder / PAGE}"]
+    if PAGE in kind.results:
+        again = f"rfdropo {command} {shlex.quote(str(folder / CONFIG))} --out ANOTHER_FOLDER"
+        raise InputError(
+            f"the page of this run of {command} is gone, and what it was drawn from is not kept",
+            where=str(folder),
+            remedy=f"run it again: {again}" if (folder / CONFIG).is_file() else "run it again",
+        )
+    found = [str(folder / name) for name in kind.results if (folder / name).is_file()]
+    lines = [f"{command} writes no page; its results:", *(f"  {file}" for file in found)]
+    if command in TO_VIEW:
+        lines.append(f"to see it: {shlex.join(['rfdropo', 'view', str(folder / TO_VIEW[command])])}")
+    return lines
