@@ -123,6 +123,10 @@ def test_a_session_is_replayed(dry_run, tmp_path: Path) -> None:
     folder, settings = dry_run
     outcome = deploy(settings, "replay", tmp_path / "again", simulated=True, commands=folder)
     assert outcome.cause is Cause.FINISHED, outcome.detail
+    assert "ends the replay before" not in (tmp_path / "again" / "log.jsonl").read_text()
+    short = settings.model_copy(update={"duration_s": 0.5})
+    deploy(short, "replay", tmp_path / "short", simulated=True, commands=folder)
+    assert "duration_s = 0.5 s ends the replay before" in (tmp_path / "short" / "log.jsonl").read_text()
     first, second = (Trajectory.load(path / "session.nc") for path in (folder, tmp_path / "again"))
     rows = min(len(first.command), len(second.command)) - 2
     np.testing.assert_allclose(second.command[:rows], first.command[:rows], atol=1e-9)
