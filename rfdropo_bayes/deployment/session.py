@@ -147,6 +147,7 @@ class _Session:
         self.found: dict[str, dict[str, int]] = {}
         self.without: dict[str, list[str]] = {}
         self.source: CommandSource | None = None
+        settings.drives.check_serial(robot.channel_names)
         self._load_policy()
         self.offsets = self._offsets()
         self.log = SessionLog(out, robot, self._facts, settings.frames)

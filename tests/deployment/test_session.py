@@ -222,6 +222,13 @@ def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: R
     assert "does not divide" in (tmp_path / "s" / "log.jsonl").read_text()
 
 
+def test_a_serial_number_of_no_channel_is_refused(dry_run, tmp_path: Path) -> None:
+    """It would otherwise never be asked for."""
+    settings = dry_run[1].model_copy(update={"drives": DrivesTable(serial={"lefd": 5})})
+    with pytest.raises(InputError, match="no channel 'lefd'; did you mean 'left'"):
+        deploy(settings, "check", tmp_path / "s", simulated=True)
+
+
 def test_a_robot_without_motors_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no motors"):
         deploy(Deployment(robot="smooth_arm"), "dry-run", tmp_path / "s")
@@ -232,6 +239,7 @@ def test_a_robot_without_motors_is_refused(tmp_path: Path) -> None:
     [
         ("robot = 'x'\nrate_hz = 130\n", "whole number of milliseconds"),
         ("robot = 'x'\nrates = 3\n", "unknown key 'rates'"),
+        ("robot = 'x'\nrate_hz = 10\n", "every 100 ms, and stop after 60 ms of silence"),
         ("robot = 'x'\n[safety]\nmisses = 0\n", "safety.misses"),
         ("robot = 'x'\n[sensor]\nrotation = [[1,0,0],[0,1,0],[0,0,-1]]\n", "reflection"),
         ("robot = ", "cannot be read"),
