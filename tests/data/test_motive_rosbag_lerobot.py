@@ -289,6 +289,21 @@ def test_a_marker_of_another_rate_is_brought_to_the_times_of_the_first():
     np.testing.assert_allclose(table[::5, 3], slow)
 
 
+def test_the_turn_of_a_pushed_body_is_interpolated_over_lost_poses():
+    """The tracker comes back with the other sign of the quaternion, which is the same rotation."""
+    time, names = np.arange(0.0, 1.0, 0.0025), [f"o.{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    turn = 0.3 * time
+    pose = np.column_stack([time, time, time, 0.0 * time, 0.0 * time, np.sin(turn / 2.0), np.cos(turn / 2.0)])
+    pose[120:122] = np.nan
+    pose[122:, 3:] *= -1.0
+    rows = np.arange(0.001, 0.99, 0.01)
+    streams = [Stream("a", rows, pd.DataFrame({"a": rows})), Stream("o", time, pd.DataFrame(pose, columns=names))]
+    table = observed(streams, "t", ["a"], names, "here")
+    found = 2.0 * np.arctan(table["o.qz"] / table["o.qw"])
+    np.testing.assert_allclose(found, 0.3 * rows, atol=1e-6)
+    assert (table["o.qw"] > 0.9).all()
+
+
 def test_a_pushed_body_may_come_from_the_bag(tmp_path):
     pose = [
         f"/mocap/tip.pose.{part}" for part in (*(f"position.{a}" for a in "xyz"), *(f"orientation.{a}" for a in "xyzw"))
