@@ -189,8 +189,8 @@ class _Session:
         self._stack.callback(self._leave)
         receivers = [thread.native_id for thread in self.network.receivers if thread.native_id is not None]
         self._stack.enter_context(real_time(threads=receivers))
-        guards = settings.safety.guards()
         motors = self._motors()
+        guards = settings.safety.guards([motor.node for motor in motors])
         drives = [
             Drive(self.network, motor, identity.eds, offset, identity.answer_s, identity.units, identity.unguarded)
             for motor, offset in zip(motors, self.offsets, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -134,9 +134,10 @@ class SafetyTable(_Table):
             self.following_time_s,
         )
 
-    def guards(self) -> Guards:
-        """For the drives."""
+    def guards(self, nodes: Collection[int]) -> Guards:
+        """For the drives of these ``nodes``: the master takes the highest number that is none of theirs."""
         return Guards(
+            master_node=max(set(range(1, 128)) - set(nodes)),
             master_timeout_s=self.heartbeat_s,
             drive_heartbeat_s=0.25 * self.heartbeat_s,
             following_error_m=self.following_error_m,

@@ -180,7 +180,7 @@ def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
     settings = Deployment(robot="motor_arm", homing=homing, simulation=simulation, drives=SLOW, safety=PATIENT)
     outcome = deploy(settings, "home", tmp_path / "s", simulated=True)
     assert outcome.cause is Cause.HOMING_FAILED
-    assert "is its cable off?" in outcome.detail
+    assert "is its cable off, or its sign in the robot file the other one?" in outcome.detail
     assert not (tmp_path / "s" / "homing.json").exists()
     assert np.abs(read_journal(tmp_path / "s")[1]["length"]).max() < 0.0101
 
@@ -220,6 +220,12 @@ def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: R
         deploy(settings, "dry-run", tmp_path / "s")
     assert json.loads((tmp_path / "s" / "summary.json").read_text())["cause"] == "refused"
     assert "does not divide" in (tmp_path / "s" / "log.jsonl").read_text()
+
+
+def test_the_master_takes_a_node_number_that_no_drive_has() -> None:
+    """Drives of some makers leave the works as node 127."""
+    assert SafetyTable().guards([1, 2, 3]).master_node == 127
+    assert SafetyTable().guards([127, 126, 3]).master_node == 125
 
 
 def test_a_serial_number_of_no_channel_is_refused(dry_run, tmp_path: Path) -> None:
