@@ -279,7 +279,7 @@ class CsvTable:
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = sorted({name for name in names if name and names.count(name) > 1})  # spreadsheets add nameless columns
     if repeated:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
 
@@ -291,6 +291,7 @@ def _check_rectangular(path: Path, lines: Sequence[str], separator: str) -> None
     for row, line in enumerate(lines[1:]):
         found = len(_cells(line, separator))
         if found != fields:
+            _check_first_line(path, lines, separator)
             last = row == len(lines) - 2
             raise InputError(
                 f"has {found} values where the header names {fields}" + (": the file is cut short" if last else ""),
@@ -299,3 +300,15 @@ def _check_rectangular(path: Path, lines: Sequence[str], separator: str) -> None
                 if found == 2 * fields
                 else ("fetch the file again or drop the row" if last else "repair the row"),
             )
+
+
+def _check_first_line(path: Path, lines: Sequence[str], separator: str) -> None:
+    """Raise an InputError where names of columns stand further down, below what a program says of itself."""
+    width = len(_cells(lines[-1], separator))
+    first = next(row for row, line in enumerate(lines) if len(_cells(line, separator)) == width)
+    if first > 0 and numbers_of(pd.Series(_cells(lines[first], separator))).isna().all():
+        raise InputError(
+            f"the names of its {width} columns stand in line {first + 1}, below other lines",
+            where=str(path),
+            remedy="leave out the lines above them",
+        )

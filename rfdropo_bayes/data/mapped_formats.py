@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from rfdropo_bayes.data import lerobot, motive_csv, named_columns, rosbag
 from rfdropo_bayes.data.csv_table import MOTIVE, CsvTable
-from rfdropo_bayes.data.named_columns import CsvColumns, coordinates, read_tables
+from rfdropo_bayes.data.named_columns import CsvColumns, command_clock, coordinates, read_tables
 from rfdropo_bayes.data.plain_csv import command_table
 from rfdropo_bayes.data.recorded import Origin
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -74,7 +74,7 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
         raise InputError(f"is of the format {found!r}, not {format!r}", where=str(path), remedy=f'use "{found}"')
     places = coordinates(columns)
     if format == rosbag.FORMAT:
-        return Observed(rosbag.read_observations(path, columns), columns)
+        return Observed(rosbag.read_observations(path, columns), _in_seconds(columns, path))
     if format == lerobot.FORMAT:
         number = lerobot.episode_numbers(path)[0] if episode is None else episode
         frame = lerobot.read_episode(path, number)
@@ -83,8 +83,14 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
         file = motive_csv.read_motive(path)
         file.table.require(places)
         unit = file.length_unit or columns.position_unit
-        return Observed(file.table, changed(columns, where=str(path), position_unit=unit))
+        return Observed(file.table, changed(_in_seconds(columns, path), where=str(path), position_unit=unit))
     return Observed(CsvTable(path, places, machine_written=False), columns)
+
+
+def _in_seconds(columns: CsvColumns, path: Path) -> CsvColumns:
+    """The same for observations whose times the format has in seconds; commands in a CSV keep their own unit."""
+    unit = command_clock(columns)[1]
+    return changed(columns, where=str(path), time_unit="s", command_time_unit=unit)
 
 
 def read_mapped(
@@ -113,8 +119,10 @@ def read_mapped(
     source = command_table(commands, columns)
     name = path.name.removesuffix(".gz")
     if format == rosbag.FORMAT and source is None:
-        source = rosbag.read_commands(path, columns)
-        columns = changed(columns, where=str(path), command_time=columns.time)
+        source, clock = rosbag.read_commands(path, columns), rosbag.clock_of(columns)
+        columns = changed(columns, where=str(path), command_time=clock, command_time_unit="s")
+        if columns.time is None:  # rows are numbered from the first one on, and so are the times of commands
+            source.frame[clock] -= table.frame[clock].iloc[0]
     if format == motive_csv.FORMAT and source is None:
         raise InputError(
             "has no commands: Motive records none",

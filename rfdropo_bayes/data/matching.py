@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rfdropo_bayes.data.mapped_formats import MAPPED
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -21,7 +22,7 @@ def shared_markers(trajectories: Sequence[Trajectory], markers: Sequence[str]) -
                 f"no marker matches by name: recording has {own}, robot has {', '.join(markers)}",
                 where=trajectory.name,
                 remedy="name them under [data.columns] markers"
-                if trajectory.dataset.attrs["format"] == "csv"
+                if trajectory.dataset.attrs["format"] in MAPPED
                 else "use the robot that was recorded, or name the markers alike in its file",
             )
     shared = set.intersection(*(set(trajectory.marker_names) for trajectory in trajectories))
@@ -39,7 +40,7 @@ def shared_markers(trajectories: Sequence[Trajectory], markers: Sequence[str]) -
 def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -> None:
     """Raise InputError where the commands of a recording are not those of a robot's ``channels``, in ``unit``."""
     own = trajectory.cable_names
-    plain = trajectory.dataset.attrs["format"] == "csv"
+    plain = trajectory.dataset.attrs["format"] in MAPPED
     if len(own) != len(channels):
         raise InputError(
             f"recording has {_counted(own)}, robot has {_counted(channels)}",

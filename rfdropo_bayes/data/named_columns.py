@@ -64,7 +64,10 @@ class CsvColumns(BaseModel):
         description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; for "
         '"rosbag": "header", stamps where messages have them, or "log", the recorder\'s times',
     )
-    time_unit: TimeUnit = Field(default="s", description="unit of the times; dates and durations need none")
+    time_unit: TimeUnit = Field(
+        default="s",
+        description='unit of the times; dates and durations need none, nor do "rosbag" and "motive-csv": seconds',
+    )
     sample_time: float | None = Field(
         default=None,
         gt=0,

@@ -176,9 +176,14 @@ def _missing(
 
 
 def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:
-    """Poses whose quaternion keeps its sign from row to row, the first with w >= 0 (q and -q are the same rotation)."""
+    """Poses whose quaternion keeps its sign from one that is known to the next, the first with w >= 0.
+
+    The quaternions q and -q are the same rotation; rows without a pose are left as they are.
+    """
     pose = np.array(pose, dtype=float)
-    turn = np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0)
-    first = -1.0 if pose.size and pose[0, 6] < 0.0 else 1.0
-    pose[:, 3:] *= first * np.concatenate([[1.0], np.cumprod(turn)])[:, None][: len(pose)]
+    known = np.flatnonzero(np.isfinite(pose[:, 3:]).all(axis=1))
+    seen = pose[known, 3:]
+    turn = np.where((seen[1:] * seen[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
+    first = -1.0 if len(seen) and seen[0, 3] < 0.0 else 1.0
+    pose[known, 3:] *= first * np.concatenate([[1.0], np.cumprod(turn)])[:, None][: len(known)]
     return pose

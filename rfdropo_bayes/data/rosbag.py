@@ -113,7 +113,7 @@ def read_observations(path: Path, columns: CsvColumns) -> CsvTable:
     Raises:
         InputError: see `read_streams`; a column that is not there; positions in several coordinate frames.
     """
-    clock, places, pose = _clock(columns), coordinates(columns), columns.object_pose
+    clock, places, pose = clock_of(columns), coordinates(columns), columns.object_pose
     names = [*places, *(columns.tensions or ()), *(columns.motor_angles or ())]
     streams = read_streams(path, _topics([*names, *(pose or ())]), clock)
     one_frame(streams, [*places, *(pose or ())], str(path))
@@ -126,7 +126,7 @@ def read_commands(path: Path, columns: CsvColumns) -> CsvTable:
     Raises:
         InputError: see `read_streams`; a column that is not there or holds nothing.
     """
-    clock, names = _clock(columns), columns.commands
+    clock, names = clock_of(columns), columns.commands
     sent = commanded(read_streams(path, _topics(names), clock), clock, names, str(path))
     return CsvTable.of_frame(sent, str(path), names)
 
@@ -135,7 +135,14 @@ def _topics(names: Sequence[str]) -> set[str]:
     return {name.split(".")[0] for name in names}
 
 
-def _clock(columns: CsvColumns) -> Clock:
+def clock_of(columns: CsvColumns) -> Clock:
+    """The clock of a bag, which is the name of its column of times [s]; header stamps where rows are numbered.
+
+    Raises:
+        InputError: a bag has no such clock.
+    """
+    if columns.time is None:
+        return "header"
     if columns.time in CLOCKS:
         return cast(Clock, columns.time)
     raise InputError(

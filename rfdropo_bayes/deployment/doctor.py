@@ -89,8 +89,8 @@ def scan(bus: BusTable, patience: float = 0.5) -> dict[str, dict[str, int]]:
     answers: dict[tuple[int, int, int], int] = {}
 
     def take(identifier: int, data: bytearray, timestamp: float) -> None:
-        if len(data) == 8 and data[0] & 0xE3 == 0x43:  # an expedited answer that states its size
-            size = 4 - (data[0] >> 2 & 3)
+        if len(data) == 8 and data[0] & 0xE2 == 0x42:  # an expedited answer, which may state its size
+            size = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
             key = (identifier - 0x580, int.from_bytes(data[1:3], "little"), data[3])
             answers[key] = int.from_bytes(data[4 : 4 + size], "little")
 

@@ -34,7 +34,10 @@ from rfdropo_bayes.deployment.vendors import (
     Units,
     acceleration_counts,
     check_guards,
+    check_home_offset,
+    check_polarity,
     check_rated_torque,
+    check_travel,
     speed_counts,
 )
 from rfdropo_bayes.errors import InputError
@@ -196,7 +199,7 @@ class Drive:
 
         Raises:
             InputError: on silence, a wrong identity or type, no cyclic synchronous position, another rated torque or
-                unit, or a guard that it lacks.
+                unit, a guard that it lacks, or positions that it reverses or shifts.
         """
         self._check_layout()
         kind = self.read(Object.DEVICE_TYPE)
@@ -210,6 +213,7 @@ class Drive:
             if not found["modes"] & objects.CSP_BIT:
                 raise InputError("has no cyclic synchronous position mode", where=self.name, remedy="use another drive")
         check_guards(self.lacking(), self.unguarded, where=f"{self.name}, data sheet")
+        self._check_positions()
         if self.knows(Object.RATED_TORQUE):
             found["rated_torque"] = self.read(Object.RATED_TORQUE)
             where = f"{self.name}, object 0x6076"
@@ -242,6 +246,25 @@ class Drive:
         if self.knows(Object.QUICK_STOP_DECELERATION):
             acceleration = acceleration_counts(self.units.acceleration, told[1], turn, self.name)
         return speed, acceleration
+
+    def _check_positions(self) -> None:
+        """Positions must be those of the encoder, neither reversed nor shifted."""
+        if self.knows(Object.POLARITY):
+            check_polarity(self.read(Object.POLARITY), self.name)
+        if self.knows(Object.HOME_OFFSET):
+            check_home_offset(self.read(Object.HOME_OFFSET), self.unguarded, self.name)
+
+    def _ends(self) -> list[int]:
+        """Least and greatest position of the travel [counts].
+
+        Raises:
+            InputError: if the drive's position would wrap in it.
+        """
+        ends = sorted(self.motor.counts(length, self.offset) for length in self.motor.length_limit_m)
+        told = all(self.knows(Object.POSITION_RANGE, subindex) for subindex in (1, 2))
+        wrap = (self.read(Object.POSITION_RANGE, 1), self.read(Object.POSITION_RANGE, 2)) if told else (0, 0)
+        check_travel(ends, wrap, self.name)
+        return ends
 
     def _check_layout(self) -> None:
         """A data sheet in which the process data have other sizes is another drive's."""
@@ -309,7 +332,8 @@ class Drive:
             say: takes a line for every object that is left out, or set to less than was asked.
 
         Raises:
-            InputError: where the drive does not keep what is written, or lacks a guard that it must have.
+            InputError: where the drive does not keep what is written, lacks a guard that it must have, or would wrap
+                its position within the travel.
         """
         lacking = self.lacking()
         check_guards(lacking, self.unguarded, where=f"{self.name}, data sheet")
@@ -355,7 +379,7 @@ class Drive:
     def _settings(self, period: float, guards: Guards) -> list[tuple[int, int, int]]:
         """Index, subindex and value of everything that is set, in the drive's own units."""
         motor = self.motor
-        ends = sorted(motor.counts(length, self.offset) for length in motor.length_limit_m)
+        ends = self._ends()
         fastest = motor.rate_limit_m_s * motor.counts_per_metre
         speed, acceleration = self._factors()
         braking = motor.acceleration_limit_m_s2 * motor.counts_per_metre

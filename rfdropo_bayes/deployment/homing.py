@@ -139,7 +139,8 @@ class Homing:
             goal[index] += step
             if goal[index] > motor.length_limit_m[1]:
                 way = 1e3 * self._table.travel_m
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {way:.0f} mm: is its cable off?")
+                asked = "is its cable off, or its sign in the robot file the other one?"
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {way:.0f} mm: {asked}")
             loop.set_points.towards(loop.set_points.clamp(goal))
             loop.command = loop.set_points.length.copy()
             loop.cycle(Phase.HOMING, acted=True)

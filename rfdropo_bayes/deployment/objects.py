@@ -42,7 +42,10 @@ class Object(IntEnum):
     RATED_TORQUE = 0x6076  # [mN m]; vendors differ
     TORQUE = 0x6077  # [per mille of rated]
     TARGET_POSITION = 0x607A
+    POSITION_RANGE = 0x607B  # where positions wrap; 0, 0 for nowhere
+    HOME_OFFSET = 0x607C
     POSITION_LIMIT = 0x607D
+    POLARITY = 0x607E
     MAX_MOTOR_SPEED = 0x6080  # [1/min]; vendors differ
     QUICK_STOP_DECELERATION = 0x6085  # vendors differ
     VELOCITY_UNIT = 0x60A9  # of the drive's velocities, in a code

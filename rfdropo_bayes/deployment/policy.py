@@ -268,13 +268,42 @@ def _open(content: bytes, where: str) -> tuple[Any, PolicyLayout]:
     return session, PolicyLayout.from_json(text, where=where)
 
 
+EVEN = 0.01
+"""Share of a period by which half of a recording's commands may come beside it. The commands of the physical trunk are
+1e-5 of theirs off; commands at 30 Hz are 0.1 of the nearest period of a loop at 100 Hz off."""
+
+
+_INSTANT = 1e-6  # periods: a command that comes half a period late belongs to the next, whatever is rounded
+
+
+def replay_rate(recording: Trajectory, rate_hz: float) -> float:
+    """Rate at which commands are sent again [Hz].
+
+    It divides the loop's ``rate_hz``: the nearest one to the commands' own where they come evenly at it, as those of a
+    session do; else the loop's own.
+    """
+    gaps = np.diff(recording.command_time)
+    nearest = rate_hz / max(1, round(rate_hz * (float(np.median(gaps)) if gaps.size else 0.1)))
+    return nearest if _evenly(gaps * nearest) else rate_hz
+
+
+def _evenly(periods: Float[np.ndarray, " gap"]) -> bool:
+    """Whether times between commands are whole periods, but for some of them."""
+    whole = np.maximum(1.0, np.round(periods))
+    return periods.size == 0 or float(np.median(np.abs(periods - whole))) <= EVEN
+
+
 class RecordedCommands:
-    """The commands of a recording, sent again.
+    """The commands of a recording, sent again: those before its first row, too.
+
+    Commands that came evenly at the rate each stay in force for whole periods: a beat that their session missed must
+    not turn into a command twice or never. Others are sent in the period that is nearest to their own time, and the
+    last one where several fall into one period.
 
     Args:
         recording: of an earlier session, or any trajectory of this robot.
         robot: that is to be driven.
-        rate_hz: of the commands; each stays in force for a whole number of periods.
+        rate_hz: of the periods; see `replay_rate`.
 
     Raises:
         InputError: if channels or unit do not fit.
@@ -292,11 +321,13 @@ class RecordedCommands:
             )
         self.rate_hz, self.start = rate_hz, np.array(recording.initial_command)
         times = np.append(recording.command_time, max(recording.time[-1], recording.command_time[-1] + 1.0 / rate_hz))
-        before = round(float(times[0]) * rate_hz)
-        # Each command for whole periods: a beat that its session missed must not turn into a command twice or never.
-        periods = np.maximum(1, np.round(np.diff(times) * rate_hz)).astype(int)
+        periods = (times - min(0.0, times[0])) * rate_hz  # since the recording or its first command began
+        apart, place = np.diff(periods), np.floor(periods + 0.5 + _INSTANT)
+        held = np.maximum(1, np.round(apart)) if _evenly(apart[:-1]) else np.diff(place)
         commands = np.concatenate([recording.initial_command[None], recording.command])
-        self._commands = np.repeat(commands, np.append(before, periods), axis=0)
+        self._commands = np.repeat(commands, np.append(place[0], held).astype(int), axis=0)
+        self.last_s = float(len(self._commands) - held[-1]) / rate_hz
+        """After how long the last command is sent [s]."""
         self._next = 0
 
     def rehearse(self) -> None:

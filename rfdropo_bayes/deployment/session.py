@@ -29,7 +29,7 @@ from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals,
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
 from rfdropo_bayes.deployment.loop import ControlLoop, Phase
-from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands
+from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands, replay_rate
 from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
@@ -147,6 +147,7 @@ class _Session:
         self.found: dict[str, dict[str, int]] = {}
         self.without: dict[str, list[str]] = {}
         self.source: CommandSource | None = None
+        settings.drives.check_serial(robot.channel_names)
         self._load_policy()
         self.offsets = self._offsets()
         self.log = SessionLog(out, robot, self._facts, settings.frames)
@@ -188,8 +189,8 @@ class _Session:
         self._stack.callback(self._leave)
         receivers = [thread.native_id for thread in self.network.receivers if thread.native_id is not None]
         self._stack.enter_context(real_time(threads=receivers))
-        guards = settings.safety.guards()
         motors = self._motors()
+        guards = settings.safety.guards([motor.node for motor in motors])
         drives = [
             Drive(self.network, motor, identity.eds, offset, identity.answer_s, identity.units, identity.unguarded)
             for motor, offset in zip(motors, self.offsets, strict=True)
@@ -226,7 +227,13 @@ class _Session:
                 raise InputError("names no recording", where="replay", remedy="give one with --recording")
             path = Path(commands)
             trajectory = session_trajectory(path, (Phase.RUNNING,)) if path.is_dir() else Trajectory.load(path)
-            self.source = RecordedCommands(trajectory, self.robot, _rate_of(trajectory, self.settings.rate_hz))
+            again = RecordedCommands(trajectory, self.robot, replay_rate(trajectory, self.settings.rate_hz))
+            if again.last_s >= self.settings.duration_s:
+                limit = f"duration_s = {self.settings.duration_s:g} s ends the replay before"
+                self.log.event(
+                    "note", f"the last command of {trajectory.name} comes after {again.last_s:.4g} s; {limit}"
+                )
+            self.source = again
         if self.source is None and self.mode not in (Mode.CHECK, Mode.HOME):
             raise InputError("names no policy", where="deployment", remedy="add [policy] file")
         if self.source is not None:
@@ -335,13 +342,6 @@ class _Session:
             "schema_version": SCHEMA_VERSION,
         }
         (self.out / SUMMARY).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def _rate_of(trajectory: Trajectory, rate_hz: float) -> float:
-    """Rate of a recording's commands: the nearest that divides the rate of the loop."""
-    gaps = np.diff(trajectory.command_time)
-    gap = float(np.median(gaps)) if gaps.size else 0.1
-    return rate_hz / max(1, round(rate_hz * gap))
 
 
 def _figures(loop: ControlLoop, period: float) -> dict[str, Any]:

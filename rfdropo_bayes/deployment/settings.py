@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,7 @@ from rfdropo_bayes.deployment.sensors import SensorTable
 from rfdropo_bayes.deployment.vendors import WITHOUT, AccelerationUnit, SpeedUnit, TorqueUnit, Units
 from rfdropo_bayes.deployment.watch import Patience
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.tables import parse_assignment, parse_table, set_entry
+from rfdropo_bayes.tables import nearest, parse_assignment, parse_table, set_entry
 
 
 class _Table(BaseModel):
@@ -65,6 +65,13 @@ class DrivesTable(_Table):
     def units(self) -> Units:
         """For the drives."""
         return Units(self.torque_unit, self.speed_unit, self.acceleration_unit)
+
+    def check_serial(self, channels: Sequence[str]) -> None:
+        """Raise an InputError that names the first of ``serial`` that is none of the robot's channels."""
+        for channel in self.serial:
+            if channel not in channels:
+                remedy = nearest(channel, channels)
+                raise InputError(f"no channel {channel!r}", where="[drives] serial", remedy=remedy)
 
     def identity(self, channel: str) -> Identity:
         """What the drive of a channel must say of itself."""
@@ -127,9 +134,10 @@ class SafetyTable(_Table):
             self.following_time_s,
         )
 
-    def guards(self) -> Guards:
-        """For the drives."""
+    def guards(self, nodes: Collection[int]) -> Guards:
+        """For the drives of these ``nodes``: the master takes the highest number that is none of theirs."""
         return Guards(
+            master_node=max(set(range(1, 128)) - set(nodes)),
             master_timeout_s=self.heartbeat_s,
             drive_heartbeat_s=0.25 * self.heartbeat_s,
             following_error_m=self.following_error_m,
@@ -203,6 +211,11 @@ class Deployment(_Table):
         period = 1e3 / self.rate_hz
         if abs(period - round(period)) > 1e-6:
             raise ValueError(f"rate_hz = {self.rate_hz:g}: the period is not a whole number of milliseconds")
+        if period >= 1e3 * self.safety.heartbeat_s:
+            raise ValueError(
+                f"rate_hz = {self.rate_hz:g}: the drives hear from the loop every {period:g} ms, and stop after "
+                f"{1e3 * self.safety.heartbeat_s:g} ms of silence: raise rate_hz or safety.heartbeat_s"
+            )
         return self
 
 

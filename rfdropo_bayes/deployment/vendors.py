@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Literal, NamedTuple
 
 from rfdropo_bayes.deployment.objects import Object
@@ -157,6 +157,73 @@ def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: s
 
 def _agree(found: float, expected: float) -> bool:
     return abs(found - expected) <= 0.02 * expected + 1.0  # drives round to whole units
+
+
+POSITION_REVERSED = 1 << 7
+"""Of 0x607E."""
+COUNTER = -(2**31), 2**31 - 1
+"""Least and greatest position of 32 bits."""
+
+
+def check_polarity(word: int, where: str) -> None:
+    """Refuse a drive that reverses positions: some reverse their targets alone, and none need reverse its torque.
+
+    Args:
+        word: what 0x607E says.
+        where: for messages.
+
+    Raises:
+        InputError: if the bit of positions is set.
+    """
+    if word & POSITION_REVERSED:
+        raise InputError(
+            f"reverses positions (0x607E is 0x{word:02X}), and need not reverse measured positions and torques alike",
+            where=where,
+            remedy="set 0x607E to 0 with the vendor's own program, and the other sign in the robot file's [[motors]]",
+        )
+
+
+def check_home_offset(offset: int, unguarded: Collection[int], where: str) -> None:
+    """Refuse a drive that shifts the ends of the travel which it is given, unless its owner bears that.
+
+    Args:
+        offset: what 0x607C says [counts].
+        unguarded: objects that the owner has named.
+        where: for messages.
+
+    Raises:
+        InputError: if there is an offset, which the standard takes off the limits of 0x607D.
+    """
+    if offset and Object.POSITION_LIMIT not in unguarded:
+        raise InputError(
+            f"has a home offset (0x607C is {offset}), by which it shifts the ends of the travel that it is given",
+            where=where,
+            remedy="set 0x607C to 0 with the vendor's own program, or state [drives] unguarded = [0x607D] if something "
+            "else guards the ends",
+        )
+
+
+def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None:
+    """Refuse a travel [counts] in which the drive's position would wrap.
+
+    Args:
+        ends: least and greatest position.
+        wrap: what 0x607B says; 0, 0 for nothing.
+        where: for messages.
+
+    Raises:
+        InputError: if an end is beyond the counter, or beyond where the drive wraps it.
+    """
+    low, high = COUNTER if wrap[0] >= wrap[1] else wrap
+    if ends[0] <= low or ends[1] >= high:
+        whose = "32-bit positions end" if (low, high) == COUNTER else "it wraps positions by its object 0x607B"
+        raise InputError(
+            f"its travel goes from {ends[0]} to {ends[1]} counts, and {whose} at {low} and {high}",
+            where=where,
+            remedy="set its position to zero where it stands (homing method 37, or the vendor's own program), then home"
+            if (low, high) == COUNTER
+            else "set both ends of 0x607B to 0 with the vendor's own program",
+        )
 
 
 WITHOUT: dict[int, str] = {

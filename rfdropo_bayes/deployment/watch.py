@@ -49,7 +49,7 @@ class Watch:
     def begin(self) -> None:
         """Look on from now; what came before does not count."""
         self._short = [drive.short_frames for drive in self._drives.all]
-        self._seen = len(self._drives.emergencies)
+        self._drives.emergencies.clear()
         self._started = time.monotonic()
         self._lagging: dict[int, float] = {}  # node -> since when
 
@@ -79,9 +79,8 @@ class Watch:
         self._check_deadlines(tick)
 
     def _check_emergencies(self) -> None:
-        news = list(self._drives.emergencies)[self._seen :]
-        self._seen = len(self._drives.emergencies)
-        for emergency in news:
+        while self._drives.emergencies:
+            emergency = self._drives.emergencies.popleft()
             if emergency.code == 0x8611:
                 raise Stop(Cause.FOLLOWING_ERROR, f"drive {emergency.channel!r} does not follow its set-points")
             if emergency.code:

@@ -251,6 +251,21 @@ def test_decimal_commas_between_commas_are_explained(tmp_path):
         plain(tmp_path / "own.csv", "x;y;z;u\n100,5;0;0;1,5\n1.005,5;0;0;1,5\n100;0;0;1\n")
 
 
+def test_lines_above_the_names_of_the_columns_are_named(tmp_path):
+    """Loggers say there when they began; the row below the names is not at fault."""
+    with fails("the names of its 4 columns stand in line 3, below other lines; leave out the lines above them"):
+        plain(tmp_path / "own.csv", "# logger 3.1\n# begun at noon\n" + ROWS)
+    with fails("row 0: has 5 values where the header names 4"):
+        plain(tmp_path / "own.csv", "x,y,z,u\n" + ROWS.removeprefix("x,y,z,u\n").replace("\n", ",\n"))
+
+
+def test_columns_without_names_are_not_read(tmp_path):
+    """Spreadsheets add commas for cells that once were touched."""
+    names, *rows = ROWS.splitlines()
+    found = plain(tmp_path / "own.csv", "\n".join([names + ",,", *(row + ",," for row in rows)]) + "\n")
+    assert found.position.shape == (3, 1, 3)
+
+
 def test_a_folder_is_no_recording(tmp_path):
     (tmp_path / "monday").mkdir()
     spec = DataSpec.parse({"format": "csv", "fit": ["monday"], "columns": COLUMNS})

@@ -18,6 +18,11 @@ def test_markers_that_do_not_match_by_name(build):
     )
     with pytest.raises(InputError, match="use the robot that was recorded"):
         shared_markers([build(format="netcdf")], ["low", "up"])
+    for format in ("motive-csv", "rosbag", "lerobot"):  # these have [data.columns], too
+        with pytest.raises(InputError, match=r"name them under \[data.columns\] markers"):
+            shared_markers([build(format=format)], ["low", "up"])
+        with pytest.raises(InputError, match=r"list the columns under \[data.columns\]"):
+            check_channels(build(format=format), ["b", "a"], "m")
 
 
 def test_markers_are_those_that_all_recordings_share_in_the_robot_s_order(build):

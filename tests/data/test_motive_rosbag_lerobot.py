@@ -219,6 +219,34 @@ def test_channels_on_topics_of_their_own_hold_their_commands(tmp_path):
     np.testing.assert_allclose(recording.command_time[::4], MOTION.command_time, atol=1e-6)
 
 
+def test_stamps_of_arrival_in_a_bag_may_be_replaced_by_a_sample_time(tmp_path):
+    """As the note on such stamps says; commands keep their distance from the first row."""
+    rows = np.arange(len(MOTION.time))
+    rosbag(MOTION, tmp_path / "run")
+    bunched = MOTION._replace(time=MOTION.time[rows // 4 * 4] + 3e-6 * (rows % 4))
+    rosbag(bunched, tmp_path / "late")
+    (recording,) = load(tmp_path, "rosbag", "late", bag_columns())
+    assert any("give sample_time = 0.0" in note for note in recording.notes)
+    step = float(np.diff(MOTION.time)[0])
+    (numbered,) = load(tmp_path, "rosbag", "late", bag_columns(time=None, sample_time=step))
+    check_motion(numbered, MOTION)
+    assert numbered.notes == []
+
+
+def test_formats_that_have_times_in_seconds_need_no_unit_of_them(tmp_path):
+    """The unit that is stated is that of the commands' file; a bag's stamps are nanoseconds for ROS alone."""
+    rosbag(MOTION, tmp_path / "run")
+    (recording,) = load(tmp_path, "rosbag", "run", bag_columns(time_unit="ns"))
+    check_motion(recording, MOTION)
+    motive_csv(MOTION, tmp_path / "take.csv")
+    commands_csv(MOTION, tmp_path / "sent.csv")
+    sent = pd.read_csv(tmp_path / "sent.csv")
+    sent.assign(t=1e3 * sent["t"]).to_csv(tmp_path / "sent.csv", index=False)
+    entry = {"observations": "take.csv", "commands": "sent.csv"}
+    (recording,) = load(tmp_path, "motive-csv", entry, motive_columns(time_unit="ms"))
+    check_motion(recording, MOTION)
+
+
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 def test_a_storage_file_alone_is_a_bag(tmp_path, storage):
     folder = rosbag(MOTION, tmp_path / "whole", storage=storage)
@@ -259,6 +287,21 @@ def test_a_marker_of_another_rate_is_brought_to_the_times_of_the_first():
     assert np.isnan(table[time > 0.92, 2]).all()
     assert np.flatnonzero(np.isfinite(table[:, 3])).tolist() == list(range(0, 50, 5))
     np.testing.assert_allclose(table[::5, 3], slow)
+
+
+def test_the_turn_of_a_pushed_body_is_interpolated_over_lost_poses():
+    """The tracker comes back with the other sign of the quaternion, which is the same rotation."""
+    time, names = np.arange(0.0, 1.0, 0.0025), [f"o.{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    turn = 0.3 * time
+    pose = np.column_stack([time, time, time, 0.0 * time, 0.0 * time, np.sin(turn / 2.0), np.cos(turn / 2.0)])
+    pose[120:122] = np.nan
+    pose[122:, 3:] *= -1.0
+    rows = np.arange(0.001, 0.99, 0.01)
+    streams = [Stream("a", rows, pd.DataFrame({"a": rows})), Stream("o", time, pd.DataFrame(pose, columns=names))]
+    table = observed(streams, "t", ["a"], names, "here")
+    found = 2.0 * np.arctan(table["o.qz"] / table["o.qw"])
+    np.testing.assert_allclose(found, 0.3 * rows, atol=1e-6)
+    assert (table["o.qw"] > 0.9).all()
 
 
 def test_a_pushed_body_may_come_from_the_bag(tmp_path):

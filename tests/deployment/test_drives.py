@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 
 from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.causes import Stop
 from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, controlword_towards
-from rfdropo_bayes.deployment.drives import Drives, Guards, Identity
+from rfdropo_bayes.deployment.clock import Tick
+from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, Reading
 from rfdropo_bayes.deployment.objects import Object
+from rfdropo_bayes.deployment.watch import Patience, Watch
 from rfdropo_bayes.errors import InputError
 
 LONG = 0.5  # [s]: a loaded machine answers in time, too
@@ -201,3 +204,20 @@ def test_emergencies_and_heartbeats_are_taken_in(rig) -> None:
     until(lambda: len(drives.emergencies) > 0)
     assert drives.emergencies[0].channel == "left"
     assert drives.emergencies[0].code == 0x2310
+
+
+def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig) -> None:
+    """Drives that report an error as gone, again and again, fill what is kept of them."""
+    drives = rig.drives()
+    watch = Watch(drives, Patience())
+    left = objects.EMCY + drives.all[1].motor.node
+    heard = drives.network.subscribers[left][-1]
+    for _ in range(3 * (drives.emergencies.maxlen or 0)):
+        heard(left, bytearray(8), 0.0)
+    tick = Tick(1, 0.0, 0.0, 0)
+    for drive in drives.all:
+        drive.reading = Reading(0x40, 0, 0, 0.0)
+    watch.check(tick, None)
+    heard(left, bytearray(objects.EMERGENCY.pack(0x2310, 1, b"")), 0.0)
+    with pytest.raises(Stop, match="drive 'left' says 0x2310"):
+        watch.check(tick, None)

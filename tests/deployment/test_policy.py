@@ -11,7 +11,7 @@ import pytest
 
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
-from rfdropo_bayes.deployment.policy import OnnxPolicy, PolicyScene, RecordedCommands
+from rfdropo_bayes.deployment.policy import OnnxPolicy, PolicyScene, RecordedCommands, replay_rate
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import ObservationPart
@@ -142,6 +142,49 @@ def test_a_recording_is_replayed_command_by_command_and_ends(robot: Robot) -> No
     acts = [source.act(scene(robot)) for _ in range(12)]
     np.testing.assert_allclose([act.command for act in acts[:10]], 1e-3 * np.arange(40).reshape(10, 4))
     assert acts[11] is None
+
+
+@pytest.mark.parametrize(("rate", "begins"), [(10, 0.0), (20, 0.0), (30, 0.0), (60, 0.0), (200, 0.0), (10, -1.0)])
+def test_a_recording_is_replayed_at_its_own_pace(robot: Robot, rate: int, begins: float) -> None:
+    """Commands of any rate, and of before the first row, are sent within half a beat of a 100 Hz loop."""
+    sent = begins + np.arange((3.0 - begins) * rate) / rate
+    command = 1e-6 * np.arange(1.0, len(sent) + 1)[:, None] * np.ones(4)
+    time = 0.01 * np.arange(301)
+    places = np.broadcast_to(robot.marker_points(), (301, 4, 3))
+    recording = Trajectory.build(
+        Origin("r", robot.name, "test"),
+        SentCommands(sent, command, "m", robot.channel_names),
+        Measured(time, places, robot.marker_names),
+    )
+    source = RecordedCommands(recording, robot, replay_rate(recording, 100.0))
+    acts = iter(lambda: source.act(scene(robot)), None)
+    given = np.array([act.command for act in acts])
+    assert len(given) / source.rate_hz == pytest.approx(3.0 - begins, abs=0.01)
+    assert source.last_s == pytest.approx(sent[-1] - begins, abs=0.005)
+    due = begins + np.arange(len(given)) / source.rate_hz
+    np.testing.assert_array_equal(given, recording.command_at(due + 0.4999 / 100.0))
+
+
+def test_commands_without_a_rate_are_replayed_when_they_came(robot: Robot) -> None:
+    """Events, seconds apart or tenths of one, and beats that a session missed, which are none."""
+    time = 0.01 * np.arange(501)
+    places = np.broadcast_to(robot.marker_points(), (501, 4, 3))
+
+    def rows(sent: np.ndarray) -> list[int]:
+        command = 1e-3 * np.arange(1.0, len(sent) + 1)[:, None] * np.ones(4)
+        made = Trajectory.build(
+            Origin("r", robot.name, "test"),
+            SentCommands(sent, command, "m", robot.channel_names),
+            Measured(time, places, robot.marker_names),
+        )
+        source = RecordedCommands(made, robot, replay_rate(made, 100.0))
+        acts = iter(lambda: source.act(scene(robot)), None)
+        given = np.array([act.command[0] for act in acts])
+        return (1 + np.flatnonzero(np.diff(given))).tolist()
+
+    assert rows(np.array([0.0, 0.5, 2.5, 3.2])) == [50, 250, 320]
+    late = 0.1 * np.arange(40) + 0.01 * (np.arange(40) >= 5)
+    assert rows(late) == list(range(1, 40))
 
 
 def test_a_recording_of_another_robot_is_refused(robot: Robot) -> None:

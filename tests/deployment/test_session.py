@@ -123,6 +123,10 @@ def test_a_session_is_replayed(dry_run, tmp_path: Path) -> None:
     folder, settings = dry_run
     outcome = deploy(settings, "replay", tmp_path / "again", simulated=True, commands=folder)
     assert outcome.cause is Cause.FINISHED, outcome.detail
+    assert "ends the replay before" not in (tmp_path / "again" / "log.jsonl").read_text()
+    short = settings.model_copy(update={"duration_s": 0.5})
+    deploy(short, "replay", tmp_path / "short", simulated=True, commands=folder)
+    assert "duration_s = 0.5 s ends the replay before" in (tmp_path / "short" / "log.jsonl").read_text()
     first, second = (Trajectory.load(path / "session.nc") for path in (folder, tmp_path / "again"))
     rows = min(len(first.command), len(second.command)) - 2
     np.testing.assert_allclose(second.command[:rows], first.command[:rows], atol=1e-9)
@@ -176,7 +180,7 @@ def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
     settings = Deployment(robot="motor_arm", homing=homing, simulation=simulation, drives=SLOW, safety=PATIENT)
     outcome = deploy(settings, "home", tmp_path / "s", simulated=True)
     assert outcome.cause is Cause.HOMING_FAILED
-    assert "is its cable off?" in outcome.detail
+    assert "is its cable off, or its sign in the robot file the other one?" in outcome.detail
     assert not (tmp_path / "s" / "homing.json").exists()
     assert np.abs(read_journal(tmp_path / "s")[1]["length"]).max() < 0.0101
 
@@ -218,6 +222,19 @@ def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: R
     assert "does not divide" in (tmp_path / "s" / "log.jsonl").read_text()
 
 
+def test_the_master_takes_a_node_number_that_no_drive_has() -> None:
+    """Drives of some makers leave the works as node 127."""
+    assert SafetyTable().guards([1, 2, 3]).master_node == 127
+    assert SafetyTable().guards([127, 126, 3]).master_node == 125
+
+
+def test_a_serial_number_of_no_channel_is_refused(dry_run, tmp_path: Path) -> None:
+    """It would otherwise never be asked for."""
+    settings = dry_run[1].model_copy(update={"drives": DrivesTable(serial={"lefd": 5})})
+    with pytest.raises(InputError, match="no channel 'lefd'; did you mean 'left'"):
+        deploy(settings, "check", tmp_path / "s", simulated=True)
+
+
 def test_a_robot_without_motors_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no motors"):
         deploy(Deployment(robot="smooth_arm"), "dry-run", tmp_path / "s")
@@ -228,6 +245,7 @@ def test_a_robot_without_motors_is_refused(tmp_path: Path) -> None:
     [
         ("robot = 'x'\nrate_hz = 130\n", "whole number of milliseconds"),
         ("robot = 'x'\nrates = 3\n", "unknown key 'rates'"),
+        ("robot = 'x'\nrate_hz = 10\n", "every 100 ms, and stop after 60 ms of silence"),
         ("robot = 'x'\n[safety]\nmisses = 0\n", "safety.misses"),
         ("robot = 'x'\n[sensor]\nrotation = [[1,0,0],[0,1,0],[0,0,-1]]\n", "reflection"),
         ("robot = ", "cannot be read"),

@@ -60,6 +60,8 @@ def sheet(tmp_path: Path) -> Write:
                 "DefaultValue": str(value), "PDOMapping": "0",
             }  # fmt: skip
         for section, values in (entries or {}).items():
+            if not parser.has_section(section):
+                parser.add_section(section)
             for key, text in values.items():
                 parser.set(section, key, text)
         path = tmp_path / "vendor.eds"
@@ -199,6 +201,62 @@ def test_a_value_that_a_drive_cannot_hold_is_refused(rigs) -> None:
     drive = masters(rig, str(objects.SIMULATED_EDS)).all[0]
     with pytest.raises(InputError, match="70000 does not fit into 16 bits"):
         drive.write(Object.MAX_TORQUE, 70_000)
+
+
+# Positions
+
+
+def test_a_drive_that_reverses_positions_is_refused(rigs, sheet: Write) -> None:
+    """A drive that reverses its targets alone would set out for the other side of zero as soon as it is enabled."""
+    eds = sheet(more={0x607E: 0x80})
+    with pytest.raises(InputError, match=r"0x607E is 0x80.*the other sign in the robot file"):
+        masters(rigs(eds=eds), eds).all[0].check(Identity())
+
+
+def test_the_polarity_of_speeds_is_no_concern_of_ours(rigs, sheet: Write) -> None:
+    eds = sheet(more={0x607E: 0x40})
+    masters(rigs(eds=eds), eds).all[0].check(Identity())
+
+
+def test_a_home_offset_that_shifts_the_ends_of_the_travel_is_refused_unless_they_are_given_up(rigs, sheet) -> None:
+    eds = sheet(more={0x607C: 5000})
+    rig = rigs(eds=eds)
+    with pytest.raises(InputError, match=r"0x607C is 5000.*unguarded = \[0x607D\]"):
+        masters(rig, eds).all[0].check(Identity())
+    masters(rig, eds, unguarded=(0x607D,)).all[0].check(Identity())
+
+
+def wrapping(sheet: Write, low: int, high: int) -> str:
+    """A data sheet of a drive that wraps its position between two ends."""
+    plain = {"DataType": "0x0004", "AccessType": "rw", "ObjectType": "0x7", "PDOMapping": "0"}
+    return sheet(
+        entries={
+            "607B": {"ParameterName": "range", "ObjectType": "0x8", "SubNumber": "3"},
+            "607Bsub0": plain | {"ParameterName": "n", "DataType": "0x0005", "AccessType": "ro", "DefaultValue": "2"},
+            "607Bsub1": plain | {"ParameterName": "low", "DefaultValue": str(low)},
+            "607Bsub2": plain | {"ParameterName": "high", "DefaultValue": str(high)},
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "refused"), [(0, 4095, True), (0, 0, False), (-(2**31), 2**31 - 1, False), (-(10**6), 10**6, False)]
+)
+def test_a_travel_in_which_the_drive_wraps_its_position_is_refused(rigs, sheet: Write, low, high, refused) -> None:
+    eds = wrapping(sheet, low, high)
+    drives = masters(rigs(eds=eds), eds)
+    if not refused:
+        return drives.configure(0.01, lambda text: None)
+    with pytest.raises(InputError, match=r"0x607B at 0 and 4095; set both ends of 0x607B to 0"):
+        drives.configure(0.01, lambda text: None)
+
+
+def test_a_counter_that_would_overflow_in_the_travel_is_refused_with_what_to_do(rigs) -> None:
+    """An absolute encoder stands anywhere: the motor's limits and units may well be right."""
+    drives = masters(rigs(), str(objects.SIMULATED_EDS))
+    drives.all[0].offset = 2.0**31 - 100.0
+    with pytest.raises(InputError, match=r"32-bit positions end at .*; set its position to zero .* then home"):
+        drives.configure(0.01, lambda text: None)
 
 
 # Guards

@@ -9,7 +9,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
-from rfdropo_bayes.simulators.adapters.mujoco_model import MuJoCo
+from rfdropo_bayes.simulators.adapters.mujoco_model import MuJoCo, first_tables
 from rfdropo_bayes.simulators.black_box import BlackBoxSimulator
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
@@ -183,6 +183,23 @@ def test_files_that_are_none(tmp_path):
         MuJoCo(tmp_path / "none.xml")
     with pytest.raises(InputError, match="cannot read"):
         MuJoCo(written(tmp_path, "<mujoco><worldbody><bod/></worldbody></mujoco>"))
+
+
+def test_a_urdf_is_sent_to_the_format_that_has_actuators(tmp_path):
+    """MuJoCo reads none of a URDF, its transmissions included."""
+    text = (
+        '<robot name="arm"><link name="base"/><link name="tip"><inertial><mass value="1"/>'
+        '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="j" type="continuous"><parent link="base"/><child link="tip"/><axis xyz="0 1 0"/></joint>'
+        '<transmission name="t"><joint name="j"/><actuator name="m"/></transmission></robot>'
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    said = r"arm.urdf: the model has no actuator.*write arm.xml with the text of mujoco.MjSpec.from_file\('arm.urdf'\)"
+    with pytest.raises(InputError, match=said):
+        MuJoCo(path, markers={"tip": "body/tip"}, channels={"c": "m"})
+    with pytest.raises(InputError, match=said):
+        first_tables(path, {}, ["c"])
 
 
 def test_a_rollout_that_diverges_has_a_status_and_leaves_no_log(tmp_path, monkeypatch):

@@ -174,7 +174,21 @@ def _elements(spec: Any, kind: str) -> Sequence[Any]:
 
 def first_tables(path: Path, markers: Mapping[str, Any], channels: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """See `adapters.first_tables`; and `adapter_tables`."""
-    return adapter_tables(_read(path).compile(), markers, channels)
+    model = _read(path).compile()
+    _check_actuators(model, path)
+    return adapter_tables(model, markers, channels)
+
+
+def _check_actuators(model: Any, path: Path) -> None:
+    """Raise an InputError where a model has nothing to command, as every URDF."""
+    if model.nu == 0:
+        remedy = "add actuators to its file"
+        if path.suffix == ".urdf":
+            remedy = (
+                f"MuJoCo reads none of a URDF: write {path.stem}.xml with the text of "
+                f"mujoco.MjSpec.from_file({path.name!r}).to_xml(), and add actuators there"
+            )
+        raise InputError("the model has no actuator to command", where=str(path), remedy=remedy)
 
 
 class MuJoCoRollouts:
@@ -252,11 +266,12 @@ class MuJoCoRollouts:
     def _commanded(self, channels: Mapping[str, str | int] | Sequence[str] | None) -> dict[str, int]:
         """Number of the actuator of each channel."""
         names = element_names(self.model, "actuator")
+        _check_actuators(self.model, self.path)
         if channels is None:
             channels = {name if not name.isdigit() else f"actuator_{name}": name for name in names}
         given = dict(channels) if isinstance(channels, Mapping) else {each: each for each in channels}
         if not given:
-            raise InputError("the model has no actuator to command", where="channels", remedy="add one to its file")
+            raise InputError("no actuator is commanded", where="channels", remedy="name one, or leave channels out")
         return {
             channel: number_of(self.model, "actuator", actuator, where=f"channel {channel!r}")
             for channel, actuator in given.items()
