@@ -285,8 +285,9 @@ class CalibrationProblem:
         values = {name: jax.ShapeDtypeStruct((), float) for name in self.names}
         steps = jnp.asarray(self.steps_for(self.n_rows))
         shapes = jax.eval_shape(lambda v: self.model.residuals(v, steps, self.measured), values)
-        ends = np.cumsum([part.size for part in shapes.values()])
-        parts = dict(zip(shapes, np.split(residuals, ends[:-1], axis=-1), strict=True))
+        names = self.model.channel_names
+        ends = np.cumsum([shapes[name].size for name in names])
+        parts = dict(zip(names, np.split(residuals, ends[:-1], axis=-1), strict=True))
         found = {}
         for channel in self.model.channels:
             if isinstance(channel, Series) and channel.independent:
@@ -369,9 +370,14 @@ class CalibrationProblem:
         return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=told)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
-        """Residuals by rollout, cut to the horizon where they have a time axis, and flattened."""
-        series = {channel.name for channel in self.model.channels if isinstance(channel, Series)}
-        cut = [part[:, :, :horizon] if name in series else part for name, part in white.items()]
+        """Residuals by rollout, cut to the horizon where they have a time axis, and flattened.
+
+        Channels come in the order of the model; a dictionary that JAX returns has another.
+        """
+        cut = []
+        for channel in self.model.channels:
+            part = white[channel.name]
+            cut.append(part[:, :, :horizon] if isinstance(channel, Series) else part)
         return jnp.concatenate([part.reshape(len(part), -1) for part in cut], axis=1)
 
 

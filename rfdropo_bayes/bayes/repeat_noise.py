@@ -94,7 +94,7 @@ def deviations(
             own = own & (own.sum(axis=0) > 1)
             parts.append(np.where(own, errors[list(group)] - mean, 0.0))
             counted.append(own)
-            freedom += own.sum() * (1.0 - 1.0 / len(group))
+            freedom += own.sum() - own.any(axis=0).sum()  # a mean for each row and column, of those that are there
             values += int(own.sum())
     return np.concatenate(parts), np.concatenate(counted), freedom / max(values, 1)
 

@@ -124,7 +124,8 @@ def calibrate(
         raise InputError(f"{datasets} data sets show nothing", where="--datasets", remedy="ask for 20 at least")
     prior_key, data_key = jax.random.split(key)
     prior = np.asarray(problem.to_unconstrained(problem.sample_prior(prior_key, 2000)), dtype=float)
-    digest = run_digest(problem, f"sbc {method}", sorted(dict(options).items()), key)
+    settings = sorted(options.items()) if isinstance(options, Mapping) else options
+    digest = run_digest(problem, f"sbc {method}", settings, key)
     rows = _known(log, digest, resume)[:datasets]
     for index in range(len(rows), datasets):
         began = time.monotonic()

@@ -16,7 +16,7 @@ from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OB
 from rfdropo_bayes.bayes.channels.tension import TENSION_NOISE
 from rfdropo_bayes.bayes.noise import Autoregression, noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_repeats
+from rfdropo_bayes.bayes.repeat_noise import deviations, group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
@@ -121,6 +121,21 @@ def test_the_log_likelihood_is_the_sum_of_the_channels_written_down_anew():
     }
 
 
+def test_residuals_of_all_channels_have_one_layout_traced_in_batches_and_taken_apart():
+    """JAX returns dictionaries in the order of their keys, and the tension stands before the motor angle."""
+    chosen = problem(recording(1), recording(3))
+    values = {"reach": 0.1, **SIZES}
+    single = {name: jnp.asarray(value) for name, value in values.items()}
+    white = np.asarray(chosen.residuals(single, ROWS))
+    batch = chosen.residual_batch({name: np.array([value]) for name, value in values.items()}, ROWS)
+    np.testing.assert_allclose(white, batch[0], rtol=1e-9)
+    series = chosen.independent_series(white)
+    assert set(series) == {"markers", "tension", "motor_angle"}
+    own = chosen.model.residuals(single, jnp.asarray(chosen.steps_for(ROWS)))
+    for name, (part, valid) in series.items():
+        np.testing.assert_allclose(part, np.asarray(own[name])[..., : valid.shape[-1]], rtol=1e-9)
+
+
 def across(share: float) -> np.ndarray:
     return share * np.ones((3, 3)) + (1.0 - share) * np.eye(3)
 
@@ -150,6 +165,30 @@ def test_known_noise_has_the_density_of_its_normal_distribution_and_draws_from_i
     valid[5] = False
     parts = [noise.row_log_density(error[rows], valid[rows]).sum() for rows in (slice(0, 5), slice(6, None))]
     assert noise.row_log_density(error, valid).sum() == pytest.approx(sum(parts))
+
+
+def test_slow_noise_is_drawn_as_large_in_the_first_row_as_in_the_last():
+    """4000 draws of 30 rows know a covariance to 3 % of the variance: 5 standard errors. A start at zero, 60 rows
+    before, would leave a third of the variance out."""
+    memory = np.array([1.0, 0.995, 0.988])
+    noise = Autoregression(np.array([2.0]), memory, "stated", np.inf)
+    drawn = noise.draw(np.random.default_rng(3), (4000, 30, 1))[..., 0]
+    lags = np.array([*memory, *np.zeros(27)])
+    for lag in range(3, 30):
+        lags[lag] = noise.predictors[0][-1] @ lags[lag - 1 : lag - 3 : -1]
+    wanted = 4.0 * lags[np.abs(np.subtract.outer(np.arange(30), np.arange(30)))]
+    np.testing.assert_allclose(np.cov(drawn.T), wanted, atol=5 * 4.0 * np.sqrt(2.0 / 4000))
+
+
+def test_a_repeat_that_a_marker_is_lost_in_adds_no_degrees_of_freedom():
+    """The mean square over the degrees of freedom is the variance: 2000 rows of three repeats, one coordinate lost in
+    the third, know it to 1.6 %; three times that."""
+    errors = 2e-3 * np.random.default_rng(4).normal(size=(4, 2000, 2))
+    valid = np.ones(errors.shape, dtype=bool)
+    valid[2, :, 1] = False
+    left, counted, share = deviations(errors, valid, ((0, 1, 2), (3,)))
+    assert share == pytest.approx((2 + 1) / (3 + 2))
+    assert np.sum(left**2) / (counted.sum() * share) == pytest.approx(2e-3**2, rel=0.055)
 
 
 def test_noise_of_repeats_is_that_which_they_differ_by():

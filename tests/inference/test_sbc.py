@@ -15,6 +15,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods, sbc
 from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 from rfdropo_bayes.posteriors import central_interval
 
 from .toys import LinearGaussian
@@ -93,6 +94,12 @@ def test_a_check_goes_on_where_it_stopped(monkeypatch, tmp_path):
         np.testing.assert_array_equal(resumed.checks[name].ranks, whole.checks[name].ranks)
     with pytest.raises(InputError, match="another check"):
         sbc.calibrate(LinearGaussian(), simulate, "exact", {}, jax.random.key(4), DATASETS, log=half, resume=True)
+
+
+def test_options_may_be_the_configuration_itself(monkeypatch):
+    monkeypatch.setattr(methods, "run", draws_of())
+    found = sbc.calibrate(LinearGaussian(), simulate, "smc", SmcConfig(particles=150), KEY, 20)
+    assert found.datasets == 20
 
 
 def test_holm_by_hand():

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
 MAX_ORDER = 3
@@ -178,13 +177,8 @@ class Autoregression:
         return jax.vmap(lambda k: self.draw_rows(k, rows))(jax.random.split(key, count))
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time column"]:
-        """A realisation of shape (..., time, column)."""
-        coefficients, deviation = self.predictors
-        warm = 0 if self.order == 0 else 60
-        white = rng.standard_normal((*shape[:-2], shape[-2] + warm, shape[-1]))
-        white = self.gather(white, np.ones(white.shape[-2:], dtype=bool))
-        filtered = lfilter([deviation[-1]], np.concatenate([[1.0], -coefficients[-1]]), white, axis=-2)
-        return self.scale * filtered[..., warm:, :]
+        """A realisation of shape (..., time, column), stationary from its first row on."""
+        return self.colour(rng.standard_normal(shape), np.ones(shape[-2:], dtype=bool))
 
 
 def rows_before(valid: Bool[np.ndarray, "*batch time column"]) -> np.ndarray:

@@ -252,7 +252,8 @@ class StraightProblem:
     """The same posterior in other coordinates: logarithms of what is positive, the problem's own for the rest.
 
     Args:
-        problem: whose unconstrained coordinates belong to one parameter each.
+        problem: whose unconstrained coordinates belong to one parameter each, or to one in units of another that is
+            positive.
         key: for the prior draws that tell which parameters are positive.
     """
 
@@ -278,8 +279,11 @@ class StraightProblem:
     def from_unconstrained(self, v: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`; values beyond a bound are returned as they are."""
         v = jnp.asarray(v)
-        own = self.problem.from_unconstrained(jnp.where(self.logarithmic, 0.0, v))
-        return {name: jnp.exp(v[:, j]) if self.logarithmic[j] else own[name] for j, name in enumerate(self.names)}
+        rest = self.problem.from_unconstrained(jnp.where(self.logarithmic, 0.0, v))
+        positive = {name: jnp.exp(v[:, j]) for j, name in enumerate(self.names) if self.logarithmic[j]}
+        # What is a deviation in units of a standard deviation has to know that one's own coordinate.
+        u = jnp.asarray(self.problem.to_unconstrained({**rest, **positive}))
+        return {**self.problem.from_unconstrained(jnp.where(self.logarithmic, u, v)), **positive}
 
     def log_prior(self, v: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log density in these coordinates; not a number beyond a bound."""

@@ -252,7 +252,7 @@ def step(
         population, done = refresh(last_key, population, info, evaluate, tuning, moves)
         left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
         rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
-        population = prolong(last_key, population, evaluate, tuning, done.moves, rounds)
+        population = prolong(jax.random.fold_in(key, 2), population, evaluate, tuning, done.moves, rounds)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
         population=population,

@@ -301,6 +301,9 @@ def prolong(
     """Equal-weight particles, and where each of some rounds of moves under the same target takes them.
 
     All are draws of the target; a hundred particles alone make coarse quantiles, the more so as resampling left copies.
+
+    The key must not be that of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``, and moves
+    by the same random numbers end near where they began.
     """
     found = [population]
     for index in range(rounds):

@@ -1,9 +1,15 @@
 """What shapes the moves of a population: its location and spread, of unlike sizes and of copies."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.inference.smc.moves import distinct_size, fit_reference, propose
+from rfdropo_bayes.bayes.pooling import Pooled
+from rfdropo_bayes.bayes.problem import ProblemDefaults
+from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.inference.smc.moves import StraightProblem, distinct_size, fit_reference, propose
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SIZES = np.array([1e-9, 1.0, 1e6])
 
@@ -46,3 +52,55 @@ def test_proposals_shaped_by_copies_of_one_particle_are_finite(where):
         proposal, ratio = propose(generator, draws(50) / SIZES, reference, 1.0 - 1e-3, 5.0)
     assert np.isfinite(proposal).all()
     assert np.isfinite(ratio).all()
+
+
+class DaysApart(ProblemDefaults):
+    """A zero that differs from day to day, with a spread that is inferred, and a stiffness that shows nowhere."""
+
+    def __init__(self) -> None:
+        self.space = build_space(
+            (
+                ParameterSpec("zero", "m", -1.0, 1.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.3}, ""),
+                ParameterSpec("stiffness", "N/m", 1.0, 9.0, 2.0, {"distribution": "Uniform", "low": 1, "high": 9}, ""),
+            ),
+            {"zero": {}, "stiffness": {}},
+            {},
+            ["a", "b"],
+            pooled={"zero": Pooled(0.2, {"a": ("a",), "b": ("b",)}, "zero")},
+        )
+        self.names, self.n_rows = self.space.names, 1
+        self.units = {p.name: p.spec.unit for p in self.space.parameters}
+        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in self.space.parameters}
+        self.sample_prior, self.log_prior = self.space.sample, self.space.log_prior_unconstrained
+        self.to_unconstrained, self.from_unconstrained = self.space.to_unconstrained, self.space.from_unconstrained
+
+    def residuals(self, values, horizon):
+        return jnp.stack([values["zero"] + values[f"zero_deviation@{day}"] for day in "ab"])
+
+    def row_log_likelihood(self, values, horizon):
+        off = np.stack([np.asarray(values["zero"] + values[f"zero_deviation@{day}"]) for day in "ab"])
+        return -0.5 * np.sum(off**2, axis=0)[:, None], np.zeros(off.shape[1], dtype=int)
+
+
+def test_logarithms_of_what_is_positive_keep_a_prior_whose_spread_is_inferred():
+    """The map is a bijection, and its density carries the Jacobian."""
+    straight = StraightProblem(DaysApart(), jax.random.key(0))
+    assert dict(zip(straight.names, straight.logarithmic, strict=True)) == {
+        "zero": False,
+        "zero_spread": True,
+        "zero_deviation@a": False,
+        "zero_deviation@b": False,
+        "stiffness": True,
+    }
+    values = straight.sample_prior(jax.random.key(1), 20)
+    v = straight.to_unconstrained(values)
+    back = straight.from_unconstrained(v)
+    for name in straight.names:
+        np.testing.assert_allclose(back[name], values[name], rtol=1e-9)
+
+    def stacked(row):
+        return jnp.stack([column[0] for column in straight.from_unconstrained(row[None]).values()])
+
+    slope = np.stack([jax.jacfwd(stacked)(row) for row in v])
+    expected = straight.problem.space.log_prior(values) + np.linalg.slogdet(slope)[1]
+    np.testing.assert_allclose(straight.log_prior(v), expected, rtol=1e-8)
