@@ -71,6 +71,7 @@ class Responses:
         jacobian: of the fit's free coordinates, by group; columns in deviations of their priors.
         levels: commands that reach the ports, by group.
         duration: rows of the simulator that each group has.
+        of_motion: features of the motion, by group, where the body carries signals that follow it.
         exact: by port: what each feature does, where it was asked for; see `with_exact_columns`.
     """
 
@@ -81,6 +82,7 @@ class Responses:
     jacobian: Float[np.ndarray, "group value d"]
     levels: Float[np.ndarray, "group row channel"]
     duration: np.ndarray
+    of_motion: Float[np.ndarray, "group feature row"] | None = None
     exact: dict[Port, Float[np.ndarray, "group value feature"]] = field(default_factory=dict)
 
     @property
@@ -122,7 +124,8 @@ def responses(
     slopes = target.measurements.series(fit.jacobian.T) * forward.coordinates.prior_sd[fit.free][:, None, None, None]
     jacobian = np.moveaxis(slopes.reshape(len(fit.free), groups, -1), 0, 2)
     duration = np.asarray(forward.commands.sample_step).max(axis=1) + 1
-    return Responses(ports, basis, found, white, jacobian, levels, duration)
+    moving = table.over_motion(theta, forward.commands, forward.deadline.check) if table.of_motion else None
+    return Responses(ports, basis, found, white, jacobian, levels, duration, moving)
 
 
 def _response(
