@@ -1,6 +1,7 @@
 """Leave recordings out in turn, fit the others, and predict those left out from their commands and first rows.
 
     python benchmarks/leave_out.py [SETTINGS.toml] [--out DIR]
+    python benchmarks/leave_out.py --store FOLDER
 
 The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
 seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
@@ -13,6 +14,9 @@ the first row, in the same rows) and after it, and which share of the measured c
 all markers, of the last, and of rows whose last marker is inside in all three.
 Lines that are there are not computed again, fits that are done are read again, and so an interrupted run goes on. A fit
 of the paper's trunk takes 2 to 10 minutes of two shared cores, one of the ASL trunk 7 minutes or more, an adaptation 1.
+
+With --store, FOLDER is that of a calibration. Each of its groups is left out of the recordings that it fitted, as
+`rfdropo calibrate` does after a fit, and the error of unseen days goes into its posterior.nc and summary.json.
 """
 
 from __future__ import annotations
@@ -21,22 +25,32 @@ import argparse
 import json
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.data import RecordingEntry
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import append_line
 from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import load_data
 from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.prediction.day_error import DAY_ERROR, left_out_sentence
+from rfdropo_bayes.prediction.predictive import HELD, predict_fitted, thin
 from rfdropo_bayes.report.coverage import predictive_bands
+from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
+from rfdropo_bayes.report.summary import write_summary
 from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.adapt import model_error_of
 from rfdropo_bayes.verbs.calibrate import calibrate, inference_options
+from rfdropo_bayes.verbs.left_out_days import DRAWS, Days, error_of_unseen_days
+from rfdropo_bayes.verbs.predict import model_of
 
 SETTINGS = Path(__file__).with_suffix(".toml")
 
@@ -81,6 +95,32 @@ def left_out(model: rb.Model, pattern: str, out: Path, start: Path | None) -> rb
     )
 
 
+def store(folder: Path) -> str:
+    """Write the error of unseen days into the folder of a calibration, and return it in words.
+
+    Raises:
+        InputError: no calibration there, other recordings than it was fitted to, or a model without groups.
+    """
+    fit = rb.load(folder)
+    model, record = model_of(fit), fit.record
+    runs = model.recordings("fit")
+    if unknown := [run.name for run in runs if run.sha256 not in record.attrs["data_sha256"]]:
+        raise InputError(f"was not fitted to {unknown[0]} as it is now", where=str(folder), remedy="calibrate again")
+    key = jax.random.key(model.settings.seed)
+    draws = {info.name: record.posterior[info.name] for info in record.free}
+    problem = model.problem(runs).holding(record.attrs[HELD])
+    predictions = predict_fitted(problem, thin(draws, DRAWS), key)
+    optimum = fit.content["optimum"]
+    start = {name: np.full(2, optimum[name]) for name in draws}
+    error = error_of_unseen_days(Days(model, runs, start, predictions, model_error_of(record)), key)
+    if error is None:
+        raise InputError("nothing of the model differs between days", where=str(folder), remedy="name [model.groups]")
+    sentence = left_out_sentence(error)
+    replace(record, attrs={**record.attrs, DAY_ERROR: error.as_dict()}).save(folder / POSTERIOR)
+    write_summary({**fit.content, "unseen_days": {**error.as_dict(), "sentence": sentence}}, folder / SUMMARY)
+    return sentence
+
+
 def tested(found: rb.Calibration) -> list[RecordingPrediction]:
     """Predictions of recordings that were not fitted."""
     return [prediction for prediction in found.record.recordings if prediction.split == "test"]
@@ -122,7 +162,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
     parser.add_argument("--out", type=Path, default=Path("reports/leave_out"))
+    parser.add_argument("--store", type=Path, metavar="FOLDER")
     given = parser.parse_args()
+    if given.store:
+        print(store(given.store))
+        return
     ledger = given.out / "ledger.jsonl"
     lines = [json.loads(line) for line in ledger.read_text().splitlines()] if ledger.exists() else []
     known = {(line["experiment"], line["left_out"], line["seconds"]) for line in lines}

@@ -177,10 +177,11 @@ def table(lines: list[dict[str, Any]]) -> str:
     rows = ["| hidden | seed | verdict | named or described | right | CPU s |", "|---|---|---|---|---|---|"]
     for line in lines:
         law, told = line["law"].get("terms", []), list(line["named"])
+        at = [term["port"].replace("cable", "actuator") for term in law]  # as sentences say it; files keep their keys
         if line["verdict"] == DESCRIBED:
-            told += [f"{term['port']}: {term['feature']}" for term in law]
+            told += [f"{port}: {term['feature']}" for port, term in zip(at, law, strict=True)]
         elif law:  # not adopted, as unseen recordings do not support its form
-            told.append(f"something at {law[0]['port']}")
+            told.append(f"something at {at[0]}")
         told = ", ".join(told) or "-"
         right = "yes" if rightly(line) else "no"
         effect, told = (words.replace("_", " ") for words in (line["effect"], told))

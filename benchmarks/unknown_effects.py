@@ -28,7 +28,6 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.audit.inadequacy import as_measured
 from rfdropo_bayes.audit.law_search import law_search
 from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.verdict import DESCRIBED
@@ -73,8 +72,8 @@ def forced_search(model: rb.Model, seed: int, workshop: Workshop) -> dict[str, A
     target, base = base_model(problem, seed)
     simulator: Any = problem.lanes.simulator
     channels, unit = simulator.channel_names, simulator.command_unit
-    search = law_search(target.measured, problem.ports, channels, unit, seed, problem.rules.family, lambda line: None)
-    found = search.find(target, as_measured(target, base), forced=True)
+    search = law_search(target, problem.ports, channels, unit, seed, problem.rules.family, lambda line: None)
+    found = search.find(target, base, forced=True)
     terms = [[refit.term.port.name, refit.term.feature.formula(channels), refit.score] for refit in found.terms]
     numbers = {"port_p": found.ports[0].adjusted_p, "gate_nats": found.gate, "offered_nats": found.offered}
     seconds = round(time.process_time() - began, 1)

@@ -47,6 +47,8 @@ class Code(StrEnum):
     """Draws of a new group's parameters did not converge in matching a first row."""
     DAY_UNMATCHED = "day_unmatched"
     """A day is fitted worse than the fitted ones, few of the body's draws explain it, or fits did not converge."""
+    GROUP_WITHOUT = "group_without"
+    """Parameters that some groups alone have: a group that no fit has seen is taken to be without them."""
     RESIDUALS_CORRELATED = "residuals_correlated"
     """Residuals last from row to row beyond the noise model."""
     RESIDUALS_LAST = "residuals_last"

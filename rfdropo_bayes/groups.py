@@ -52,6 +52,17 @@ def gather_groups(recordings: Sequence[str], patterns: Patterns) -> dict[str, tu
     return groups
 
 
+def unmatched(recordings: Sequence[str], patterns: Patterns) -> list[tuple[str, str]]:
+    """Entries of the patterns that name none of the recordings, each with its group."""
+    names = [whole(recording) for recording in recordings]
+    return [
+        (group, entry)
+        for group, entries in _listed(patterns).items()
+        for entry in entries
+        if not any(name == whole(entry) or fnmatchcase(name, entry) for name in names)
+    ]
+
+
 def in_group(recording: str, group: str, patterns: Patterns) -> dict[str, list[str]]:
     """Patterns under which a recording belongs to a group, whatever group named it before."""
     name = whole(recording)

@@ -64,9 +64,13 @@ def text_of(path: str) -> str:
 
 
 def notebook(path: str) -> str:
-    """A notebook with its outputs as Markdown, its pictures inside."""
+    """A notebook with its outputs as Markdown, its pictures inside.
+
+    The theme lets tables scroll on a narrow screen, but not those that have a class, as pandas gives to its own.
+    """
     exporter = MarkdownExporter(config=Config({"ExtractOutputPreprocessor": {"enabled": False}}))
-    return str(exporter.from_filename(str(ROOT / path))[0])
+    text = str(exporter.from_filename(str(ROOT / path))[0])
+    return re.sub(r'<table [^>]*class="dataframe"[^>]*>', "<table>", text)
 
 
 def python_reference() -> str:

@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.screen import Screen, ScreenRow
 from rfdropo_bayes.audit.sentence import sentence
 from rfdropo_bayes.audit.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
-from rfdropo_bayes.bayes.space import SEPARATOR, force_power
+from rfdropo_bayes.bayes.space import force_power
 
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
@@ -220,7 +220,7 @@ def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]
     return {
         "mechanism": candidate.title if candidate else step.name,
         "group": candidate.group if candidate else "",
-        "equivalence_class": list(dict.fromkeys(name.partition(SEPARATOR)[0] for name in step.members)),
+        "equivalence_class": list(step.members),
         "parameters": parameters,
         "relative": relative,
         "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),

@@ -20,7 +20,6 @@ from rfdropo_bayes.audit.extension import Added, Rules
 from rfdropo_bayes.audit.fit import Fit, FitTarget, widened
 from rfdropo_bayes.audit.gain import Gain
 from rfdropo_bayes.audit.held_out import HeldOut, JudgedModel, predicted, stages_of
-from rfdropo_bayes.audit.inadequacy import as_measured
 from rfdropo_bayes.audit.law_search import FoundLaw, Refit, law_search
 
 
@@ -117,7 +116,7 @@ def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], No
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
     target, fit = model.last
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report)
-    found = law_search(target.measured, *options).find(target, as_measured(target, fit))
+    found = law_search(target, *options).find(target, fit)
     if not found.terms:
         return Described(found)
     stages = stages_of(model.judge, model.base, model.steps)

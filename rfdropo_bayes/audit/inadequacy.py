@@ -60,10 +60,32 @@ def as_measured(judge: FitTarget, fit: Fit) -> Fit:
 
     def whitened(white: np.ndarray) -> np.ndarray:
         weighed = white[..., known.measurements.count.size :]
-        return np.concatenate([known.measurements.whiten(_errors(judge, white), known.noise), weighed], axis=-1)
+        return np.concatenate([rewhitened(judge, known, white), weighed], axis=-1)
 
     promise = fit.promise if fit.converged else np.inf
     return replace(fit, residual=whitened(fit.residual), jacobian=whitened(fit.jacobian.T).T, promise=promise)
+
+
+def rewhitened(
+    judge: FitTarget, other: FitTarget, white: Float[np.ndarray, "*batch n"]
+) -> Float[np.ndarray, "*batch m"]:
+    """Residuals of the channels under the white noise of a judge, in deviations of the noise of another target."""
+    return other.measurements.whiten(_errors(judge, white), other.noise)
+
+
+def judged_anew(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
+    """Target and fit of a model that has got better: where its judge took it for far off, under the noise of what it
+    leaves now."""
+    return (target, fit) if target.known is None else fit_with_noise(target.known, fit.x, fit.free)
+
+
+def noise_share(judge: FitTarget) -> float:
+    """Mean square of the measurement's noise in deviations of a judge's noise; 1 where the model is not far off."""
+    if judge.known is None:
+        return 1.0
+    known = judge.known.measurements
+    variance = (judge.known.noise.scale / judge.noise.scale) ** 2 / np.maximum(known.count, 1.0)
+    return float(np.mean(variance[known.valid]))
 
 
 def spread(judge: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:

@@ -3,6 +3,9 @@
 One term at a time: every feature at every port is fitted together with the base parameters, linearly, to all recordings
 but one, and predicts that one. The best are refitted without linearisation. Then the next term is looked for in what is
 left. Choosing several terms before the first refit lets false ones in.
+
+Ports and terms are judged under the noise that candidates of the library are judged under: where the model is far off,
+that of what it leaves (see `inadequacy`), taken anew after each term.
 """
 
 from __future__ import annotations
@@ -15,9 +18,16 @@ from jaxtyping import Float
 
 from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
-from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise
+from rfdropo_bayes.audit.inadequacy import judged_anew
 from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
-from rfdropo_bayes.audit.port_responses import Responses, feature_columns, responses, signal_sizes, with_exact_columns
+from rfdropo_bayes.audit.port_responses import (
+    Responses,
+    feature_columns,
+    responses,
+    signal_sizes,
+    under,
+    with_exact_columns,
+)
 from rfdropo_bayes.audit.port_rollouts import FeatureTable, PlacedTerm, PortedForward, placed
 from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.mechanisms.features import Feature, dictionary, own_dictionary
@@ -78,9 +88,8 @@ class Refit:
 
     @property
     def square(self) -> float:
-        """Sum of squares that the model leaves, in deviations of the measurement's noise."""
-        left = as_measured(self.target, self.fit).residual
-        return float(left @ left)
+        """Sum of squares that the model leaves, in deviations of the noise that it was fitted under."""
+        return float(self.fit.residual @ self.fit.residual)
 
 
 @dataclass(frozen=True)
@@ -159,7 +168,7 @@ def _sums(
 ) -> _Sums:
     """Of the residual, and after it of simulated ones."""
     j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)[..., None]
-    count = np.count_nonzero(y[..., 0], axis=1).astype(float)
+    count = found.noise * np.count_nonzero(y[..., 0], axis=1)
     if null is not None:
         y = np.concatenate([y, _pieces(null)], axis=-1)
     return _Sums(
@@ -240,10 +249,10 @@ class LawSearch:
 
         Args:
             target: under which the model was fitted.
-            fit: the model, with residuals and slopes in deviations of the measurement's noise.
+            fit: the model.
             forced: whether a first term is looked for though no port is significant.
         """
-        known = target.measured
+        known = target
         found = responses(known, fit, self.ports, self.table, self.report)
         values = self._values(found)
         null = self._null(known, fit, found)
@@ -265,8 +274,9 @@ class LawSearch:
                 if best.score <= 0.0:
                     break
                 ties = ties if terms else _tied(best, others)
-                terms.append(best)
-                fit = as_measured(best.target, best.fit)
+                judge, fit = judged_anew(best.target, best.fit)
+                terms.append(replace(best, target=judge, fit=fit))
+                found, known = under(found, known, judge), judge.on(target.forward)
                 found = _relinearised(known, found, fit)
                 null = self._null(known, fit, found)
                 where = evidences(found, null)
@@ -308,8 +318,8 @@ class LawSearch:
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
-        law = f"{best.term.port.name}: {best.term.feature.formula(names)}"
-        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.name} {where.log_evidence:.1f} nats")
+        law = f"{best.term.port.words}: {best.term.feature.formula(names)}"
+        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
         """Whitened residuals of simulated data sets that lack nothing."""
@@ -362,10 +372,10 @@ class LawSearch:
         chosen, every = refits[0], list(refits)
         best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
         for _ in range(EXCHANGES):
-            fit = as_measured(best.target, best.fit)
+            fit = best.fit
             without = fit.x.copy()
             without[-1] = 0.0
-            residual = best.target.measured.residual(without[None])[0]
+            residual = best.target.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
             linear = _relinearised(known, found, bare)
@@ -377,7 +387,7 @@ class LawSearch:
             better = max(others, key=lambda refit: refit.score, default=best)
             if better.square >= best.square - 2.0:
                 break
-            self.report(f"instead: {better.term.port.name}: {better.term.feature.formula(self.units[0])}")
+            self.report(f"instead: {better.term.port.words}: {better.term.feature.formula(self.units[0])}")
             best = self._climbed(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
         best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
@@ -402,7 +412,7 @@ class LawSearch:
         for row in dict.fromkeys(chosen):
             found = self._refit(known, terms, fit, row)
             refits.append(found)
-            words = f"{row.port.name}: {row.feature.formula(self.units[0])}"
+            words = f"{row.port.words}: {row.feature.formula(self.units[0])}"
             self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
         return sorted(refits, key=lambda refit: -refit.score)
 
@@ -415,15 +425,14 @@ class LawSearch:
         scale = float(term.spec.prior["scale"])
         start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
         free = np.append(fit.free, len(start) - 1)
-        target = replace(known, forward=forward)
+        target = known.on(forward)
         found = climb(target, start, free, evaluations=GLANCE)
         gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
         return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
 
     def _climbed(self, refit: Refit) -> Refit:
         """The same, climbed to its end."""
-        judge, fit = fit_with_noise(refit.target, refit.fit.x, refit.fit.free)
-        return replace(refit, target=judge, fit=fit)
+        return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
 
 
 def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:

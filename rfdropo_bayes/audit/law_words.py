@@ -86,7 +86,7 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
     """A law as a formula, without its coefficients' values."""
     parts: dict[str, list[str]] = {}
     for refit in terms:
-        own = parts.setdefault(refit.term.port.name, [])
+        own = parts.setdefault(refit.term.port.words, [])
         own.append(f"c{sum(map(len, parts.values())) + 1} {refit.term.feature.formula(names)}")
     return "; ".join(f"w({port}) = {' + '.join(own)}" for port, own in parts.items())
 
@@ -112,7 +112,7 @@ def law_sentence(answer: Answer) -> str:
 def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:
     feature, unit = refit.term.feature, "" if row["unit"] == "-" else f" {row['unit']}"
     size = f"{row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
-    return f"at {refit.term.port.name} it changes {feature.words(names)} ({size} times {feature.formula(names)})"
+    return f"at {refit.term.port.words} it changes {feature.words(names)} ({size} times {feature.formula(names)})"
 
 
 def _when(described: Described) -> str:
@@ -145,7 +145,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
     ties = described.found.ties[:MOST_TIES]
     if not ties:
         return ""
-    found = ", ".join(f"{tie.term.feature.formula(names)} at {tie.term.port.name}" for tie in ties)
+    found = ", ".join(f"{tie.term.feature.formula(names)} at {tie.term.port.words}" for tie in ties)
     return f" Not to be told from it by these data: {found}."
 
 
@@ -158,12 +158,12 @@ def ports_sentence(answer: Answer) -> str:
     if not rows:
         return ""
     left = answer.extended.residual
-    if left @ left > POOR * np.count_nonzero(left):  # every signal is sure then, and none of the size it is found with
-        return f" Of all ports, a signal at {rows[0].port.name} explains most of it; no law of it holds."
+    if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as what is left, and shrinks the signal
+        return f" Of all ports, a signal at {rows[0].port.words} explains most of it; no law of it holds."
     size = f"{rows[0].amplitude:.2g}" + ("" if rows[0].port.unit == "-" else f" {rows[0].port.unit}")
-    others = ", ".join(row.port.name for row in rows[1 : 1 + MOST_TIES])
+    others = ", ".join(row.port.words for row in rows[1 : 1 + MOST_TIES])
     beside = f" ({others} explain less)" if others else ""
-    return f" A signal at {rows[0].port.name}, of {size}, explains most of it{beside}; no law of it holds."
+    return f" A signal at {rows[0].port.words}, of {size}, explains most of it{beside}; no law of it holds."
 
 
 def law_tables(answer: Answer) -> list[dict[str, Any]]:

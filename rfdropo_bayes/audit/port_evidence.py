@@ -88,7 +88,7 @@ def evidences(
         every[k] = np.maximum(gains.max(axis=(0, 1)), 0.0)
         place = np.unravel_index(int(np.argmax(gains[:, :, 0])), gains.shape[:2])
         best[port] = (parts[place[0]], float(SIZES[place[1]]), MEMORIES[place[0]], projected[:, 0])
-    most, excess = every[:, 1:].max(axis=0), float(residual @ residual) - (len(residual) - base.shape[1])
+    most, excess = every[:, 1:].max(axis=0), float(residual @ residual) - found.noise * (len(residual) - base.shape[1])
     rows = []
     for k, port in enumerate(ports):
         part, size, memory, projected = best[port]

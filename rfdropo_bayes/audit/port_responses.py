@@ -19,6 +19,7 @@ from scipy.interpolate import BSpline
 from rfdropo_bayes.audit.deadline import about
 from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.forward import Fields
+from rfdropo_bayes.audit.inadequacy import noise_share, rewhitened
 from rfdropo_bayes.audit.port_rollouts import COARSE, FINE, STEP, FeatureTable, as_sensed, signals_of
 from rfdropo_bayes.audit.score import span
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
@@ -71,6 +72,7 @@ class Responses:
         jacobian: of the fit's free coordinates, by group; columns in deviations of their priors.
         levels: commands that reach the ports, by group.
         duration: rows of the simulator that each group has.
+        noise: mean square of the measurement's noise in these deviations; less than 1 where the model is far off.
         of_motion: features of the motion, by group, where the body carries signals that follow it.
         exact: by port: what each feature does, where it was asked for; see `with_exact_columns`.
     """
@@ -82,6 +84,7 @@ class Responses:
     jacobian: Float[np.ndarray, "group value d"]
     levels: Float[np.ndarray, "group row channel"]
     duration: np.ndarray
+    noise: float = 1.0
     of_motion: Float[np.ndarray, "group feature row"] | None = None
     exact: dict[Port, Float[np.ndarray, "group value feature"]] = field(default_factory=dict)
 
@@ -97,7 +100,7 @@ def responses(
     """Responses at every port around a fit.
 
     Args:
-        target: data under the noise of the measurement.
+        target: data under the noise by which the model is judged.
         fit: of the model, with residuals and slopes under that noise.
         ports: of the simulator.
         table: that tells which commands reach the ports.
@@ -125,7 +128,7 @@ def responses(
     jacobian = np.moveaxis(slopes.reshape(len(fit.free), groups, -1), 0, 2)
     duration = np.asarray(forward.commands.sample_step).max(axis=1) + 1
     moving = table.over_motion(theta, forward.commands, forward.deadline.check) if table.of_motion else None
-    return Responses(ports, basis, found, white, jacobian, levels, duration, moving)
+    return Responses(ports, basis, found, white, jacobian, levels, duration, noise_share(target), moving)
 
 
 def _response(
@@ -183,6 +186,20 @@ def with_exact_columns(
         if port not in found.exact
     }
     return replace(found, exact={**found.exact, **exact})
+
+
+def under(found: Responses, judge: FitTarget, other: FitTarget) -> Responses:
+    """The same responses in deviations of the noise of another target; residual and slopes stay as they are."""
+    if judge.known is None:  # whose noise is that of the measurement, and stays
+        return found
+
+    def each(part: Float[np.ndarray, "group value k"]) -> Float[np.ndarray, "group value k"]:
+        white = rewhitened(judge, other, np.moveaxis(part, 2, 0).reshape(part.shape[2], -1))
+        return np.moveaxis(white.reshape(part.shape[2], *part.shape[:2]), 0, 2)
+
+    whitened = {port: each(part) for port, part in found.whitened.items()}
+    exact = {port: each(part) for port, part in found.exact.items()}
+    return replace(found, whitened=whitened, exact=exact, noise=noise_share(other))
 
 
 def _time_step(forward: Any) -> float:

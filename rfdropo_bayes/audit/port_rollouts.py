@@ -258,7 +258,7 @@ def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], u
     at = f"{port.name} {feature.kind} {' '.join(feature.commands(channels))}".strip()
     shape = "" if feature.shape is None else f"_{feature.shape:.3g}"
     name = f"law_{at.replace(' ', '_')}{shape}"
-    words = f"of the law at {port.name}: it changes {feature.words(channels)}"
+    words = f"of the law at {port.words}: it changes {feature.words(channels)}"
     return PlacedTerm(
         port,
         feature,

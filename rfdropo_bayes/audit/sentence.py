@@ -221,7 +221,7 @@ def _named(finding: dict[str, Any]) -> str:
     sizes = ", ".join(
         _size(title.replace(f"@{finding['group']}", ""), row) for title, row in given if (title, row) in surest
     )
-    others = [other.replace("_", " ") for other in finding["equivalence_class"][1:]]
+    others = [spoken(other) for other in finding["equivalence_class"][1:]]
     alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
     return f"{name} ({sizes}){alike}"
 

@@ -39,6 +39,7 @@ class InferredParameter:
         added_to: the parameter that it is added to; empty if it is a value of its own.
         scaled_by: the parameter that is its standard deviation, in place of that of its prior; empty if none is. Its
             coordinate in the unconstrained space is then the ratio of the two (a non-centred parametrisation).
+        scoped: whether it is a value of its own of the group ``recording``, which other groups do not have.
     """
 
     spec: ParameterSpec
@@ -48,6 +49,7 @@ class InferredParameter:
     members: tuple[str, ...] = ()
     added_to: str = ""
     scaled_by: str = ""
+    scoped: bool = False
 
     @property
     def name(self) -> str:
@@ -194,6 +196,7 @@ def build_space(
     recordings: Sequence[str],
     *,
     pooled: Mapping[str, Pooled] | None = None,
+    scoped: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
     where: str = "[model.priors]",
 ) -> ParameterSpace:
     """Join specifications and prior tables.
@@ -205,12 +208,13 @@ def build_space(
         per_recording: parameters that are free in the named recordings only.
         recordings: names of all recordings.
         pooled: parameters that differ between groups of recordings, about a value that all share.
+        scoped: parameters that some groups have and others do not: recordings by group.
 
     Raises:
         InputError: an unknown name, an unusable prior, nothing to infer, or a pooled parameter without a shared value.
     """
     by_name = {spec.name: spec for spec in specs}
-    pooled = pooled or {}
+    pooled, scoped = pooled or {}, scoped or {}
     check_names(list(priors) + list(per_recording) + list(pooled), specs, where=where)
     for name in pooled:
         if name not in priors or name in per_recording:
@@ -224,6 +228,10 @@ def build_space(
         spec = by_name[name]
         chosen = dict(table) if table else dict(spec.prior)
         prior = prior_from_table(spec, chosen, where=f"{where} {name}")
+        if name in scoped:
+            own = InferredParameter(confined(spec, chosen), prior, "", chosen, scoped=True)
+            parameters += [replace(own, recording=g, members=tuple(m)) for g, m in scoped[name].items()]
+            continue
         for recording in per_recording.get(name, ("",)):
             if recording and recording not in recordings:
                 raise InputError(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rfdropo_bayes.cli.options import ExperimentFile, Overrides
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.verbs.check import Check
 
 PROBLEMS = 2
 
@@ -32,10 +35,21 @@ def check(
         typer.echo(f"{label:<{width}}  {text}")
     for note in found.notes:
         typer.echo(f"\nnote: {note}")
+    for doubt in found.doubts:
+        typer.echo(f"\nDOUBTFUL: {doubt}")
     for file in found.files:
         typer.echo(f"\npicture: {file}")
     for problem in found.problems:
         typer.echo(f"\nPROBLEM: {problem}")
     if found.problems:
         raise typer.Exit(PROBLEMS)
-    typer.echo("\nnothing keeps this experiment from running")
+    typer.echo(f"\n{ending(found)}")
+
+
+def ending(found: Check) -> str:
+    """The last line of a check without problems."""
+    if not found.doubts:
+        return "nothing keeps this experiment from running"
+    count = len(found.doubts)
+    lines = "the line above that is" if count == 1 else f"the {count} lines above that are"
+    return f"this experiment would run, but something was probably misread: look first at {lines} marked DOUBTFUL"

@@ -158,6 +158,10 @@ class CsvColumns(BaseModel):
             if names is not None and len(names) != count:
                 what = "marker in positions" if key == "markers" else "channel in commands"
                 raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
+        for number, point in enumerate(self.positions):
+            if point in self.positions[:number]:
+                first = self.positions.index(point) + 1
+                raise ValueError(f"markers {first} and {number + 1} of positions have the same columns {list(point)}")
         return self
 
 

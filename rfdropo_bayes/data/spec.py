@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -149,7 +149,7 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
             logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
         recording = spec.piece(loaded[key], source.rows)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
-    return _distinct_names(recordings, sources)
+    return _distinct_names(recordings, sources, [*fit, *test])
 
 
 def find_data_file(name: str | Path, base: Path) -> Path:
@@ -221,15 +221,25 @@ def _check_split(fit: list[_Source], test: list[_Source]) -> None:
                     )
 
 
-def _distinct_names(recordings: list[Trajectory], sources: list[_Source]) -> list[Trajectory]:
+def _distinct_names(recordings: list[Trajectory], sources: list[_Source], listed: list[_Source]) -> list[Trajectory]:
+    """Recordings whose files have one name in several folders, of either role, get the folders into their names."""
     names = [recording.name for recording in recordings]
     distinct = []
     for recording, source in zip(recordings, sources, strict=True):
-        if names.count(recording.name) > 1:
-            recording = recording.with_attributes(name=f"{source.observations.parent.name}/{recording.name}")
+        path = source.observations.resolve()
+        others = {each.observations.resolve() for each in listed if each.observations.name == path.name} - {path}
+        if others or names.count(recording.name) > 1:
+            recording = recording.with_attributes(name=f"{_folders(path, others)}/{recording.name}")
         distinct.append(recording)
     renamed = [recording.name for recording in distinct]
     for name in renamed:
         if renamed.count(name) > 1:
             raise InputError("is listed twice", where=name, remedy="list each recording once")
     return distinct
+
+
+def _folders(path: Path, others: Iterable[Path]) -> str:
+    """The folders that a file is in, as many from the last one on as tell it from the other files."""
+    parts = path.parent.parts
+    apart = (count for count in range(1, len(parts)) if all(o.parent.parts[-count:] != parts[-count:] for o in others))
+    return "/".join(parts[-next(apart, len(parts)) :])

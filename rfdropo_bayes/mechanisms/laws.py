@@ -73,7 +73,7 @@ class Law:
         self.port, self.terms, self._ports = port, tuple(terms), ports
         self.name = f"law at {port.name}: {formula}" if formula else f"law at {port.name}"
         self.parameters = tuple(term.spec for term in terms)
-        self.cause = f"something acts at {port.name} by a law that stands for no mechanism of the library"
+        self.cause = f"something acts at {port.words} by a law that stands for no mechanism of the library"
         self.remedy = f"look at {port.look}"
 
     def signal(self, values: Values, levels: Float[Array, "row channel"], time_step: float) -> Float[Array, " row"]:
@@ -271,7 +271,7 @@ def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command
         feature = _feature(table, port, names, where)
         scale = float(table["scale"])
         unit = unit_of(port.unit, feature, command_unit)
-        words = f"of the law at {port.name}: it changes {feature.words(channels)}"
+        words = f"of the law at {port.words}: it changes {feature.words(channels)}"
         name = str(table["coefficient"])
         terms.append(Term(feature, ParameterSpec(name, unit, -FAR * scale, FAR * scale, 0.0, normal(scale), words)))
     if len({term.spec.name for term in terms}) < len(terms):

@@ -16,7 +16,7 @@ from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BODIES
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 
 AXES = "xyz"
-EVERY_CABLE = "every cable"
+EVERY_CABLE, EVERY_ACTUATOR = "every cable", "every actuator"
 PLACES = ("base", "middle", "tip")
 """Names of the places that forces may act on, as many as the engine has; see `simulators.engine.LOAD_PLACES`."""
 
@@ -33,6 +33,7 @@ class Port(NamedTuple):
         unit: of the signal.
         size: of an effect that a laboratory might see: the scale of priors and of differences.
         look: what to look for at the robot.
+        spoken: its name in sentences, tables and figures, where that is not the name in files; see `words`.
     """
 
     name: str
@@ -43,6 +44,12 @@ class Port(NamedTuple):
     unit: str
     size: float
     look: str
+    spoken: str = ""
+
+    @property
+    def words(self) -> str:
+        """Its name in sentences, tables and figures: the actuator of a simulator without cables is none of a cable."""
+        return self.spoken or self.name
 
 
 class PortMap(NamedTuple):
@@ -62,8 +69,8 @@ class PortMap(NamedTuple):
     gravity: tuple[float, float, float]
 
     def named(self, name: str) -> Port | None:
-        """A port by its name; None where there is none."""
-        return next((port for port in self.ports if port.name == name), None)
+        """A port by its name in files or in sentences; None where there is none."""
+        return next((port for port in self.ports if name in (port.name, port.words)), None)
 
     def members(self, port: Port) -> tuple[Port, ...]:
         """The ports at which a law acts that is placed at this one: at every cable by the cable's own command."""
@@ -148,18 +155,19 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
 
 
 def _of_actuation(channels: Sequence[str], unit: str, *, wound: bool) -> list[Port]:
-    """Ports of drives that wind cables, or of the commands of a simulator of one's own."""
-    size = 1e-3 if unit == "m" else 0.05
+    """Ports of drives that wind cables, or of the commands of a simulator of one's own; metres are those of cables."""
+    cables, size = wound or unit == "m", 1e-3 if unit == "m" else 0.05
     look = "guide, spool and tension of cable {0}, and what it shares with other cables"
     look = look if wound else "the drive of {0}, what it moves, and what it shares with other drives"
-    found = [
-        Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name))
-        for k, name in enumerate(channels)
-    ]
+    found = []
+    for k, name in enumerate(channels):
+        words = f"cable {name}" if cables else f"actuator {name}"
+        found.append(Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name), words))
     if len(found) > 1:
         look_at = "what all drives and cables share: gears, spools, guides, and the material of the cables"
         look_at = look_at if wound else "what all drives share"
-        found.append(Port(EVERY_CABLE, "actuation", "cables", len(found), -1, unit, size, look_at))
+        words = EVERY_CABLE if cables else EVERY_ACTUATOR
+        found.append(Port(EVERY_CABLE, "actuation", "cables", len(found), -1, unit, size, look_at, words))
     look = "the way of commands to the drives: queues, buses, and clocks"
     return [*found, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
 

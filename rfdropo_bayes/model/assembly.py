@@ -49,7 +49,7 @@ from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.body_engine import Engine, Integrator
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
-from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -232,6 +232,35 @@ def pooling(
     return found
 
 
+def scoping(
+    spec: ModelSpec, simulator: AnySimulator, fitted: Sequence[str], others: Sequence[str] = ()
+) -> dict[str, dict[str, tuple[str, ...]]]:
+    """The parameters of [model.only_in], with the recordings of each of their groups that has one to fit.
+
+    Raises:
+        InputError: a name that is none of the simulator's parameters, one that has another scope or a fixed value as
+            well, or a group that [model.groups] lacks.
+    """
+    check_used(spec.only_in, spec, simulator, where="[model.only_in]")
+    specs, groups = simulator.parameters, gather_groups([*fitted, *others], spec.groups)
+    known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
+    others_of = {"per_recording": spec.per_recording, "per_group": spec.per_group, "fixed": spec.fixed}
+    found = {}
+    for name, given in expand_groups(spec.only_in, specs).items():
+        check_names([name], specs, where="[model.only_in]")
+        for key, table in others_of.items():
+            if name in expand_groups(table, specs):
+                remedy = "keep it in one of them"
+                raise InputError(f"{name} is in [model.{key}], too", where="[model.only_in]", remedy=remedy)
+        asked = [given] if isinstance(given, str) else list(given)
+        for group in asked:
+            if group not in spec.groups:
+                remedy = f"{nearest(group, list(spec.groups))}; [model.groups] names recordings of one day or one robot"
+                raise InputError(f"unknown group {group!r}", where=f"[model.only_in] {name}", remedy=remedy)
+        found[name] = {group: known[group] for group in asked if group in known}
+    return found
+
+
 def build_model(spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
     """The probabilistic program of a model for the given recordings.
 
@@ -278,13 +307,15 @@ def model_space(
     if both:
         raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     shared = expand_groups(spec.per_recording, every)
-    defaults = [name for name in (*added, *shared, *measured) if name not in fixed and name not in given]
+    groups = scoping(spec, simulator, fitted, others)
+    defaults = [name for name in (*added, *shared, *groups, *measured) if name not in fixed and name not in given]
     priors: dict[str, Any] = {name: given.get(name, {}) for name in (*given, *defaults) if name not in last}
     priors |= {name: given.get(name, {}) for name in last if name not in fixed and name not in priors}
     scopes = {
         name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
     }
-    return build_space(specs, priors, scopes, fitted, pooled=pooling(spec, simulator.parameters, fitted, others))
+    pooled = pooling(spec, simulator.parameters, fitted, others)
+    return build_space(specs, priors, scopes, fitted, pooled=pooled, scoped=groups)
 
 
 def gather_channels(

@@ -104,6 +104,11 @@ class ModelTable(ExperimentTable):
         "prior of their standard deviation between groups, in their unit, which is inferred; a name such as "
         "initial_displacement stands for those of all cables, with one standard deviation",
     )
+    only_in: dict[str, str | list[str]] = Field(
+        default_factory=dict,
+        description="parameters that recordings of the named groups have and others do not: each of these groups has a "
+        "value, all others the nominal one, at which a mechanism does nothing",
+    )
     tension: bool = Field(
         default=False,
         description="the recordings' cable tensions are data, with a relative noise tension_noise that is inferred "

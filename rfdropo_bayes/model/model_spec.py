@@ -66,6 +66,7 @@ class ModelSpec:
         per_recording: parameters that are free in each of the recordings that match.
         groups: recordings that have a set-up in common.
         per_group: scale of the spread between groups of parameters that differ between them, in their unit.
+        only_in: groups that have a parameter, each its own value; it is neutral in all others.
         drives: what is known of the drives, beside what the robot says.
         channels: what is data beside the markers.
         weighed: sums of parameters that were measured.
@@ -87,6 +88,7 @@ class ModelSpec:
     per_recording: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
     groups: Patterns = field(default_factory=dict)
     per_group: Mapping[str, float] = field(default_factory=dict)
+    only_in: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
     drives: tuple[DriveTravel, ...] = ()
     channels: DataChannels = field(default_factory=DataChannels)
     weighed: tuple[Weighed, ...] = ()
@@ -132,6 +134,7 @@ class ModelSpec:
             "groups": dict(self.groups),
             "drives": drives,
             "per_group": dict(self.per_group),
+            "only_in": dict(self.only_in),
             **vars(self.channels),
             "weighed": weighed,
         }
@@ -220,6 +223,7 @@ def spec_of(
         per_recording=table.per_recording,
         groups=table.groups,
         per_group=table.per_group,
+        only_in=table.only_in,
         drives=tuple(table.drives),
         channels=DataChannels(table.tension, table.motor_angle, table.object_pose),
         weighed=tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed),

@@ -5,7 +5,7 @@ A cube that is pushed starts where it was measured before a new recording.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -56,16 +56,19 @@ class NewPredictions(NamedTuple):
         unmatched: draws that did not converge in matching a first row.
         far: how many times as far as the model is wrong in the fitted recordings a first row is from the simulated one,
             by recording, where that is too much for chance.
+        without: cautions of groups that no fit has seen, see `without_cautions`.
     """
 
     recordings: list[RecordingPrediction]
     unmatched: int
     far: dict[str, float]
+    without: list[Caution]
 
 
 def match_cautions(found: NewPredictions) -> list[Caution]:
-    """Cautions where draws did not converge in matching a first row, or where one stays far from the simulated one."""
-    cautions = []
+    """Cautions where draws did not converge in matching a first row, where one stays far from the simulated one, and
+    where a group is without what others have."""
+    cautions = list(found.without)
     if found.unmatched:
         sentence = (
             f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row, and "
@@ -80,6 +83,26 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
         )
         cautions.append(Caution(Code.FIRST_ROW_FAR, sentence))
     return cautions
+
+
+def without_cautions(space: ParameterSpace, groups: Sequence[str], known: Container[str]) -> list[Caution]:
+    """Cautions of groups that no fit has seen, where some of the fitted groups alone have a parameter.
+
+    Args:
+        space: of the fit.
+        groups: that are predicted; known: those of the fitted recordings.
+    """
+    owners: dict[str, list[str]] = {}
+    for parameter in space.parameters:
+        if parameter.scoped:
+            owners.setdefault(parameter.spec.name, []).append(parameter.recording)
+    names = "; ".join(f"{name} in {' and '.join(own)}" for name, own in owners.items())
+    sentence = (
+        "{0} is predicted without what some of the fitted groups alone have ({1}); if {0} may have it, name {0} in "
+        "[model.only_in] and calibrate with a recording of {0}"
+    )
+    unseen = [group for group in groups if group not in known]
+    return [Caution(Code.GROUP_WITHOUT, sentence.format(group, names)) for group in unseen if owners]
 
 
 def thin(draws: Mapping[str, Float[np.ndarray, "chain draw"]], count: int) -> Batch:
@@ -117,8 +140,9 @@ def predict_new(
     first row (`match_first_row`), and for a new recording of a known group draws count as they predict its first row
     (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
-    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A cube starts
-    where it was measured in the first row.
+    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A parameter
+    that some groups alone have is that of their new recordings, too; a group that no fit has seen is without it. A cube
+    starts where it was measured in the first row.
 
     Args:
         fitted: names of the recordings that were fitted.
@@ -152,7 +176,9 @@ def predict_new(
         with_day_error(p, slow[p.name], k) if slow and p.name in slow else p
         for p, k in zip(predictions, keys, strict=True)
     ]
-    return NewPredictions(predictions, unmatched, far_first_rows(predictions, left))
+    patterns = groups or {}
+    without = without_cautions(model.space, list(gather_groups(names, patterns)), gather_groups(fitted, patterns))
+    return NewPredictions(predictions, unmatched, far_first_rows(predictions, left), without)
 
 
 def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKeyArray) -> RecordingPrediction:
@@ -180,7 +206,7 @@ def _for_new_recordings(
     shared = [p for p in space.parameters if not p.recording]
     families: dict[str, list[InferredParameter]] = {}
     for parameter in space.parameters:
-        if parameter.recording and not parameter.added_to:
+        if parameter.recording and not parameter.added_to and not parameter.scoped:
             families.setdefault(parameter.spec.name, []).append(parameter)
     extended = {p.name: values[p.name] for p in shared}
     count = len(next(iter(values.values())))
@@ -197,8 +223,13 @@ def _for_new_recordings(
             pool = np.stack([values[member.name] for member in members])
             extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
             parameters.append(replace(members[0], recording=recording))
+    gathered = gather_groups(names, groups)
+    for parameter in space.parameters:
+        if parameter.scoped and parameter.recording in gathered:
+            extended[parameter.name] = values[parameter.name]
+            parameters.append(replace(parameter, members=gathered[parameter.recording]))
     deviating = [p for p in space.parameters if p.added_to]
-    for parameter in _deviations(deviating, gather_groups(names, groups)):
+    for parameter in _deviations(deviating, gathered):
         drawn = values.get(parameter.name)
         if drawn is None:
             drawn = np.asarray(parameter.prior.sample(jax.random.fold_in(key, len(names) + len(parameters)), (count,)))

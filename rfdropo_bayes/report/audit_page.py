@@ -130,7 +130,7 @@ def _signal(answer: Answer) -> figures.Signal | None:
         members = described.found.map.members(terms[0].term.port)
         row = next(each for each in described.found.ports if each.port in members)
     names = answer.target.measurements.names
-    return figures.Signal(row.port.name, row.port.unit, names, described.found.centre, row.mean, row.sd)
+    return figures.Signal(row.port.words, row.port.unit, names, described.found.centre, row.mean, row.sd)
 
 
 def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:

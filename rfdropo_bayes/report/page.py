@@ -11,6 +11,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.screen import p_in_words
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.posteriors.bounds import PILED
@@ -68,7 +69,7 @@ def render(template: str, **content: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
-    environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value}
+    environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value, "spoken": spoken}
     environment.globals["interval"] = interval
     assets = {}
     for name, file in (("stylesheet", "page.css"), ("script", "replay.js"), ("sort", "sort.js")):

@@ -286,7 +286,7 @@ def _fitted(study: Study, task: str, row: str, seed: int | None) -> tuple[Path, 
 
 
 def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
-    """The model with the mechanisms that the audit adopted, and their priors."""
+    """The model with the mechanisms that the audit adopted, their priors, and the laws that it found at ports."""
     out, minutes = study.out / "audit", f"audit.minutes={study.size.minutes}"
     asked = f"# {minutes}\n{study.audit.read_text(encoding='utf-8')}"
     if not _ran(out, asked):
@@ -297,7 +297,8 @@ def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
         raise InputError(found["sentence"], where=str(out), remedy="mend the audit's file, then remove this folder")
     before, after = read_tables(study.audit), read_tables(out / EXTENDED)
     model = tables["model"]
-    model["mechanisms"] = [*model.get("mechanisms", []), *after["model"].get("mechanisms", [])]
+    for key in ("mechanisms", "laws"):
+        model[key] = [*model.get(key, []), *after["model"].get(key, [])]
     known = before["model"].get("priors", {})
     added = {name: prior for name, prior in after["model"]["priors"].items() if name not in known}
     model["priors"] = {**added, **model["priors"]}

@@ -24,7 +24,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import DataSpec, RecordingEntry, Trajectory, load_recordings, one_at_a_time
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.groups import group_of, in_group
+from rfdropo_bayes.groups import gather_groups, group_of, in_group
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.assembly import pooling
@@ -46,6 +46,7 @@ from rfdropo_bayes.prediction.predictive import (
     predict_fitted,
     predict_new,
     thin,
+    without_cautions,
 )
 from rfdropo_bayes.report import build_summary
 from rfdropo_bayes.report.coverage import predictive_bands
@@ -145,7 +146,8 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     before = _from_first_rows(asked, draws, before_key)
     adapted = _fitted(asked, draws, fit_key, show)
     checks = _checks(before, adapted.predictions)
-    cautions = []
+    known = gather_groups(asked.fit.record.attrs[FITTED], model_of(asked.fit).spec.groups)
+    cautions = without_cautions(fitted_parts(asked.fit)[1], [asked.name], known)
     check = checks.get(asked.rest)
     if check and check["adapted"]["error_mm"] > check["from_first_row"]["error_mm"]:
         cautions.append(_kept_caution(check))
@@ -437,9 +439,10 @@ def day_space(
         known = [p.name for p in [*shared, *spreads]]
         spreads += [p for p in spread_of(spec, pooled) if p.name not in known]
         added += deviations(spec, replace(pooled, groups={day: tuple(recordings)}))
+    added += [replace(p, members=tuple(recordings)) for p in space.parameters if p.scoped and p.recording == day]
     families: dict[str, list[InferredParameter]] = {}
     for p in space.parameters:
-        if p.recording and not p.added_to:
+        if p.recording and not p.added_to and not p.scoped:
             families.setdefault(p.spec.name, []).append(p)
     # A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
     every = [ps[0] for ps in families.values() if len(ps) == len(fitted)]

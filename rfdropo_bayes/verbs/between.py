@@ -15,7 +15,7 @@ from rfdropo_bayes.audit.fixed_quantities import OwnParameter
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.groups import Patterns, gather_groups, whole
+from rfdropo_bayes.groups import Patterns, gather_groups, group_of, in_group, whole
 from rfdropo_bayes.tables import nearest
 
 Between = Sequence[str] | Mapping[str, Sequence[str | Trajectory] | str | Trajectory]
@@ -114,12 +114,12 @@ def _matching(
 def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -> None:
     """Say in the table [model] of an experiment file what differs between groups.
 
-    A mechanism of one group alone is free in its recordings, and absent in all others. What several have is pooled.
+    A mechanism that was named in one scope alone, a group or all groups but one, is in these groups, with a value for
+    each, and absent in all others. A mechanism that was named in several scopes is pooled.
     """
     coordinates, groups = answer.problem.coordinates, answer.problem.groups
     assert groups is not None
     factor = widening(answer.extended, coordinates)
-    fitted = {trajectory.name for trajectory in answer.problem.trajectories}
     scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
     alone = len(scopes) == 1 and not isinstance(candidate.mechanism, OwnParameter)
     for index in candidate.indices:
@@ -127,15 +127,30 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
         if not parameter.added_to:
             continue
         name = parameter.added_to
-        if alone:
-            own = [member for member in groups.recordings(candidate.group) if member in fitted]
-            model.setdefault("per_recording", {})[name] = own
-            continue
         if groups.compared:
-            model.setdefault("groups", {}).update({group: list(own) for group, own in groups.members.items()})
-        model.get("per_recording", {}).pop(name, None)
+            model["groups"] = _naming(groups.members, model.get("groups", {}))
+        if alone:
+            own = _groups_of(candidate.group, groups, model.get("groups", {}))
+            model["groups"] = _naming(own, model.get("groups", {}))
+            model.setdefault("only_in", {})[name] = list(own)
+            continue
         table = parameter.table or {}
         spread = float(table["scale"]) * float(factor[index]) / np.sqrt(2.0)
         model.setdefault("per_group", {})[name] = float(f"{spread:.3g}")
         if name not in coordinates.names:
             model.setdefault("priors", {}).setdefault(name, {})
+
+
+def _groups_of(scope: str, groups: Groups, patterns: Patterns) -> dict[str, tuple[str, ...]]:
+    """A group alone, or the groups that all recordings but those of one belong to."""
+    recordings = groups.recordings(scope)
+    return {scope: recordings} if scope in groups.members else gather_groups(recordings, patterns)
+
+
+def _naming(groups: Mapping[str, Sequence[str]], patterns: Patterns) -> Patterns:
+    """Patterns that name these groups, and by which their recordings belong to them."""
+    for group, recordings in groups.items():
+        for recording in recordings:
+            if group not in patterns or group_of(recording, patterns) != group:
+                patterns = in_group(recording, group, patterns)
+    return patterns

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, astuple, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -22,15 +22,18 @@ from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json
+from rfdropo_bayes.groups import unmatched
 from rfdropo_bayes.inference.methods import make_config
+from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
-from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.experiment import AuditTable, Experiment, load_experiment
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.model.model_spec import Workpiece, find_robot, spec_of
+from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
@@ -50,7 +53,8 @@ class Check:
 
     Attributes:
         lines: what there is, as pairs of a label and a text; an empty label goes on with the one before.
-        notes: what is allowed, and perhaps not meant.
+        notes: what is allowed, and worth knowing.
+        doubts: what is allowed, and probably not meant: the recordings or their description look wrong.
         problems: what keeps the experiment from running.
         files: pictures, one per recording.
         ahead: what a fit could determine; None where that was not asked, or nothing can be fitted.
@@ -58,6 +62,7 @@ class Check:
 
     lines: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
     ahead: Preflight | None = None
@@ -97,7 +102,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     if isinstance(robot, Robot):
         robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
     _say_robot(found, robot)
-    recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
+    recordings = {role: _read(found, experiment, folder, role) for role in ("fit", "test")}
     for role, trajectories in recordings.items():
         for trajectory in trajectories:
             _say_recording(found, trajectory, role, robot)
@@ -106,6 +111,12 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         _say_placement(found, experiment, robot, [*recordings["fit"], *recordings["test"]])
         found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
+    _say_copies(found, [*recordings["fit"], *recordings["test"]])
+    found.doubts += [
+        f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {_names(named)}"
+        for group, entry in unmatched(named, experiment.model.groups)
+        if named
+    ]
     _say_model(found, experiment, folder, recordings["fit"])
     if ahead and recordings["fit"] and not found.problems:
         if isinstance(robot, Robot):
@@ -120,7 +131,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         save_recording(trajectory, rest, file)
         found.files.append(file)
     if found.files:
-        content = {key: getattr(found, key) for key in ("lines", "notes", "problems")}
+        content = {key: getattr(found, key) for key in ("lines", "notes", "doubts", "problems")}
         told = None if found.ahead is None else found.ahead.as_dict()
         write_json(out / "check.json", {**content, "preflight": told})
     return found
@@ -131,7 +142,7 @@ def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequenc
     try:
         found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
     except InputError as error:
-        found.notes.append(str(error))
+        found.doubts.append(str(error))
         return
     found.lines += found.ahead.lines()
 
@@ -153,18 +164,22 @@ def _say_robot(found: Check, robot: Workpiece) -> None:
             found.lines.append((label, facts[label]))
 
 
-def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iterator[Trajectory]:
-    """The recordings of one role, those that can be read."""
+def _read(found: Check, experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
+    """The recordings of one role; those that can be read where one of them is a problem."""
     spec = experiment.data
     if spec is None:
         if role == "fit":
             found.lines.append(("recordings", "none: the experiment has no [data], and can only be simulated"))
-        return
-    entries: list[RecordingEntry] = spec.fit if role == "fit" else spec.test
-    for entry in entries:
+        return []
+    together = _try(found, partial(load_recordings, spec, folder, role=role))
+    if together is not None:
+        return together
+    readable: dict[str, Trajectory] = {}
+    for entry in spec.fit if role == "fit" else spec.test:
         alone = changed(spec, where="[data]", fit=[entry], test=[])
-        yield from _try(found, partial(load_recordings, alone, folder)) or []
-    _try(found, lambda: load_recordings(spec, folder, role="fit" if role == "fit" else "test"))
+        for recording in _try(found, partial(load_recordings, alone, folder)) or []:
+            readable.setdefault(recording.name, recording)
+    return list(readable.values())
 
 
 def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> None:
@@ -172,7 +187,7 @@ def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Workp
     gaps = np.diff(trajectory.time)
     step = sample_time(trajectory.time)
     rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
-    found.notes += [f"{trajectory.name}: {note}" for note in trajectory.notes]
+    found.doubts += [f"{trajectory.name}: {note}" for note in trajectory.notes]
     if gaps.max() > IRREGULAR * step:
         rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
     found.lines.append((f"{role}: {trajectory.name}", rows))
@@ -228,7 +243,7 @@ def _say_placement(found: Check, experiment: Experiment, robot: Robot, trajector
     for trajectory in trajectories:
         for hint in placement_hints(robot, trajectory, *([columns.axes] if columns else [])):
             shared.setdefault(hint, []).append(trajectory.name)
-    found.notes += [f"{_names(names)}: {hint}" for hint, names in shared.items()]
+    found.doubts += [f"{_names(names)}: {hint}" for hint, names in shared.items()]
 
 
 def _masks(trajectory: Trajectory) -> str:
@@ -291,6 +306,19 @@ def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
         found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
 
 
+def _say_copies(found: Check, trajectories: Sequence[Trajectory]) -> None:
+    """Recordings of the same content: noise never repeats, so that one of them is a copy."""
+    alike: dict[str, list[str]] = {}
+    for trajectory in trajectories:
+        alike.setdefault(trajectory.sha256, []).append(trajectory.name)
+    found.doubts += [
+        f"{_names(names)} are the same to the last digit: a copy is no second measurement, and tests nothing; "
+        "list one of them"
+        for names in alike.values()
+        if len(names) > 1
+    ]
+
+
 def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
     """What is inferred, and how; a model that cannot be built is a problem."""
     method, named = experiment.inference.method, experiment.model.mechanisms
@@ -298,6 +326,8 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
     found.lines.append(("method", f"{method}, {experiment.inference.rollouts} rollouts, seed {experiment.seed}"))
     found.lines.append(("mechanisms", ", ".join(named) or "none"))
     spec = _try(found, lambda: spec_of(experiment, folder))
+    if spec is not None:
+        _try(found, partial(_see_candidates, spec, experiment.audit))
     simulator = None if spec is None else _try(found, partial(build_simulator, spec))
     if spec is None or simulator is None or not fitted:
         return
@@ -319,6 +349,16 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         if there and not asdict(spec.channels)[key]:
             words = key.replace("_", " ")
             found.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
+
+
+def _see_candidates(spec: ModelSpec, table: AuditTable) -> None:
+    """See that an audit would find the mechanisms that [audit] names.
+
+    Raises:
+        InputError: it would not.
+    """
+    names = candidate_names(spec, table)
+    mechanisms_named(names, spec.robot, folder=spec.folder, where="[audit] candidates")
 
 
 def _names(names: Sequence[str]) -> str:

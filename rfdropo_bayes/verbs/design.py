@@ -192,11 +192,11 @@ def _laws(
     options = (problem.ports, names, unit, problem.seed, problem.rules.family, report)
     rivals = []
     with clock.part(LAWS_BY, "laws at ports"):
-        search = replace(law_search(target.measured, *options), most=1)
-        rivals = search.find(target.measured, as_measured(target, base)).rivals
+        search = replace(law_search(target, *options), most=1)
+        rivals = search.find(target, base).rivals
     return [
         Hypothesis(
-            f"{refit.term.feature.formula(names)} at {refit.term.port.name}",
+            f"{refit.term.feature.formula(names)} at {refit.term.port.words}",
             as_measured(refit.target, refit.fit),
             refit.target.forward,
         )

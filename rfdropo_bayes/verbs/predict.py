@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
 from rfdropo_bayes.groups import Patterns, group_of, in_group
-from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups
+from rfdropo_bayes.model.assembly import KNOWN, expand_groups, fixed_values, integrator_of, model_specs, with_groups
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
@@ -171,7 +171,8 @@ def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
     """Values that a calibration took for known, and the parameters that it inferred."""
     model = model_of(fit)
     fixed = {**fixed_values(model.spec, model.simulator), **fit.record.attrs.get(HELD, {})}
-    return fixed, _fitted_space(fit.record, model_specs(model.spec, model.simulator))
+    scoped = expand_groups(model.spec.only_in, model.simulator.parameters)
+    return fixed, _fitted_space(fit.record, model_specs(model.spec, model.simulator), scoped)
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
@@ -295,13 +296,19 @@ def _markers(
     return Markers.gather(recordings, noise, own)
 
 
-def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> ParameterSpace:
-    """The parameters a posterior holds, with the recordings they belong to.
+def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec], of_groups: Container[str]) -> ParameterSpace:
+    """The parameters a posterior holds, with the recordings, or groups of them, that they belong to.
+
+    Args:
+        record: the posterior.
+        specs: every parameter of the model.
+        of_groups: names of those that some groups have and others do not.
 
     Raises:
         InputError: a parameter that the experiment's model lacks.
     """
     scopes: dict[str, list[str]] = {}
+    scoped: dict[str, dict[str, tuple[str, ...]]] = {}
     priors: dict[str, dict[str, Any]] = {}
     known = {spec.name for spec in specs}
     pooled: dict[str, Pooled] = {}
@@ -318,7 +325,9 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
         if name.endswith(SPREAD) and name.removesuffix(SPREAD) in families:
             continue
         priors[name] = dict(info.prior)
-        if recording:
+        if recording and name in of_groups:
+            scoped.setdefault(name, {})[recording] = ()
+        elif recording:
             scopes.setdefault(name, []).append(recording)
     missing = [name for name in priors if name not in known]
     if missing:
@@ -328,7 +337,7 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
             remedy="predict with the experiment that was calibrated, mechanisms included",
         )
     recordings = sorted({recording for names in scopes.values() for recording in names})
-    return build_space(specs, priors, scopes, recordings, pooled=pooled, where="posterior")
+    return build_space(specs, priors, scopes, recordings, pooled=pooled, scoped=scoped, where="posterior")
 
 
 def summarise(predicted: RecordingPrediction) -> xr.Dataset:

@@ -86,6 +86,7 @@ def test_a_mechanism_of_one_day_is_named_for_it_in_an_audit_that_compares_nothin
     content = content_of(answer)
     (finding,) = content["findings"]
     assert (finding["mechanism"], finding["group"]) == ("play", "april")
+    assert finding["equivalence_class"][0] == "play@april"
     assert abs(finding["parameters"]["play@april"]["mean"] - 0.5) < 4.0 * finding["parameters"]["play@april"]["sd"]
     assert content["verdict"] == "explained"
     assert content["between"] is None
@@ -93,17 +94,25 @@ def test_a_mechanism_of_one_day_is_named_for_it_in_an_audit_that_compares_nothin
     assert "shared by" not in content["sentence"]
     table: dict = {}
     extend_groups(table, answer, answer.problem.candidate("play@april"))
-    assert table == {"per_recording": {"play": ["r2", "r4", "r6"]}}  # r8 is not fitted
+    assert table == {"groups": {"april": list(MONTHS["april"])}, "only_in": {"play": ["april"]}}
+    table = {"groups": {"april": "r[2468]", "january": "r[13579]"}, "only_in": {"bend": "january"}}
+    extend_groups(table, answer, answer.problem.candidate("play@april"))
+    assert table["groups"] == {"april": "r[2468]", "january": "r[13579]"}  # recordings to come belong, too
+    assert table["only_in"] == {"bend": "january", "play": ["april"]}
 
 
 def test_a_mechanism_that_one_day_of_three_lacks_is_named_for_the_others():
     months = {"january": ["r0", "r1", "r3"], "march": "r[57]", "april": MONTHS["april"]}
     runs = recordings(TRUTH, 1)[:9]
-    content = found(compared({"play": 0.5}, {}, 1, groups_at_hand(months, runs[:FITTED], runs[FITTED:])))
+    answer = audit(compared({"play": 0.5}, {}, 1, groups_at_hand(months, runs[:FITTED], runs[FITTED:])))
+    content = content_of(answer)
     (finding,) = content["findings"]
     assert (finding["mechanism"], finding["group"]) == ("play", "all but april")
     (size,) = finding["parameters"].values()
     assert abs(size["mean"] - 0.5) < 4.0 * size["sd"]
+    table: dict = {"groups": months}
+    extend_groups(table, answer, answer.problem.candidate("play@all but april"))
+    assert table == {"groups": months, "only_in": {"play": ["january", "march"]}}
 
 
 def test_what_both_days_lack_is_no_difference():

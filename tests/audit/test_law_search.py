@@ -14,17 +14,18 @@ from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.described import NamedModel, describe
 from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
-from rfdropo_bayes.audit.inadequacy import as_measured
+from rfdropo_bayes.audit.inadequacy import as_measured, noise_share
 from rfdropo_bayes.audit.law_search import law_search
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
+from rfdropo_bayes.audit.port_responses import responses, under
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.mechanisms.ports import Port, port_map
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.residual_file import residual_dataset
 
-from .toys import Toy, problem, recordings
+from .toys import STEP, Toy, problem, recordings
 
 SIZE = 3e-3  # [m] per square of the command's unit
 TRUTH = {"gain": 1.3, "bend": -0.4}
@@ -37,6 +38,37 @@ class Pushed(Toy):
         seen = super().rollout(parameters, commands, steps)
         level = jnp.concatenate([commands.initial[None], commands.step])
         return seen._replace(position=seen.position.at[:, 2, 0].add(SIZE * level[:, 0] * level[:, 1]))
+
+
+REST, LARGE = 3e-3, 25e-3  # [m], and [m] per square of the command's unit
+PATTERN = np.random.default_rng(11).normal(size=(4, 3))
+
+
+class Elsewhere(Toy):
+    """All markers move by six times the noise in a way that no feature and no candidate says."""
+
+    pushed = 0.0
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level = jnp.concatenate([commands.initial[None], commands.step])
+        rest = REST * jnp.sin(9.0 * STEP * jnp.cumsum(jnp.abs(level[:, 0] - level[:, 1])))
+        position = seen.position + rest[:, None, None] * PATTERN
+        return seen._replace(position=position.at[:, 2, 0].add(self.pushed * level[:, 0] * level[:, 1]))
+
+
+class PushedElsewhere(Elsewhere):
+    """Marker m3 moves along x by the product of both commands, too."""
+
+    pushed = LARGE
+
+
+def searched(toy):
+    """Problem, judge, base model and the search's findings of recordings of a toy."""
+    question = asked(6, toy)
+    target, base = base_model(question, question.seed)
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    return question, target, base, law_search(target, *options).find(target, base)
 
 
 def asked(seed, toy=None, alike=False):
@@ -76,7 +108,7 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
 
 @pytest.mark.parametrize(("left", "said"), [(1.0, "at marker tip x, of 0.002 m"), (30.0, "at marker tip x explains")])
 def test_a_model_that_is_far_off_is_told_no_size_of_a_signal(left, said):
-    """There every signal is sure, and none of the size that a linear model gives it."""
+    """There the noise is as large as what is left, and shrinks the signal to half of what it is."""
     row = SimpleNamespace(port=Port("marker tip x", "sensing", "marker", 0, 0, "m", 1e-3, ""), amplitude=0.002)
     found = SimpleNamespace(significant=lambda family: [row])
     causes = SimpleNamespace(described=SimpleNamespace(holds=False, found=found))
@@ -91,8 +123,8 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     question = asked(5, Pushed())
     target, base = base_model(question, question.seed)
     options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
-    search = replace(law_search(target.measured, *options), most=1)
-    once = search.find(target, as_measured(target, base))
+    search = replace(law_search(target, *options), most=1)
+    once = search.find(target, base)
 
     class Twice:
         def find(self, *_):
@@ -107,6 +139,47 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     assert said == ["unseen recordings do not support more than 1 of 2 terms"]
 
 
+def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidates_are_judged_by():
+    """Under the noise of the measurement its port had 15,775 nats, and two terms followed that are not there."""
+    question, target, base, found = searched(PushedElsewhere())
+    assert target.known is not None
+    rows = np.count_nonzero(base.residual)
+    (term,) = found.terms
+    assert (term.term.port.name, term.term.feature.formula("ab")) == ("marker m3 x", "u_a u_b")
+    assert term.target.known is not None  # the rest is still there
+    assert found.ports[0].port.name == "marker m3 x"
+    assert 0.0 < found.ports[0].log_evidence < term.gain.gain < 0.1 * rows
+    assert [row.port.name for row in found.significant(question.rules.family)] == ["marker m3 x"]
+    scale = term.term.spec.prior["scale"]
+    assert abs(scale * term.fit.x[-1] - LARGE) < 3.0 * scale * np.sqrt(term.fit.covariance[-1, -1])
+    assert 0.0 < term.gain.share < 1.0
+
+
+def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
+    """Under the noise of the measurement a law of three terms was, with scores of 138 to 198 nats."""
+    question, target, _, found = searched(Elsewhere())
+    assert target.known is not None
+    assert found.terms == []
+    assert found.significant(question.rules.family) == []
+
+
+def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
+    question = asked(6, Elsewhere())
+    judge, base = base_model(question, question.seed)
+    table = law_search(judge, question.ports, ("a", "b"), "m", 0, 0.02, lambda line: None).table
+    known = judge.measured
+    far, near = (responses(t, as_measured(judge, base), question.ports, table) for t in (judge, known))
+    seen = under(far, judge, known)
+    for port, part in near.whitened.items():
+        assert not np.allclose(far.whitened[port], part)
+        np.testing.assert_allclose(seen.whitened[port], part, atol=1e-9 * np.abs(part).max())
+    assert (seen.noise, near.noise) == (1.0, 1.0)
+    # Of the readings that are means of three repeats, noise is a third; the same noise over what is left, squared.
+    share = np.mean(1.0 / known.measurements.count) * float(np.mean((known.noise.scale / judge.noise.scale) ** 2))
+    assert far.noise == noise_share(judge) == pytest.approx(share)
+    assert under(near, known, known) is near
+
+
 def test_nothing_is_described_where_nothing_is_hidden():
     answer = audit(asked(101))
     assert answer.verdict == "no_discrepancy"
@@ -117,8 +190,8 @@ def test_commands_tell_laws_apart_that_recordings_do_not():
     """Both channels have moved alike, so that the product of both is the square of either."""
     given = asked(5, Pushed(), alike=True)
     target, base = base_model(given, 5)
-    search = law_search(target.measured, given.ports, ("a", "b"), "rad", 5, 0.02, lambda line: None)
-    found = replace(search, most=1).find(target.measured, as_measured(target, base))
+    search = law_search(target, given.ports, ("a", "b"), "rad", 5, 0.02, lambda line: None)
+    found = replace(search, most=1).find(target, base)
     tied = {refit.term.feature.formula("ab"): refit for refit in found.rivals if refit.term.port.name == "marker m3 x"}
     assert {"u_a u_a", "u_a u_b", "u_b u_b"} <= set(tied)
     hypotheses = [

@@ -653,3 +653,9 @@ def test_of_many_sizes_the_surest_are_said_in_their_order():
     sizes = {f"size_{k}": {"mean": float(m), "sd": 1.0, "unit": "m"} for k, m in enumerate((0, 5, -9, 1, 7, 6))}
     finding = {"mechanism": "glue", "group": "", "parameters": sizes, "relative": {}, "equivalence_class": ["glue"]}
     assert re.findall(r"size (\d)", _named(finding)) == ["1", "2", "4", "5"]
+
+
+def test_a_tie_with_the_same_mechanism_in_another_group_is_said():
+    alike = ["glue@april", "slip@april", "glue@june", "glue"]
+    finding = {"mechanism": "glue", "group": "april", "parameters": {}, "relative": {}, "equivalence_class": alike}
+    assert "(not to be told from slip in april, glue in june, glue by these data)" in _named(finding)

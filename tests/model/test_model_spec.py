@@ -32,6 +32,7 @@ TABLES = {
         "per_recording": {"command_delay": "all"},
         "groups": {"monday": "one"},
         "per_group": {"young_modulus": 1e5},
+        "only_in": {"backlash": ["monday"]},
         "tension": True,
         "weighed": [{"parameters": ["trunk_mass"], "value": 0.1, "sd": 0.01}],
     },

@@ -12,6 +12,8 @@ from scipy.signal import lfilter
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.laws import LawChoice, make_law
+from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
@@ -115,6 +117,20 @@ def test_mechanisms_act_before_and_after_it_and_not_inside(sent):
     np.testing.assert_allclose(moved[:, 0, 0], 1.1 * plain[:, 0, 0], atol=1e-12)
     with pytest.raises(InputError, match="payload does not run here"):
         BlackBoxSimulator(box, mechanisms_named(["payload"], box))
+
+
+@pytest.mark.parametrize(("unit", "kind"), [("m", "cable"), ("rad", "actuator"), ("N m", "actuator")])
+def test_a_port_is_spoken_of_as_a_cable_only_where_commands_are_metres_of_cable(unit, kind):
+    box = BlackBox(lag, parameters=PARAMETERS, **(NAMES | {"channels": ["a", "b"], "command_unit": unit}))
+    ports = port_map(BlackBoxSimulator(box), ["tip"])
+    drives = [port for port in ports.ports if port.kind in ("cable", "cables")]
+    assert [port.name for port in drives] == ["cable a", "cable b", "every cable"]  # as files have them
+    assert [port.words for port in drives] == [f"{kind} a", f"{kind} b", f"every {kind}"]
+    assert [ports.named(port.words) for port in drives] == [ports.named(port.name) for port in drives] == drives
+    term = {"coefficient": "c", "feature": "constant", "scale": 1.0}
+    law = make_law(LawChoice("cable b", (term,)), ports, ["a", "b"], unit)
+    assert f"acts at {kind} b" in law.cause
+    assert f"of the law at {kind} b" in law.parameters[0].description
 
 
 @pytest.mark.parametrize(

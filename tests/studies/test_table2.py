@@ -102,9 +102,11 @@ def test_the_target_keeps_its_truth_and_takes_the_task(tmp_path) -> None:
 
 
 def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_path) -> None:
-    """Mechanisms, their priors, and a finer body; the audit's own priors stay its own."""
+    """Mechanisms, their priors, laws, and a finer body; the audit's own priors stay its own."""
     found = read_tables(AUDIT)
     found["model"] |= {"mechanisms": ["actuator_lag"], "priors": {**found["model"]["priors"], "actuator_lag": {}}}
+    term = {"coefficient": "slip", "feature": "travelled", "commands": ["long_0"], "scale": 0.1}
+    found["model"]["laws"] = [{"port": "cable long_0", "terms": [term]}]
     found["simulator"] = {"refine": 2}
     (tmp_path / "audit").mkdir()
     (tmp_path / "audit" / "extended.toml").write_text(describe(found))
@@ -117,6 +119,7 @@ def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_pat
     path.write_text(describe(extended))
     experiment, _ = load_experiment(path)
     assert experiment.model.mechanisms == ["actuator_lag"]
+    assert [(law.port, law.terms[0].coefficient) for law in experiment.model.laws] == [("cable long_0", "slip")]
     assert set(experiment.model.priors) == {*table2._tables(study, "push")["model"]["priors"], "actuator_lag"}
     assert (experiment.simulator.push, experiment.simulator.refine) == (True, 2)
     (tmp_path / "audit" / "audit.json").write_text(json.dumps({"verdict": "no_verdict", "sentence": "No fit."}))

@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from rfdropo_bayes.cli.check_command import ending
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.named_columns import axes_matrix
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
@@ -155,8 +157,68 @@ def test_recordings_alike_share_a_note(tmp_path):
     text = path.read_text().replace('fit = ["run.csv"]', 'fit = ["run.csv", "again.csv"]')
     path.write_text(text.replace('position_unit = "mm"', 'position_unit = "mm"\naxes = ["x", "z", "-y"]'))
     found = run_check(path, tmp_path / "pictures")
-    assert sum("off the undeformed robot" in note for note in found.notes) == 1
-    assert any(note.startswith("run, again: the first row is ") for note in found.notes)
+    assert sum("off the undeformed robot" in note for note in found.doubts) == 1
+    assert any(note.startswith("run, again: the first row is ") for note in found.doubts)
+
+
+def listed(tmp_path: Path, *copies: str, fit: str, test: str = "[]", more: str = "") -> Check:
+    """What check says of copies of one recording, some of them under the names of folders."""
+    checked(tmp_path, more=more)
+    for copy in copies:
+        (tmp_path / copy).parent.mkdir(exist_ok=True)
+        (tmp_path / copy).write_bytes((tmp_path / "run.csv").read_bytes())
+    path = tmp_path / "own.toml"
+    path.write_text(path.read_text().replace('fit = ["run.csv"]', f"fit = {fit}\ntest = {test}"))
+    return run_check(path, tmp_path / "pictures")
+
+
+def test_files_of_one_name_in_several_folders_are_told_apart_whatever_their_role(tmp_path):
+    found = listed(tmp_path, "a/run.csv", "b/run.csv", fit='["a/run.csv", "run.csv"]', test='["b/run.csv"]')
+    assert not found.problems
+    labels = [label for label, _ in found.lines if label.startswith(("fit:", "test:"))]
+    assert labels == ["fit: a/run", f"fit: {tmp_path.name}/run", "test: b/run"]
+    assert len(set(found.files)) == 3
+
+
+def test_a_file_that_is_listed_twice_is_one_problem(tmp_path):
+    found = listed(tmp_path, fit='["run.csv", "run.*"]')
+    (problem,) = found.problems
+    assert "is listed twice; list each recording once" in problem
+
+
+def test_a_copy_of_a_recording_is_doubtful_and_the_last_line_says_so(tmp_path):
+    found = listed(tmp_path, "copy.csv", fit='["run.csv"]', test='["copy.csv"]')
+    assert not found.problems
+    (doubt,) = found.doubts
+    assert doubt.startswith("run, copy are the same to the last digit")
+    assert ending(found).endswith("look first at the line above that is marked DOUBTFUL")
+    assert ending(checked(tmp_path)) == "nothing keeps this experiment from running"
+
+
+def test_a_group_that_names_no_recording_is_doubtful(tmp_path):
+    found = checked(tmp_path)
+    path = tmp_path / "own.toml"
+    path.write_text(path.read_text() + '[model.groups]\nmonday = ["run", "runn_*"]\n')
+    found = run_check(path, tmp_path / "pictures")
+    assert [doubt for doubt in found.doubts if "monday: 'runn_*' is the name of none" in doubt] == found.doubts
+
+
+@pytest.mark.parametrize("key", ["candidates", "exclude"])
+def test_a_mechanism_that_an_audit_would_not_find_is_a_problem(tmp_path, key):
+    checked(tmp_path)
+    path = tmp_path / "own.toml"
+    path.write_text(path.read_text() + f'[audit]\n{key} = ["backlsh"]\n')
+    (problem,) = run_check(path, tmp_path / "pictures").problems
+    assert "backlsh" in problem
+    assert "did you mean 'backlash'" in problem
+
+
+def test_two_markers_of_the_same_columns_are_refused(tmp_path):
+    checked(tmp_path)
+    path = tmp_path / "own.toml"
+    path.write_text(path.read_text().replace('["x4", "y4", "z4"]', '["x3", "y3", "z3"]'))
+    with pytest.raises(InputError, match="markers 3 and 4 of positions have the same columns"):
+        run_check(path, tmp_path / "pictures")
 
 
 def test_markers_in_another_order_are_named():
@@ -178,7 +240,7 @@ def test_times_in_another_unit_are_a_problem_that_names_it_before_anything_is_si
     (problem,) = found.problems
     assert problem.startswith("run: 61 rows over 3e+09 s would be ")
     assert '"ns" taken for "s", with rows 50 ms apart: correct time_unit under [data.columns]' in problem
-    assert any(note.startswith("run: rows are 5e+07 s apart") for note in found.notes)
+    assert any(note.startswith("run: rows are 5e+07 s apart") for note in found.doubts)
 
 
 def test_nanoseconds_are_read_to_the_last(tmp_path):
@@ -193,14 +255,14 @@ def test_stamps_coarser_than_rows_are_a_problem_that_names_sample_time(tmp_path)
     assert "give sample_time = 0.05" in problem
 
 
-def test_stamps_of_arrival_and_a_clock_that_jumps_are_notes(tmp_path):
+def test_stamps_of_arrival_and_a_clock_that_jumps_are_doubtful(tmp_path):
     arrival = checked(tmp_path, time=0.3 * (ROWS // 6) + 3e-6 * (ROWS % 6))
-    assert any("stamps of arrival" in note and "give sample_time = 0.05" in note for note in arrival.notes)
+    assert any("stamps of arrival" in note and "give sample_time = 0.05" in note for note in arrival.doubts)
     assert "61 rows over 3 s, one every 50 ms" in text_of(arrival)
     assert "no position is masked" in text_of(arrival)
     assert not arrival.problems
     jump = checked(tmp_path, time=0.05 * ROWS + 600.0 * (ROWS > 29))
-    assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.notes)
+    assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.doubts)
 
 
 def test_the_numerical_error_of_step_and_mesh_is_said():

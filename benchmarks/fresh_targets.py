@@ -1,0 +1,79 @@
+"""Table II's rows on a target that nobody has looked at; resumable.
+
+    python benchmarks/fresh_targets.py --kind unknown --seed 1 [--only-done]
+
+Makes the target of `rfdropo_bayes/studies/fresh_targets.py` from kind and seed, trains the policies of every row on
+what is learnt from its six recordings, and plays them on it. Settings are the constants below. Writes table2.json
+(every distance) and table.md into reports/fresh_targets/KIND_SEED; a second call goes on where the first stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.files import write_text
+from rfdropo_bayes.studies.fresh_targets import KINDS, make_target
+from rfdropo_bayes.studies.table2 import ORACLE, OURS, ROWS, Table2Size, run_table2, share_of
+
+SIZE = Table2Size(seeds=3, steps=200_000, episodes=200, budget=3_000, minutes=25.0, exact_oracle=True)
+WITHIN = (5.0, 10.0, 15.25)  # mm
+NEEDS_SBI = ("BayesSim", "NPDR")
+
+
+def rows_at_hand() -> tuple[str, ...]:
+    """Rows of Table II that this environment can compute, those that decide most first."""
+    missing = importlib.util.find_spec("sbi") is None
+    rest = [name for name in reversed(ROWS) if name not in (ORACLE, OURS)]
+    return tuple(name for name in (ORACLE, OURS, *rest) if not (missing and name in NEEDS_SBI))
+
+
+def table(content: Mapping[str, Any], rows: Sequence[str]) -> str:
+    """Shares of episodes within each distance with 95 % intervals, medians, and what was left out."""
+    heads = ["row", *(f"{mm:g} mm" for mm in WITHIN), "10 mm by training", "median [mm]", "seconds a training"]
+    lines = [f"`{content['command']}`", "", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    for name in (name for name in ROWS if name in rows):
+        cells = [cell for cell in content["cells"] if cell["row"] == name]
+        if not cells:
+            continue
+        distance = np.array([cell["distance_mm"] for cell in cells])
+        shares = [share_of(distance <= mm) for mm in WITHIN]
+        words = [f"{100 * s['share']:.0f} % [{100 * s['low']:.0f}, {100 * s['high']:.0f}]" for s in shares]
+        by_training = ", ".join(f"{100 * share:.0f}" for share in (distance <= 10.0).mean(axis=1))
+        seconds = np.mean([cell["seconds"] for cell in cells])
+        entries = [name, *words, by_training, f"{np.median(distance):.1f}", f"{seconds:.0f}"]
+        lines.append(f"| {' | '.join(entries)} |")
+    left_out = [name for name in ROWS if name not in rows]
+    lines += ["", *(f"- {name}: not computed; the extra `sbi` is not installed" for name in left_out)]
+    lines += [f"- {cell}: {why}" for cell, why in content["failed"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Go on with the study of a target."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kind", choices=KINDS, required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--out", type=Path, default=Path("reports/fresh_targets"))
+    parser.add_argument("--only-done", action="store_true")
+    given = parser.parse_args()
+    out = given.out / f"{given.kind}_{given.seed}"
+    files = make_target(given.kind, given.seed, out / "target")
+    rows = rows_at_hand()
+    content = run_table2(
+        [files["reach"]], files["truth"], files["audit"], out, SIZE, rows=rows, resume=(out / "run.json").exists(),
+        only_done=given.only_done, command=shlex.join(["python", *sys.argv]),
+    )  # fmt: skip
+    write_text(out / "table.md", table(content, rows))
+    print(table(content, rows))
+
+
+if __name__ == "__main__":
+    main()
