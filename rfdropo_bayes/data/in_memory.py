@@ -116,15 +116,42 @@ def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
         if set(dataset[key].dims) != set(wanted):
             raise InputError(f"{key} has the dimensions {dataset[key].dims}, and not {wanted}", where=name)
     arrays: dict[str, Any] = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
+    arrays |= {"time": dataset["time"].values, "command_time": dataset[clock].values[: len(arrays["command"])]}
+    stated = {key: str(dataset[key].attrs.get("units", unit)) for key, unit in _UNITS.items()}
+    own = {key: dataset[clock if key == "command_time" else key].attrs.get("units") for key in arrays}
+    for key, (unit, sizes) in _further_units(stated, name).items():
+        if own.get(key, unit) not in (None, unit):
+            arrays[key] = _rescaled(key, arrays[key], _unit(str(own[key]), sizes, f"{name}, {key}") / sizes[unit])
     return arrays | {
-        "time": dataset["time"].values,
-        "command_time": dataset[clock].values[: len(arrays["command"])],
         "markers": [str(marker) for marker in dataset["marker"].values],
         "channels": [str(value) for value in dataset[channel].values],
-        "position_unit": str(dataset["position"].attrs.get("units", "m")),
-        "command_unit": str(dataset["command"].attrs.get("units", "m")),
-        "time_unit": str(dataset["time"].attrs.get("units", "s")),
+        **{f"{key}_unit": unit for key, unit in stated.items()},
     }
+
+
+_UNITS = {"position": "m", "command": "m", "time": "s"}
+"""Units of a data set's variables where they state none."""
+
+
+def _further_units(stated: Mapping[str, str], where: str) -> dict[str, tuple[str, dict[str, float]]]:
+    """In which unit `from_arrays` takes each further variable, and the sizes of the units that it may be in."""
+    kind, _ = _unit(stated["command"], COMMAND_UNITS, where)
+    commands = {unit: factor for unit, (own, factor) in COMMAND_UNITS.items() if own == kind}
+    times = {unit: 1.0 / count for unit, count in PER_SECOND.items()}
+    for key, known in (("position", METRES), ("time", PER_SECOND)):
+        _known(stated[key], known, where)
+    return {
+        "command_time": (stated["time"], times),
+        "initial_command": (stated["command"], commands),
+        "tension": ("N", {"N": 1.0}),
+        "motor_angle": ("rad", {unit: COMMAND_UNITS[unit][1] for unit in ("rad", "deg")}),
+        "object_pose": (stated["position"], METRES),
+    }
+
+
+def _rescaled(key: str, values: np.ndarray, factor: float) -> np.ndarray:
+    """Values in another unit; of a pose the centre alone has one."""
+    return values * np.repeat([factor, 1.0], [3, 4]) if key == "object_pose" else values * factor
 
 
 def beginning(rule: str | None, where: str) -> Rule | None:

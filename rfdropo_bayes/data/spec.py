@@ -152,20 +152,33 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     return _distinct_names(recordings, sources, [*fit, *test])
 
 
-def find_data_file(name: str | Path, base: Path) -> Path:
+def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Path:
     """A file beside the recordings, e.g. a mesh, looked for as they are: in RFDROPO_DATA if set, then in ``base``.
 
+    Args:
+        name: of the file; a pattern that one file alone matches will do.
+        base: folder that it is relative to.
+        folders: whether a folder may stand for the files in it.
+
     Raises:
-        InputError: no such file.
+        InputError: no such file, or a pattern that several match.
     """
-    return find_files(str(name), base)[0]
+    found = find_files(str(name), base, folders=folders)
+    if len(found) > 1:
+        raise InputError(
+            f"matches {len(found)} files ({', '.join(file.name for file in found[:3])}{', ...' if found[3:] else ''}) "
+            "where one is meant",
+            where=str(name),
+            remedy="name the file; where every recording has commands of its own, give an entry for each recording",
+        )
+    return found[0]
 
 
 def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
     for entry in entries:
         commands = None
         if entry.commands not in (None, NO_COMMANDS):
-            commands = find_files(str(entry.commands), base)[0]
+            commands = find_data_file(str(entry.commands), base)
         for match in find_files(entry.observations, base, folders=spec.format in FOLDERS):
             zero = entry.commands == NO_COMMANDS
             for episode in _episodes(spec, entry, match):

@@ -124,8 +124,8 @@ class Trajectory:
 
         Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels
         are named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing, and
-        "s" of ``time``, which may hold dates). Further variables are ``initial_command``, ``tension``, ``motor_angle``
-        and ``object_pose``.
+        "s" of ``time``, which may hold dates). Further variables are ``initial_command``, ``tension`` [N],
+        ``motor_angle`` [rad] and ``object_pose``; where they or ``command_time`` state units of their own, these count.
 
         Raises:
             InputError: a variable, dimension or coordinate that is missing, or see `from_arrays`.

@@ -58,9 +58,11 @@ def load_unseen(
         whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
         return first_row_only(spec.piece(_begun(whole, spec, begun), rows))
     if spec.columns is not None:
-        path = find_files(commands, base, folders=spec.format in FOLDERS)[0]
+        folders = spec.format in FOLDERS
+        path = find_files(commands, base, folders=folders)[0]
         if recognised_format(path) == CSV and holds_commands_alone(path, spec.columns):
-            observations = None if start is None else find_files(start, base, folders=spec.format in FOLDERS)[0]
+            path = find_data_file(commands, base)
+            observations = None if start is None else find_data_file(start, base, folders=folders)
             known = None if observations is None else observed_table(spec.format, observations, spec.columns, episode)
             columns = spec.columns if known is None else known.columns
             whole = read_csv_start(path, columns, None if known is None else known.table, rows[0] if rows else 0)

@@ -15,6 +15,7 @@ PLACE = np.stack([0.01 * np.sin(TIME), 0.02 * np.cos(TIME), 0.1 + 0.0 * TIME], a
 PLACE = np.concatenate([0.5 * PLACE, PLACE], axis=1)  # (time, 2 markers, 3) [m]
 PULL = np.stack([0.01 * (TIME > 0.5), 0.005 * (TIME > 1.0)], axis=-1)  # [m]
 NAMES = {"markers": ["middle", "tip"], "channels": ["left", "right"]}
+LABELS = {"marker": NAMES["markers"], "channel": NAMES["channels"], "axis": list("xyz")}
 
 
 def arrays(**changes):
@@ -60,6 +61,49 @@ def test_a_table_and_a_data_set_give_the_same():
     counted = dataset.assign_coords(time=("time", 1e3 * TIME, {"units": "ms"}))
     for other in (dated, counted):
         np.testing.assert_allclose(Trajectory.from_xarray(other).time, TIME, atol=1e-9)
+
+
+def test_every_variable_of_a_data_set_counts_in_the_unit_that_it_states():
+    """Angles in degrees, commands that are stamped in milliseconds, and a pose in centimetres."""
+    sent, angle = np.arange(10) * 0.2, np.stack([TIME, -TIME], axis=-1)
+    pose = np.tile([0.1, 0.2, 0.05, 0.0, 0.0, 0.6, 0.8], (len(TIME), 1))
+
+    def dataset(**units):
+        clock = {} if "command_time" not in units else {"units": units["command_time"]}
+        size = {"ms": 1e3, "deg": np.degrees(1.0), "cm": 100.0, "mm": 1e3}
+        scale = {key: size.get(unit, 1.0) for key, unit in units.items()}
+        told = {key: {"units": unit} for key, unit in units.items()}
+        scaled = pose * np.repeat([scale.get("object_pose", 1.0), 1.0], [3, 4])
+        return xr.Dataset(
+            {
+                "position": (("time", "marker", "axis"), PLACE),
+                "command": (("command_time", "channel"), PULL[:10]),
+                "initial_command": (
+                    ("channel",),
+                    np.array([0.001, 0.002]) * scale.get("initial_command", 1.0),
+                    told.get("initial_command", {}),
+                ),
+                "tension": (("time", "channel"), 1.0 + PULL, told.get("tension", {})),
+                "motor_angle": (
+                    ("time", "channel"),
+                    angle * scale.get("motor_angle", 1.0),
+                    told.get("motor_angle", {}),
+                ),
+                "object_pose": (("time", "pose"), scaled, told.get("object_pose", {})),
+            },
+            {"time": TIME, "command_time": ("command_time", sent * scale.get("command_time", 1.0), clock), **LABELS},
+        )
+
+    plain = Trajectory.from_xarray(dataset())
+    units = {"command_time": "ms", "motor_angle": "deg", "object_pose": "cm", "initial_command": "mm", "tension": "N"}
+    other = Trajectory.from_xarray(dataset(**units))
+    for key in ("command_time", "motor_angle", "object_pose", "initial_command", "tension"):
+        np.testing.assert_allclose(getattr(other, key), getattr(plain, key), atol=1e-12, err_msg=key)
+    np.testing.assert_allclose(other.command_time, sent)
+    np.testing.assert_allclose(other.motor_angle, angle)
+    for key, unit in (("tension", "mN"), ("motor_angle", "turns"), ("initial_command", "deg")):
+        with pytest.raises(InputError, match=f"{key}: unknown unit '{unit}'"):
+            Trajectory.from_xarray(dataset(**{key: unit}))
 
 
 def test_missing_positions_are_masked_and_counted():

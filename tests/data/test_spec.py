@@ -88,6 +88,25 @@ def test_names_are_distinct(folder, sofa_table, write):
     twice = DataSpec.parse({"format": "sofa-csv", "fit": ["sofa/reach_1.csv", "sofa/*_1.csv"]})
     with pytest.raises(InputError, match="listed twice"):
         load_recordings(twice, folder)
+    for day in ("monday", "tuesday"):
+        (folder / day / "run").mkdir(parents=True)
+        write(sofa_table(5), folder / day / "run" / "reach_9.csv")
+    days = DataSpec.parse({"format": "sofa-csv", "fit": ["*day/run/reach_9.csv", "sofa/reach_1.csv"]})
+    told = ["monday/run/reach_9", "tuesday/run/reach_9", "reach_1"]
+    assert [recording.name for recording in load_recordings(days, folder)] == told
+
+
+def test_commands_of_several_recordings_are_never_those_of_the_first(folder, asl_tables, write):
+    """A pattern of commands says nothing of which recording each file belongs to."""
+    observations, commands = asl_tables()
+    for number in (1, 2):
+        write(observations, folder / f"seen_{number}.csv.gz")
+        write(commands, folder / f"sent_{number}.csv.gz")
+    spec = DataSpec.parse({"format": "asl-csv", "fit": [{"observations": "seen_*.gz", "commands": "sent_*.gz"}]})
+    with pytest.raises(InputError, match=r"sent_\*\.gz: matches 2 files \(sent_1.csv.gz, sent_2.csv.gz\)"):
+        load_recordings(spec, folder)
+    one = DataSpec.parse({"format": "asl-csv", "fit": [{"observations": "seen_*.gz", "commands": "sent_2*"}]})
+    assert len(load_recordings(one, folder)) == 2
 
 
 def test_commands_of_their_own_only_where_the_format_has_them(folder):
