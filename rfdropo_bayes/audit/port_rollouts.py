@@ -5,7 +5,7 @@ One compiled simulator serves all laws: their signals are computed outside and h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
