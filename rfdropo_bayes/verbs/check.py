@@ -11,7 +11,6 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from rfdropo_bayes.data import (
-    RecordingEntry,
     Trajectory,
     check_channels,
     load_recordings,
