@@ -100,8 +100,10 @@ class FeatureTable:
 
         ``check`` is called before every batch of rollouts, and may raise.
         """
-        lanes = (theta, commands)
-        return np.asarray(in_chunks(lambda own: self._paths(*own), lanes, (self.lanes.width,), before=check))
+        once, again = distinct([theta, *map(np.asarray, jax.tree.leaves(commands))])
+        lanes = (theta[once], commands.of(once))
+        found = in_chunks(lambda own: self._paths(*own), lanes, (self.lanes.width,), before=check)
+        return np.asarray(found)[again]
 
     def levels(self, theta: Float[np.ndarray, "lane physical"], commands: Commands) -> np.ndarray:
         """Commands that reach the ports, without signals (lane, row, channel)."""
