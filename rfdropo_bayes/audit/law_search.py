@@ -226,7 +226,7 @@ class LawSearch:
 
     Attributes:
         ports: of the simulator.
-        table: features of the commands.
+        table: features of the commands, and of the motion for ports of the body.
         own: features of a cable's own command, for ports of several cables.
         units: names of the commands, and their unit.
         seed: of simulated data sets.
@@ -254,7 +254,7 @@ class LawSearch:
         """
         known = target
         found = responses(known, fit, self.ports, self.table, self.report)
-        values = self.table.over(found.levels)
+        values = self._values(found)
         null = self._null(known, fit, found)
         where = evidences(found, null)
         first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
@@ -301,13 +301,20 @@ class LawSearch:
         chosen = [p for p in self.ports.ports if p.stage == "sensing" or p in leading]
         return with_exact_columns(known, fit, found, {port: self._offered(port, values)[1] for port in chosen})
 
+    def _values(self, found: Responses) -> Float[np.ndarray, "group feature row"]:
+        """All features of the commands, then those of the motion."""
+        values = self.table.over(found.levels)
+        return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
+
     def _features(self, port: Port) -> Sequence[Feature]:
-        """What a law at a port may be made of."""
-        return self.table.features if self.ports.members(port) == (port,) else self.own
+        """What a law at a port may be made of: on a body of the motion, too."""
+        if self.ports.members(port) != (port,):
+            return self.own
+        return (*self.table.features, *self.table.of_motion) if port.stage == "body" else self.table.features
 
     def _offered(self, port: Port, values: Float[np.ndarray, "group feature row"]) -> tuple[np.ndarray, np.ndarray]:
         """Sizes of a port's features, and the features over their sizes (group, feature, member, row)."""
-        place = {feature: k for k, feature in enumerate(self.table.features)}
+        place = {feature: k for k, feature in enumerate((*self.table.features, *self.table.of_motion))}
         own = [[place[f.of(m.number)] for m in self.ports.members(port)] for f in self._features(port)]
         signals = values[:, np.array(own)]
         sizes = signal_sizes(signals)

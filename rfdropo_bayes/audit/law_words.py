@@ -179,7 +179,7 @@ def law_tables(answer: Answer) -> list[dict[str, Any]]:
         size = abs(float(fit.x[coordinates.names.index(spec.name)]))
         entry: dict[str, Any] = {"coefficient": spec.name, "feature": feature.kind}
         if feature.channels:
-            entry["commands"] = feature.commands(names)
+            entry["motion" if feature.of_motion else "commands"] = feature.commands(names)
         if feature.shape is not None:
             entry["shape"] = float(f"{feature.shape:.6g}")
         entry["scale"] = float(f"{spec.prior['scale'] * max(size, 1.0):.3g}")

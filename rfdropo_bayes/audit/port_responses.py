@@ -73,6 +73,7 @@ class Responses:
         levels: commands that reach the ports, by group.
         duration: rows of the simulator that each group has.
         noise: mean square of the measurement's noise in these deviations; less than 1 where the model is far off.
+        of_motion: features of the motion, by group, where the body carries signals that follow it.
         exact: by port: what each feature does, where it was asked for; see `with_exact_columns`.
     """
 
@@ -84,6 +85,7 @@ class Responses:
     levels: Float[np.ndarray, "group row channel"]
     duration: np.ndarray
     noise: float = 1.0
+    of_motion: Float[np.ndarray, "group feature row"] | None = None
     exact: dict[Port, Float[np.ndarray, "group value feature"]] = field(default_factory=dict)
 
     @property
@@ -125,7 +127,8 @@ def responses(
     slopes = target.measurements.series(fit.jacobian.T) * forward.coordinates.prior_sd[fit.free][:, None, None, None]
     jacobian = np.moveaxis(slopes.reshape(len(fit.free), groups, -1), 0, 2)
     duration = np.asarray(forward.commands.sample_step).max(axis=1) + 1
-    return Responses(ports, basis, found, white, jacobian, levels, duration, noise_share(target))
+    moving = table.over_motion(theta, forward.commands, forward.deadline.check) if table.of_motion else None
+    return Responses(ports, basis, found, white, jacobian, levels, duration, noise_share(target), moving)
 
 
 def _response(

@@ -5,7 +5,7 @@ One compiled simulator serves all laws: their signals are computed outside and h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -20,13 +20,14 @@ from rfdropo_bayes.audit.journal import digest
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.mechanisms.default_priors import normal
-from rfdropo_bayes.mechanisms.features import Feature
+from rfdropo_bayes.mechanisms.features import Feature, gauges_of, motion_dictionary
 from rfdropo_bayes.mechanisms.laws import FAR, unit_of
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands, observed_at
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.robot_simulator import PASSES, RobotSimulator
 
 Signals = Float[np.ndarray, "lane row"]
 STEP = 1e-4
@@ -50,13 +51,15 @@ class FeatureTable:
 
     Args:
         lanes: the simulator.
-        features: all that may be asked for.
+        features: all of time and commands that may be asked for; of the motion it has what a body can carry.
     """
 
     def __init__(self, lanes: Lanes, features: Sequence[Feature]) -> None:
         self.lanes, self.features = lanes, tuple(features)
         simulator: Any = lanes.simulator
         self.time_step = float(simulator.description["time_step_s"])
+        carries = isinstance(simulator, RobotSimulator) and simulator.engine.carries_loads
+        self.of_motion = tuple(motion_dictionary()) if carries else ()
 
     @cached_property
     def _levels(self) -> Any:
@@ -77,6 +80,30 @@ class FeatureTable:
             return jnp.stack([feature.over(levels, self.time_step) for feature in self.features])
 
         return jax.jit(jax.vmap(one))
+
+    @cached_property
+    def _paths(self) -> Any:
+        simulator = self.lanes.simulator
+        assert isinstance(simulator, RobotSimulator)
+
+        def one(theta: jax.Array, commands: Commands) -> jax.Array:
+            values = dict(zip(self.lanes.physical, theta, strict=True))
+            gauges = gauges_of(simulator.path(values, commands))
+            return jnp.stack([feature.over(gauges, self.time_step) for feature in self.of_motion])
+
+        return jax.jit(jax.vmap(one))
+
+    def over_motion(
+        self, theta: Float[np.ndarray, "lane physical"], commands: Commands, check: Callable[[], None] = lambda: None
+    ) -> Float[np.ndarray, "lane feature row"]:
+        """Features of the motion that commands and their signals make, all that a body can carry.
+
+        ``check`` is called before every batch of rollouts, and may raise.
+        """
+        once, again = distinct([theta, *map(np.asarray, jax.tree.leaves(commands))])
+        lanes = (theta[once], commands.of(once))
+        found = in_chunks(lambda own: self._paths(*own), lanes, (self.lanes.width,), before=check)
+        return np.asarray(found)[again]
 
     def levels(self, theta: Float[np.ndarray, "lane physical"], commands: Commands) -> np.ndarray:
         """Commands that reach the ports, without signals (lane, row, channel)."""
@@ -180,13 +207,24 @@ class PortedForward(Forward):
         """Signals of every lane at each port that has a law."""
         flat = theta.reshape(-1, theta.shape[-1])
         sizes = np.repeat(self._beside(points), self.count, axis=0)
-        parts = [(k, member) for k, term in enumerate(self.terms) for member in self.ports.members(term.port)]
+        by_command = [k for k, term in enumerate(self.terms) if not term.feature.of_motion]
+        parts = [(k, member) for k in by_command for member in self.ports.members(self.terms[k].port)]
         features = [self.terms[k].feature.of(member.number) for k, member in parts]
-        values = self.table.over(self.table.levels(flat, commands), features)
         found: dict[Port, Signals] = {}
-        for place, (k, member) in enumerate(parts):
-            found[member] = found.get(member, 0.0) + sizes[:, k, None] * values[:, place]
-        return list(found.items())
+        if parts:
+            values = self.table.over(self.table.levels(flat, commands), features)
+            for place, (k, member) in enumerate(parts):
+                found[member] = found.get(member, 0.0) + sizes[:, k, None] * values[:, place]
+        following = [k for k, term in enumerate(self.terms) if term.feature.of_motion]
+        acting = found
+        for _ in range(PASSES if following else 0):
+            signals = signals_of(self.ports, list(acting.items()))
+            values = self.table.over_motion(flat, commands._replace(signals=signals), self.deadline.check)
+            acting = dict(found)
+            for k in following:
+                port, own = self.terms[k].port, values[:, self.table.of_motion.index(self.terms[k].feature)]
+                acting[port] = acting.get(port, 0.0) + sizes[:, k, None] * own
+        return list(acting.items())
 
     def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
         flat, start, commands = super()._per_lane(theta, points)

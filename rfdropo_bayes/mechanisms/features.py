@@ -1,4 +1,4 @@
-"""Features: what a law at a port may depend on, each a number at every time step, made of time and commands.
+"""Features: what a law at a port may depend on, each a number at every time step: of time, commands or the motion.
 
 A feature is written as a step with a memory, so that a whole rollout, which scans it, and a session give the same.
 """
@@ -20,6 +20,8 @@ REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
 OWN = -1
 """In the place of a command: that of the cable on which a law acts, at a port of several cables."""
 OWN_NAME = "own"
+GAUGES = ("tip x", "tip y", "tip z", "tip distance")
+"""The motion as features see it [m]: the last marker from where it was before the first step, and its distance."""
 
 
 class Kind(NamedTuple):
@@ -55,30 +57,38 @@ KINDS: Mapping[str, Kind] = {
     ),
     "largest": Kind(1, (1, 0), "with the largest {0} so far", "max|u_{0}|"),
     "travelled": Kind(1, (1, 0), "with all the travel of {0} so far", "travel(u_{0})"),
+    "position": Kind(1, (1, 0), "in proportion to {0}", "u_{0}"),
 }
 """Shapes: of a low pass the time constant [s]; of a play half its width, tried as a share of the commands' stroke."""
 
+MOTION_KINDS = ("position", "rate", "largest")
+"""Kinds of features of the motion; a position is of nothing else."""
+
 
 class Feature(NamedTuple):
-    """A feature of some commands.
+    """A feature of some commands, or of the motion.
 
     Attributes:
         kind: a key of `KINDS`.
-        channels: indices of its commands; `OWN` is to be replaced before values are asked for, see `of`.
+        channels: indices of its commands, or of its `GAUGES`; `OWN` is to be replaced before values are asked for, see
+            `of`.
         shape: its time constant [s] or width [m or rad]; None without.
+        of_motion: whether it is made of `GAUGES`, which take the place of commands then.
     """
 
     kind: str
     channels: tuple[int, ...] = ()
     shape: float | None = None
+    of_motion: bool = False
 
     def of(self, channel: int) -> Feature:
         """The same with a command in the place of `OWN`."""
         return self._replace(channels=tuple(channel if k == OWN else k for k in self.channels))
 
     def commands(self, names: Sequence[str]) -> list[str]:
-        """Names of its commands."""
-        return [OWN_NAME if k == OWN else names[k] for k in self.channels]
+        """Names of its commands, or of its gauges."""
+        known = GAUGES if self.of_motion else names
+        return [OWN_NAME if k == OWN else known[k] for k in self.channels]
 
     def begin(self, first: Float[Array, " channel"]) -> Any:
         """Memory before the first step, given the command that was held before it."""
@@ -98,7 +108,7 @@ class Feature(NamedTuple):
 
     def at_rest(self, first: Float[Array, " channel"]) -> Float[Array, ""]:
         """Its value before the first step."""
-        if self.kind in ("command", "low_pass"):
+        if self.kind in ("command", "position", "low_pass"):
             return first[self.channels[0]]
         if self.kind in ("magnitude", "largest"):
             return jnp.abs(first[self.channels[0]])
@@ -152,20 +162,39 @@ class Feature(NamedTuple):
     def unit(self, command_unit: str) -> tuple[tuple[str, int], ...]:
         """Powers of units."""
         length, seconds = KINDS[self.kind].unit
-        return tuple((name, power) for name, power in ((command_unit, length), ("s", seconds)) if power)
+        own = "m" if self.of_motion else command_unit
+        return tuple((name, power) for name, power in ((own, length), ("s", seconds)) if power)
 
     def words(self, names: Sequence[str]) -> str:
         """In a sentence."""
-        own = ["its own command" if k == OWN else names[k] for k in self.channels]
+        own = ["its own command" if name == OWN_NAME else name for name in self.commands(names)]
         return KINDS[self.kind].words.format(*own, shape=self.shape or 0.0)
 
     def formula(self, names: Sequence[str]) -> str:
         """As a symbol."""
-        return KINDS[self.kind].formula.format(*self.commands(names), shape=self.shape or 0.0)
+        symbol = KINDS[self.kind].formula.replace("u_", "") if self.of_motion else KINDS[self.kind].formula
+        return symbol.format(*self.commands(names), shape=self.shape or 0.0)
+
+
+def gauges_of(path: Float[Array, "row 3"]) -> Float[Array, "row 4"]:
+    """`GAUGES` of the last marker's path [m]; row 0 is before the first step."""
+    way = path - path[0]
+    square = jnp.sum(way**2, axis=1)
+    moved = square > 0.0  # the slope of a root has no value at 0
+    distance = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
+    return jnp.concatenate([way, distance[:, None]], axis=1)
+
+
+def motion_dictionary() -> list[Feature]:
+    """All features of the motion: where the last marker is, how fast, and the largest distance so far."""
+    last = len(GAUGES) - 1
+    found = [Feature("position", (k,), of_motion=True) for k in range(len(GAUGES))]
+    found += [Feature("rate", (k,), of_motion=True) for k in range(last)]
+    return [*found, Feature("largest", (last,), of_motion=True)]
 
 
 def dictionary(channels: int, stroke: float) -> list[Feature]:
-    """All features of so many commands, whose largest change is ``stroke`` [m or rad]."""
+    """All features of time and of so many commands, whose largest change is ``stroke`` [m or rad]."""
     return _of_channels(range(channels), stroke)
 
 
@@ -177,6 +206,8 @@ def own_dictionary(stroke: float) -> list[Feature]:
 def _of_channels(channels: Sequence[int], stroke: float) -> list[Feature]:
     found = []
     for name, kind in KINDS.items():
+        if name == "position":
+            continue
         shapes: list[float | None] = [*kind.shapes] or [None]
         if name == "play":
             shapes = [share * stroke for share in kind.shapes]
@@ -185,24 +216,40 @@ def _of_channels(channels: Sequence[int], stroke: float) -> list[Feature]:
     return found
 
 
-def feature_named(kind: str, commands: Sequence[str], shape: float | None, names: Sequence[str], where: str) -> Feature:
+def feature_named(
+    kind: str,
+    commands: Sequence[str],
+    shape: float | None,
+    names: Sequence[str],
+    where: str,
+    *,
+    of_motion: bool = False,
+) -> Feature:
     """A feature as a file has it.
 
     Args:
         kind: a key of `KINDS`.
-        commands: names of its commands, among them `OWN_NAME` where ``names`` has that.
+        commands: names of its commands, among them `OWN_NAME` where ``names`` has that; or of its gauges.
         shape: its time constant or width; None without.
-        names: of the commands, in their order; `OWN_NAME`, if it may be used, comes last.
+        names: of the commands, in their order; `OWN_NAME`, if it may be used, comes last. Or `GAUGES`.
         where: the place in the file.
+        of_motion: whether it is made of gauges.
 
     Raises:
         InputError: an unknown kind or command, or a shape that is missing or has no meaning.
     """
     if kind not in KINDS:
         raise InputError(f"unknown feature {kind!r}", where=where, remedy=nearest(kind, KINDS))
+    if of_motion != (kind in MOTION_KINDS) and (of_motion or kind == "position"):
+        raise InputError(
+            f"the feature {kind!r} is not made of {'the motion' if of_motion else 'commands'}",
+            where=where,
+            remedy=f"features of the motion are {', '.join(MOTION_KINDS)}; see docs/mechanisms.md",
+        )
     for command in commands:
         if command not in names:
-            raise InputError(f"unknown command {command!r}", where=where, remedy=nearest(command, names))
+            what = "part of the motion" if of_motion else "command"
+            raise InputError(f"unknown {what} {command!r}", where=where, remedy=nearest(command, names))
     wanted = KINDS[kind]
     if len(commands) != wanted.channels:
         raise InputError(
@@ -213,4 +260,5 @@ def feature_named(kind: str, commands: Sequence[str], shape: float | None, names
     if bool(wanted.shapes) != (shape is not None) or (shape is not None and not shape > 0.0):
         needs = "a positive shape" if wanted.shapes else "no shape"
         raise InputError(f"the feature {kind!r} takes {needs}", where=where, remedy="see docs/mechanisms.md")
-    return Feature(kind, tuple(OWN if command == OWN_NAME else names.index(command) for command in commands), shape)
+    places = tuple(OWN if command == OWN_NAME else names.index(command) for command in commands)
+    return Feature(kind, places, shape, of_motion)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.default_priors import normal
-from rfdropo_bayes.mechanisms.features import KINDS, OWN_NAME, Feature, feature_named
+from rfdropo_bayes.mechanisms.features import GAUGES, KINDS, OWN_NAME, Feature, feature_named, gauges_of
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.simulators.commands import sample
 from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
@@ -163,9 +163,23 @@ class BodyLaw(Law):
     stage = "body"
     bodies = ("layered",)
 
-    def push(self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int) -> BodySignals:
+    @property
+    def follows_motion(self) -> bool:
         """See `PushingMechanism`."""
-        return self._ports.push(self.port, self.signal(values, command, time_step))
+        return any(term.feature.of_motion for term in self.terms)
+
+    def push(
+        self,
+        values: Values,
+        command: Float[Array, "row channel"],
+        path: Float[Array, "row 3"] | None,
+        time_step: float,
+    ) -> BodySignals:
+        """See `PushingMechanism`."""
+        w = _summed([t for t in self.terms if not t.feature.of_motion], values, command, time_step)
+        if path is not None:
+            w = w + _summed([t for t in self.terms if t.feature.of_motion], values, gauges_of(path), time_step)
+        return self._ports.push(self.port, w)
 
 
 class SensingLaw(Law):
@@ -224,6 +238,20 @@ def law_at(port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "")
     return (ClockedSensingLaw if of_time and port.kind != "observation" else SensingLaw)(port, terms, ports, formula)
 
 
+def _feature(table: Mapping[str, Any], port: Port, names: Sequence[str], where: str) -> Feature:
+    kind, shape, motion = table["feature"], table.get("shape"), table.get("motion", ())
+    if not motion:
+        return feature_named(kind, table.get("commands", ()), shape, names, where)
+    if port.stage != "body" or table.get("commands"):
+        raise InputError(
+            f"a term cannot follow the motion {'and commands' if port.stage == 'body' else 'here'}",
+            where=where,
+            remedy="laws of the motion act on the body (forces, stiffness, damping, base tilt), and commands = [...] "
+            "goes into a term of its own",
+        )
+    return feature_named(kind, motion, shape, GAUGES, where, of_motion=True)
+
+
 def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command_unit: str) -> Mechanism:
     """A law as a file has it.
 
@@ -240,7 +268,7 @@ def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command
     names = (*channels, OWN_NAME) if port.kind == "cables" else tuple(channels)
     terms = []
     for table in choice.terms:
-        feature = feature_named(table["feature"], table.get("commands", ()), table.get("shape"), names, where)
+        feature = _feature(table, port, names, where)
         scale = float(table["scale"])
         unit = unit_of(port.unit, feature, command_unit)
         words = f"of the law at {port.words}: it changes {feature.words(channels)}"

@@ -44,6 +44,11 @@ class LawTermTable(ExperimentTable):
     coefficient: str = Field(description="name of its parameter, zero of which is no effect")
     feature: str = Field(description="kind of the feature, see docs/mechanisms.md")
     commands: list[str] = Field(default_factory=list, description="commands that the feature is made of")
+    motion: list[str] = Field(
+        default_factory=list,
+        description="in their place, at ports of the body: tip x, tip y, tip z or tip distance, from where the last"
+        " marker begins",
+    )
     shape: float | None = Field(
         default=None, gt=0.0, description="time constant [s] of a low pass, or half the width of a play"
     )

@@ -124,10 +124,27 @@ class CommandedSensingMechanism(Mechanism, Protocol):
 
 @runtime_checkable
 class PushingMechanism(Mechanism, Protocol):
-    """Acts on a layered body from step to step, in a way that depends on time and on what is commanded."""
+    """Acts on a layered body from step to step, by time, by what is commanded, and by how the body moves."""
 
-    def push(self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int) -> BodySignals:
-        """Return what acts on the body, given the commands that reach the cables; row 0 is before the first step."""
+    @property
+    def follows_motion(self) -> bool:
+        """Whether it depends on how the body moves."""
+
+    def push(
+        self,
+        values: Values,
+        command: Float[Array, "row channel"],
+        path: Float[Array, "row 3"] | None,
+        time_step: float,
+    ) -> BodySignals:
+        """Return what acts on the body; row 0 is before the first step.
+
+        Args:
+            values: parameters by name.
+            command: that reaches the cables.
+            path: of the last marker in the frame of the base [m]; None for what acts whatever the motion.
+            time_step: [s].
+        """
 
 
 @runtime_checkable

@@ -37,6 +37,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
+PASSES = 2
+"""Rollouts after which laws that follow the motion are given the motion that they make."""
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
 
@@ -180,13 +182,32 @@ class RobotSimulator(ExtendedSimulator):
         """
         values = self.complete(parameters)
         steps = self.steps_seen(values, commands, self.time_step, steps)
-        cube, loads = self.body_inputs(values)[1], self.loads(values, commands)
-        motion = self.engine.motion(*self.inputs(values, commands), steps, cube, loads)
+        cube, inputs = self.body_inputs(values)[1], self.inputs(values, commands)
+        loads = self.loads(values, commands)
+        following = [m for m in self.mechanisms if isinstance(m, PushingMechanism) and m.follows_motion]
+        for _ in range(PASSES if following else 0):
+            path = self.engine.motion(*inputs, steps, cube, loads).position[:, -1]
+            loads = self.loads(values, commands, path)
+        motion = self.engine.motion(*inputs, steps, cube, loads)
         return self.observation(values, commands, motion, self.unsolved)
 
-    def loads(self, values: Values, commands: Commands) -> BodySignals | None:
+    def path(self, parameters: Values, commands: Commands) -> Float[Array, "row 3"]:
+        """Where the last marker is before the first step and at the end of each [m], in the frame of the base, without
+        laws that follow the motion."""
+        values = self.complete(parameters)
+        cube, loads = self.body_inputs(values)[1], self.loads(values, commands)
+        return self.engine.motion(*self.inputs(values, commands), None, cube, loads).position[:, -1]
+
+    def loads(
+        self, values: Values, commands: Commands, path: Float[Array, "row 3"] | None = None
+    ) -> BodySignals | None:
         """What acts on the body from step to step: signals that come with the commands, and mechanisms; None for
         nothing.
+
+        Args:
+            values: of all parameters.
+            commands: from `commands`.
+            path: of the last marker in the frame of the base [m], for laws that follow it; they do nothing without.
 
         Raises:
             InputError: mechanisms that do, on another body than layers without a cube.
@@ -201,8 +222,8 @@ class RobotSimulator(ExtendedSimulator):
                     remedy='set body = "layered" under [simulator], and leave the cube out',
                 )
             initial, command = self.actuated(values, commands, self.time_step)
-            levels, places = jnp.concatenate([initial[None], command]), len(self.engine.load_stations)
-            found += [mechanism.push(values, levels, self.time_step, places) for mechanism in pushing]
+            levels = jnp.concatenate([initial[None], command])
+            found += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
         return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:

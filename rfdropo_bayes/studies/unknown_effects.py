@@ -137,7 +137,10 @@ EFFECTS: dict[str, Effect] = {
     ),
     "slow_queue": Effect(("command delay",), ("time",), lambda a, s: {"delay": 0.02 * a * s.time}),
     "magnet": Effect(
-        ("force x at the tip", "force y at the tip"), ("command", "product", "magnitude"), _magnet, moves=True
+        ("force x at the tip", "force y at the tip"),
+        ("position", "command", "product", "magnitude"),
+        _magnet,
+        moves=True,
     ),
     "rising_wind": Effect(
         ("force x at the tip", "force x at the middle"),

@@ -91,7 +91,7 @@ def test_terms_of_null_data_pass_the_gate_as_seldom_as_is_said():
     """At a family of .1 of 60 data sets about 6 have a term that passes; 14 by chance in one of a thousand series."""
     found, time, rng = responses(3), STEP * np.arange(ROWS), np.random.default_rng(4)
     values = np.stack([np.sin(k * time) for k in range(1, 30)])[None].repeat(GROUPS, axis=0)
-    table = SimpleNamespace(features=[Feature("command", (k,)) for k in range(29)])
+    table = SimpleNamespace(features=[Feature("command", (k,)) for k in range(29)], of_motion=())
     search = LawSearch(found.ports, table, [], ((), "m"), 0, 0.1)
     gate = search._gate(found, values, rng.normal(size=(199, GROUPS * VALUES)))
     small = 0
@@ -106,7 +106,7 @@ def test_a_term_that_the_law_has_is_not_asked_for_again():
     found, time = responses(3, signal=3.0), STEP * np.arange(ROWS)
     values = np.stack([np.sin(k * time) for k in (8.0, 3.0, 5.0)])[None].repeat(GROUPS, axis=0)
     features = [Feature("command", (k,)) for k in range(3)]
-    search = LawSearch(found.ports, SimpleNamespace(features=features), [], ((), "m"), 0, 0.1)
+    search = LawSearch(found.ports, SimpleNamespace(features=features, of_motion=()), [], ((), "m"), 0, 0.1)
     best, *others = [(row.port, row.feature) for row in search._ranked(found, values, 0.0)]
     assert best == (PORTS[0], features[0])
     law = [SimpleNamespace(term=SimpleNamespace(port=best[0], feature=best[1]))]
@@ -190,7 +190,9 @@ def test_a_law_of_every_cable_is_found_where_both_cables_follow_it():
     moved = sum(found.whitened[port] @ near[:, k, :, None] for k, port in enumerate(found.whitened))[..., 0]
     found = replace(found, residual=found.residual + 0.5 * moved)
     features = [Feature("command", (k,)) for k in range(2)]
-    search = LawSearch(found.ports, SimpleNamespace(features=features), [Feature("command", (OWN,))], ((), "m"), 0, 0.1)
+    search = LawSearch(
+        found.ports, SimpleNamespace(features=features, of_motion=()), [Feature("command", (OWN,))], ((), "m"), 0, 0.1
+    )
     best, *others = search._ranked(found, values, 0.0)
     assert (best.port, best.feature) == (every, Feature("command", (OWN,)))
     assert abs(best.size - 0.5) < 4.0 * best.sd

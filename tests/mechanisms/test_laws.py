@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary, own_dictionary
+from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary, gauges_of, motion_dictionary, own_dictionary
+from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.simulators.robot_simulator import PASSES
 from rfdropo_bayes.tables import parse_table
 
 STEP = 0.01
@@ -55,6 +58,7 @@ def test_features_are_what_their_formulas_say():
         "largest": np.maximum.accumulate(np.abs(u)),
         "travelled": np.append(0.0, np.cumsum(np.abs(move))),
     }
+    truth["position"] = u
     assert set(truth) == set(KINDS)
     shapes = {"low_pass": 0.3, "play": 2e-3}
     for name, kind in KINDS.items():
@@ -131,8 +135,62 @@ def test_a_session_holds_the_play_of_every_cable():
     assert np.abs(np.stack(seen) - whole.position[1:]).max() < 1e-12
 
 
+def test_gauges_are_where_the_tip_is_and_their_slope_is_finite_at_rest():
+    path = jnp.asarray(np.cumsum(np.random.default_rng(2).normal(size=(30, 3)), axis=0))
+    way = np.asarray(path - path[0])
+    gauges = gauges_of(path)
+    assert np.allclose(gauges[:, :3], way)
+    assert np.allclose(gauges[:, 3], np.linalg.norm(way, axis=1))
+    assert np.isfinite(jax.jacobian(gauges_of)(path)).all()
+    largest = Feature("largest", (3,), of_motion=True)
+    assert np.allclose(largest.over(gauges, STEP), np.maximum.accumulate(np.linalg.norm(way, axis=1)))
+    assert (largest.formula(()), largest.unit("rad")) == ("max|tip distance|", (("m", 1),))
+    assert len(motion_dictionary()) == len(set(motion_dictionary())) == 8
+
+
+def by_hand(simulator, given, port, signal, rollouts):
+    """What a law of the motion does, by signals of the motion that the rollout before shows."""
+    ports = port_map(simulator, simulator.marker_names)
+    rows = np.arange(len(given.step) + 1)
+    every = given._replace(sample_step=rows, sample_fraction=np.zeros(len(rows)))
+    acted = every
+    for _ in range(rollouts):
+        tip = np.asarray(simulator.rollout({}, acted).position)[:, -1]
+        acted = every._replace(signals=ports.signals(ports.named(port), jnp.asarray(signal(tip - tip[0]))))
+    return np.asarray(simulator.rollout({}, given._replace(signals=acted.signals)).position)
+
+
+@pytest.mark.parametrize(
+    ("port", "term", "size", "signal"),
+    [
+        ("force x at the tip", {"feature": "position", "motion": ["tip x"]}, -6.0, lambda w: -6.0 * w[:, 0]),
+        (
+            "stiffness",
+            {"feature": "largest", "motion": ["tip distance"]},
+            -10.0,
+            lambda w: -10.0 * np.maximum.accumulate(np.linalg.norm(w, axis=1)),
+        ),
+    ],
+)
+def test_a_law_of_the_motion_is_given_the_motion_that_it_makes(port, term, size, signal):
+    plain, acting = build_robot_simulator(spec()), build_robot_simulator(spec(law(port, **term)))
+    given = commands(plain)
+    still = np.asarray(plain.rollout({}, given).position)
+    assert np.array_equal(still, acting.rollout({"c": jnp.asarray(0.0)}, given).position)
+    seen = np.asarray(acting.rollout({"c": jnp.asarray(size)}, given).position)
+    assert np.abs(seen - by_hand(plain, given, port, signal, PASSES)).max() < 1e-9
+    settled, moved = by_hand(plain, given, port, signal, 8), np.abs(seen - still).max()
+    assert moved > 5e-4
+    assert np.abs(seen - settled).max() < 0.05 * moved
+
+
 def test_what_a_law_cannot_be_is_said():
     for wrong, match in (
+        (law("cable left", "position", motion=["tip x"]), "cannot follow the motion here"),
+        (law("stiffness", "position", motion=["tip x"], commands=["up"]), "cannot follow the motion and commands"),
+        (law("stiffness", "position", motion=["tip top"]), "unknown part of the motion"),
+        (law("stiffness", "travelled", motion=["tip x"]), "not made of the motion"),
+        (law("stiffness", "position", commands=["up"]), "not made of commands"),
         (law("cable top"), "no port 'cable top'"),
         (law("cable left", "speed"), "unknown feature"),
         (law("cable left", "product", commands=["up"]), "made of 2 commands"),
