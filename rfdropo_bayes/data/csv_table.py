@@ -81,9 +81,15 @@ class Dialect(NamedTuple):
 def dialect_of(lines: Sequence[str]) -> Dialect:
     """Separator of a file (comma, semicolon or tab, whichever gives its header the most names) and decimal sign.
 
-    Decimals follow a comma where cells do that are not separated by commas, or are quoted.
+    Spaces separate where none of these does and all lines have as many words. Decimals follow a comma where cells do
+    that are not separated by commas, or are quoted.
     """
     separator = max(",;\t", key=lambda sign: len(_cells(lines[0], sign)))
+    if (
+        len(_cells(lines[0], separator)) == 1 < len(lines[0].split())
+        and len({len(line.split()) for line in lines}) == 1
+    ):
+        separator = " "
     wall = '"' if separator == "," else f'["{separator}]'
     comma = re.compile(rf"(?:^|{wall})\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*(?:$|{wall})")
     if separator == "," and '"' not in "".join(lines[1:]):
@@ -92,6 +98,8 @@ def dialect_of(lines: Sequence[str]) -> Dialect:
 
 
 def _cells(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
     if '"' not in line:
         return line.split(separator)
     return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
@@ -100,7 +108,7 @@ def _cells(line: str, separator: str) -> list[str]:
 class CsvTable:
     """A rectangular table of numbers with named columns.
 
-    Values may be separated by commas, semicolons or tabs, and decimals may follow a comma (`dialect_of`).
+    Values may be separated by commas, semicolons, tabs or spaces, and decimals may follow a comma (`dialect_of`).
 
     Args:
         path: the file, plain or gzipped.
@@ -144,12 +152,15 @@ class CsvTable:
             raise InputError("the file is empty", where=str(self.path), remedy="give a CSV with a header and rows")
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
+        bare = [lines[0].removeprefix("#"), *lines[1:]]
+        if dialect_of(bare).separator == " ":  # NumPy marks the names so where it separates by spaces
+            lines = bare
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
         _check_rectangular(self.path, lines, dialect.separator)
         self.frame = pd.read_csv(
             io.StringIO("\n".join(lines)),
-            sep=dialect.separator,
+            sep=r"\s+" if dialect.separator == " " else dialect.separator,
             decimal=dialect.decimal,
             skipinitialspace=True,
             low_memory=False,

@@ -122,7 +122,9 @@ def _of_text(cells: pd.Series, unit: str, where: str, column: str) -> Stamps:
     raise InputError(
         f"{str(cells.iat[row])!r} is not a number, nor a date as ISO 8601 has it",
         where=f"{where}, row {row}, column {column!r}",
-        remedy="correct the cell",
+        remedy="correct the cell"
+        if found.notna().any()
+        else "write all times as numbers or like 2024-05-01T12:00:00.25, or give sample_time in place of time",
     )
 
 

@@ -181,7 +181,7 @@ class NatNetMarkers:
         robot: whose markers they are.
 
     Raises:
-        InputError: if a marker has no rigid body, the package is missing, or Motive does not answer.
+        InputError: if a marker has no rigid body of its own, the package is missing, or Motive does not answer.
     """
 
     def __init__(self, table: SensorTable, robot: Robot) -> None:
@@ -191,6 +191,9 @@ class NatNetMarkers:
                 f"marker {missing[0]!r} has none", where="sensor.rigid_bodies", remedy="give its identifier"
             )
         self._identifiers = {table.rigid_bodies[name]: place for place, name in enumerate(robot.marker_names)}
+        if len(self._identifiers) < len(robot.marker_names):
+            remedy = "give each marker the identifier of its own"
+            raise InputError("two markers have the same one", where="sensor.rigid_bodies", remedy=remedy)
         self._rotation, self._origin = np.array(table.rotation), np.array(table.origin_m)
         self._lock = threading.Lock()
         self._sighting = _nothing(len(robot.marker_names))

@@ -225,6 +225,10 @@ ROWS = "x,y,z,u\n100.5,0,0,1.5\n100,1,0,2\n100,2,0,2\n"
         ROWS.replace(",", " ; "),
         "sep=;\n" + ROWS.replace(",", ";").replace(".", ","),
         ROWS.replace("100.5", '"100,5"').replace("1.5", '"1,5"'),
+        ROWS.replace(",", " "),
+        "# " + ROWS.replace(",", " "),
+        "  " + ROWS.replace(",", "   ").replace("\n", "\n  ").rstrip(" "),
+        ROWS.replace(",", " ").replace(".", ","),
         ROWS.replace("\n", "\r\n"),
         ROWS.replace("\n", "\r"),
         ROWS.removesuffix("\n"),
@@ -257,6 +261,13 @@ def test_lines_above_the_names_of_the_columns_are_named(tmp_path):
         plain(tmp_path / "own.csv", "# logger 3.1\n# begun at noon\n" + ROWS)
     with fails("row 0: has 5 values where the header names 4"):
         plain(tmp_path / "own.csv", "x,y,z,u\n" + ROWS.removeprefix("x,y,z,u\n").replace("\n", ",\n"))
+
+
+def test_a_clock_that_is_written_in_no_known_way_is_not_one_cell_to_correct(tmp_path):
+    names, *rows = ROWS.splitlines()
+    text = "\n".join([f"t,{names}", *(f"3/31/2024 10:59:{59 - k} AM,{row}" for k, row in enumerate(rows))]) + "\n"
+    with fails("row 0, column 't': '3/31/2024 10:59:59 AM' is not a number.*or give sample_time in place of time"):
+        plain(tmp_path / "own.csv", text, time="t", sample_time=None)
 
 
 def test_columns_without_names_are_not_read(tmp_path):

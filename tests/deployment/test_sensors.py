@@ -143,6 +143,12 @@ def test_a_marker_without_a_rigid_body_is_refused(robot: Robot) -> None:
         NatNetMarkers(SensorTable(kind="natnet"), robot)
 
 
+def test_two_markers_of_one_rigid_body_are_refused(robot: Robot) -> None:
+    """One of them would count as lost for ever."""
+    with pytest.raises(InputError, match=r"sensor.rigid_bodies: two markers have the same one"):
+        NatNetMarkers(SensorTable(kind="natnet", rigid_bodies={"m1": 1, "m2": 2, "m3": 2, "m4": 4}), robot)
+
+
 def test_springs_have_their_closed_form(robot: Robot) -> None:
     plant = SpringCables(robot, stiffness=100.0, pretension=1.0, lean=2.0)
     state = plant.advance(np.array([0.01, -0.02, 0.0, 0.0]), 0.01)
