@@ -31,8 +31,8 @@ NEEDS_SBI = ("BayesSim", "NPDR")
 def rows_at_hand() -> tuple[str, ...]:
     """Rows of Table II that this environment can compute, those that decide most first."""
     missing = importlib.util.find_spec("sbi") is None
-    rest = [name for name in reversed(ROWS) if name not in (ORACLE, OURS)]
-    return tuple(name for name in (ORACLE, OURS, *rest) if not (missing and name in NEEDS_SBI))
+    order = dict.fromkeys((ORACLE, OURS, "ours", *ROWS))
+    return tuple(name for name in order if not (missing and name in NEEDS_SBI))
 
 
 def table(content: Mapping[str, Any], rows: Sequence[str]) -> str:
