@@ -18,7 +18,7 @@ PROBLEMS = 2
 def check(
     experiment: ExperimentFile,
     out: Annotated[
-        Path | None, typer.Option("--out", help="folder of the pictures; reports/<experiment>-check by default")
+        Path | None, typer.Option("--out", help="folder of the pictures; by default reports/EXPERIMENT-check")
     ] = None,
     overrides: Overrides = None,
     quick: Annotated[

@@ -29,7 +29,7 @@ def deploy(
     deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="the deployment file")],
     mode: Annotated[str, typer.Option(help="check, home, dry-run, shadow, run or replay")] = "dry-run",
     out: Annotated[
-        Path | None, typer.Option("--out", help="folder of the session; reports/<name>-<time> by default")
+        Path | None, typer.Option("--out", help="folder of the session; by default reports/NAME-TIME")
     ] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="what to replay: a session's folder, or a trajectory")] = None,
