@@ -227,3 +227,11 @@ def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
             drawn = found.draw(np.random.default_rng(0))
             assert drawn.pop("young_modulus") == pytest.approx(2e6, rel=0.05)
             assert drawn == {"trunk_mass": 0.31, "poisson_ratio": 0.4}
+
+
+def test_one_episode_is_an_evaluation_and_none_is_not(tmp_path) -> None:
+    found = rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "one", episodes=1, film=False)
+    (policy,) = found["policies"].values()
+    assert policy["interquartile_mean_mm"] == {"value": policy["median_mm"], "low": None, "high": None}
+    with pytest.raises(InputError, match="0 episodes show nothing"):
+        rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "none", episodes=0)
