@@ -6,10 +6,8 @@ import hashlib
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from rfdropo_bayes.data.trajectory import Trajectory
-from rfdropo_bayes.errors import InputError
 
 
 def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
@@ -53,30 +51,24 @@ def same_opening(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
     return bool(shared) and one[max(shared, key=int)] == other[max(shared, key=int)]
 
 
-def _squares(repeats: Sequence[Trajectory]) -> Float[np.ndarray, " marker"]:
-    """Mean square distance of each marker from the mean of the repeats of ONE experiment [m2], masked positions left
-    out.
+def _variances(repeats: Sequence[Trajectory]) -> dict[str, float]:
+    """Variance [m2] of each marker that all repeats of ONE experiment have, masked positions left out.
 
-    Rows are compared with rows: row k follows the same command in every repeat, though its time may differ a little.
-
-    Raises:
-        InputError: they differ in rows or markers.
+    Rows are compared with rows, as far as all repeats go: row k follows the same command in each, though its time may
+    differ a little. A marker that no two of them saw at once has none.
     """
-    shape, names = repeats[0].position.shape, repeats[0].marker_names
-    for other in repeats[1:]:
-        if other.position.shape != shape or other.marker_names != names:
-            raise InputError(
-                f"{other.name} ({other.position.shape}) and {repeats[0].name} ({shape}) differ in rows or markers",
-                where="noise floor",
-                remedy="give repeats of one experiment",
-            )
-    position = np.stack([repeat.position for repeat in repeats])
-    weight = np.stack([repeat.position_mask for repeat in repeats]).astype(float)
+    names = [name for name in repeats[0].marker_names if all(name in other.marker_names for other in repeats)]
+    rows = min(len(repeat.time) for repeat in repeats)
+    columns = [[repeat.marker_names.index(name) for name in names] for repeat in repeats]
+    own = list(zip(repeats, columns, strict=True))
+    position = np.stack([repeat.position[:rows, index] for repeat, index in own])
+    weight = np.stack([repeat.position_mask[:rows, index] for repeat, index in own]).astype(float)
     weight *= weight.sum(axis=0) >= 2  # a row seen once says nothing about spread
     count = weight.sum(axis=0)
     mean = (weight[..., None] * position).sum(axis=0) / np.maximum(count, 1.0)[..., None]
-    square = weight * ((position - mean) ** 2).sum(axis=-1)
-    return square.sum(axis=(0, 1)) / np.maximum(count.sum(axis=0), 1.0)
+    square = (weight * ((position - mean) ** 2).sum(axis=-1)).sum(axis=(0, 1))
+    freedom = np.maximum(count - 1.0, 0.0).sum(axis=0)
+    return {name: float(s / f) for name, s, f in zip(names, square, freedom, strict=True) if f}
 
 
 def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
@@ -84,12 +76,11 @@ def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
 
     The first row of a group counts like any other: rest poses that differ from repeat to repeat are part of the floor.
     """
-    squares: dict[str, float] = {}
-    freedom = 0
+    total: dict[str, float] = {}
+    freedom: dict[str, int] = {}
     for group in group_repeats(trajectories):
         if len(group) > 1:
-            repeats = [trajectories[index] for index in group]
-            freedom += len(group) - 1
-            for marker, value in zip(repeats[0].marker_names, _squares(repeats), strict=True):
-                squares[marker] = squares.get(marker, 0.0) + len(group) * value
-    return {marker: float(np.sqrt(value / freedom)) for marker, value in squares.items()} if freedom else None
+            for marker, variance in _variances([trajectories[index] for index in group]).items():
+                total[marker] = total.get(marker, 0.0) + (len(group) - 1) * variance
+                freedom[marker] = freedom.get(marker, 0) + len(group) - 1
+    return {marker: float(np.sqrt(total[marker] / freedom[marker])) for marker in total} or None

@@ -141,6 +141,9 @@ def interquartile_mean(
         seed: of the bootstrap.
         level: of the interval.
         resamples: of the bootstrap.
+
+    Returns:
+        the mean and the ends of its interval; these are not a number where a group has a single episode.
     """
     distances = [np.array([episode.distance for episode in group]) for group in groups]
 
@@ -150,6 +153,8 @@ def interquartile_mean(
     found = float(middle(*distances))
     if not np.isfinite(found):  # a quarter and more of the simulations failed
         return found, found, found
+    if min(map(len, distances)) < 2:
+        return found, float("nan"), float("nan")
     # Strata are resampled apart: each argument of `bootstrap` is one.
     interval = bootstrap(
         distances,

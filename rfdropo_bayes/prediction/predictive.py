@@ -28,7 +28,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Trajectory, group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
@@ -191,6 +191,26 @@ def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKey
     predicted = prediction.predicted.copy()
     predicted[:, :, known] += slow.draw(key, len(predicted), prediction.time, unit).astype(predicted.dtype)
     return replace(prediction, predicted=predicted, mean=prediction.central)
+
+
+def with_repeats_marked(
+    predictions: Sequence[RecordingPrediction], trajectories: Sequence[Trajectory]
+) -> list[RecordingPrediction]:
+    """Predictions that say which of them repeat the commands of another one of the same split.
+
+    Args:
+        predictions: of recordings.
+        trajectories: these recordings, in the same order.
+    """
+    marked, number = list(predictions), 0
+    for split in ("fit", "test"):
+        own = [index for index, prediction in enumerate(predictions) if prediction.split == split]
+        for group in group_repeats([trajectories[index] for index in own]):
+            if len(group) > 1:
+                for index in (own[member] for member in group):
+                    marked[index] = replace(predictions[index], repeat_group=number)
+                number += 1
+    return marked
 
 
 def _for_new_recordings(

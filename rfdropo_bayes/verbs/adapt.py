@@ -47,6 +47,7 @@ from rfdropo_bayes.prediction.predictive import (
     predict_new,
     thin,
     without_cautions,
+    with_repeats_marked,
 )
 from rfdropo_bayes.report import build_summary
 from rfdropo_bayes.report.coverage import predictive_bands
@@ -511,7 +512,8 @@ def _record(
     )
     known |= {DAY_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
-    record = PosteriorRecord(infos, result.draws, dict(prior), tuple(adapted.predictions), attrs=attributes)
+    predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
+    record = PosteriorRecord(infos, result.draws, dict(prior), tuple(predictions), attrs=attributes)
     return with_ratios(record, problem.names)
 
 

@@ -41,6 +41,7 @@ from rfdropo_bayes.prediction.predictive import (
     predict_fitted,
     predict_new,
     thin,
+    with_repeats_marked,
 )
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
 from rfdropo_bayes.report.baselines import with_fitted_commands
@@ -219,7 +220,7 @@ def record_posterior(
         ),
         result.draws,
         prior,
-        tuple(predictions),
+        tuple(with_repeats_marked(predictions, [*asked.runs, *tested])),
         trace=result.trace,
         block_scores=result.block_scores,
         log_likelihood=rows,

@@ -84,6 +84,8 @@ def evaluate(
     Raises:
         InputError: bad input, a policy for another layout, or one that is given twice.
     """
+    if episodes < 1:
+        raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for one at least")
     opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
     model = with_training(model, {**(_task_of(policies) if model.settings.training is None else {}), **options})
     table, task, simulator = training_of(model)

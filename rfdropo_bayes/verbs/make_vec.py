@@ -26,6 +26,7 @@ from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot
@@ -142,7 +143,8 @@ def randomisation_of(
     if isinstance(posterior, Calibration):
         fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
         check_fitted_integrator(fitted, simulator.integrator, where="posterior")
-        parts.append(drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot))
+        rows = drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot)
+        parts.append(_beside_held(rows, posterior.record.attrs, simulator))
     elif posterior is not None:
         parts.append(_of_run(Path(posterior), simulator))
     elif table.randomisation != "none":
@@ -179,7 +181,15 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     """
     found = (read_phi if phi else read_posterior)(source, simulator.parameters, simulator.robot)
     folder = source if source.is_dir() else source.parent
-    attributes = {} if phi else PosteriorRecord.load(source / POSTERIOR if source.is_dir() else source).attrs
+    file = source if source.is_file() and not phi else folder / POSTERIOR
+    attributes = PosteriorRecord.load(file).attrs if file.is_file() else {}
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
-    return found
+    return _beside_held(found, attributes, simulator)
+
+
+def _beside_held(found: Randomisation, attributes: Mapping[str, Any], simulator: AnySimulator) -> Randomisation:
+    """What a run found, beside the values of the simulator's parameters that it held: what it found holds with them."""
+    known = {spec.name for spec in simulator.parameters}
+    held = {name: value for name, value in attributes.get(HELD, {}).items() if name in known}
+    return Layers((Point(held), found), found.kind) if held else found

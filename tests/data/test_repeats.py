@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.data import group_repeats, noise_floor, read_asl_csv, read_optitrack_csv
-from rfdropo_bayes.errors import InputError
 
 
 def test_identical_commands_are_repeats(build):
@@ -51,10 +50,31 @@ def test_masked_rows_do_not_count(build):
     assert max(floor.values()) < 1e-15
 
 
-def test_repeats_that_do_not_match_are_rejected(build):
-    with pytest.raises(InputError, match="differ in rows or markers"):
-        noise_floor([build(), build(marker_names=["m1", "m3"])])
+def test_repeats_are_compared_in_the_rows_and_markers_that_all_have(build):
+    """A calibration of them must not end when it counts its noise."""
+    sent = {"command": build(rows=20).command, "command_time": 0.1 * np.arange(19)}
+    whole, longer = (build(rows=n, time=0.1 * np.arange(n), **sent) for n in (20, 24))
+    position = longer.position.copy()
+    position[:20] = whole.position + np.array([0.002, 0.0, 0.0])
+    longer = build(rows=24, time=0.1 * np.arange(24), position=position, **sent)
+    floor = noise_floor([whole, longer])
+    assert floor == pytest.approx({"m1": 0.002 / np.sqrt(2.0), "m2": 0.002 / np.sqrt(2.0)})
+    assert set(noise_floor([build(), build(marker_names=["m1", "m3"])])) == {"m1"}
     assert noise_floor([build(), build(command=2 * build().command)]) is None
+
+
+def test_a_marker_that_is_lost_in_a_repeat_is_known_from_fewer_degrees_of_freedom(build):
+    """Two repeats that are 2 mm apart have a variance of 2 mm2, with a third or without."""
+    clean, mask = build(), np.ones((11, 2), dtype=bool)
+    mask[:, 1] = False
+    shifts = (0.001, -0.001, 0.5)
+    moved = [clean.position + np.array([shift, 0.0, 0.0]) for shift in shifts]
+    floor = noise_floor(
+        [build(position=moved[0]), build(position=moved[1]), build(position=moved[2], position_mask=mask)]
+    )
+    assert floor["m2"] == pytest.approx(0.001 * np.sqrt(2.0))
+    lost = [build(position=moved[0]), build(position=moved[1], position_mask=mask)]
+    assert set(noise_floor(lost)) == {"m1"}
 
 
 def test_spread_of_the_physical_trunk(datasets):

@@ -349,6 +349,10 @@ def test_the_interquartile_mean_ignores_the_outer_halves_and_its_interval_holds_
     assert low < found < high < 0.021
 
 
+def test_the_mean_of_one_episode_has_no_interval() -> None:
+    assert interquartile_mean([episodes_with([0.01])], seed=0) == pytest.approx((0.01, np.nan, np.nan), nan_ok=True)
+
+
 def test_failures_of_a_quarter_leave_no_interquartile_mean() -> None:
     found = interquartile_mean([episodes_with([0.01] * 14 + [np.inf] * 6)], seed=0)
     assert found == (np.inf, np.inf, np.inf)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.prediction.predictive import with_repeats_marked
 from rfdropo_bayes.report import MeasuredPath, score
-from rfdropo_bayes.report.scores import settled_rows
+from rfdropo_bayes.report.scores import measured_paths, settled_rows
 
 
 def path(position: np.ndarray, name: str = "r", mask: np.ndarray | None = None, group: int = -1) -> MeasuredPath:
@@ -79,3 +82,16 @@ def test_the_two_parts_are_scored_apart() -> None:
     assert figures.final == pytest.approx(7.0)
     assert figures.recordings["r"].rows_moving == 48
     assert figures.headline == pytest.approx(np.sqrt((48 * 2.0**2 + 52 * 7.0**2) / 100))
+
+
+def test_predictions_of_repeats_are_cut_where_the_recordings_are(run) -> None:
+    """Among the recordings of their role: what was fitted and what was not are scored apart."""
+    trajectories = [*run.fit, *run.test]
+    unmarked = [replace(prediction, repeat_group=-1) for prediction in run.record.recordings]
+    marked = with_repeats_marked(unmarked, trajectories)
+    assert [prediction.repeat_group for prediction in marked] == [-1, -1, -1, 0, 0]
+    again = [replace(run.fit[0], dataset=run.test[0].dataset), *run.fit[1:], *run.test]
+    assert [prediction.repeat_group for prediction in with_repeats_marked(unmarked, again)] == [-1, -1, -1, 0, 0]
+    rows = settled_rows([MeasuredPath.of_prediction(prediction) for prediction in marked[3:]])
+    assert rows == settled_rows(measured_paths(run.test))
+    assert rows[0] == rows[1]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.cautions import Code
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, load_posterior
@@ -36,16 +37,18 @@ SHORT = [
 @pytest.mark.slow
 def test_a_calibration_writes_what_it_promises(tmp_path):
     stated = 'model.drives=[{recordings="demo_1", high=1.0, beyond="lost"}]'
-    found = calibrate(Model.read(DEMO, [*SHORT, stated]), out=tmp_path)
+    Trajectory.load(DEMO.parent / "demo" / "demo_3.nc").with_attributes(name="again").save(tmp_path / "again.nc")
+    tested = f'data.test=["demo/demo_3.nc", "{tmp_path / "again.nc"}"]'
+    found = calibrate(Model.read(DEMO, [*SHORT, stated, tested]), out=tmp_path / "run")
     assert Code.DRIVES_UNSTATED in [caution.code for caution in found.cautions]  # of the test recording
     assert found.verdict in ("safe", "with care", "unsafe")
-    assert (tmp_path / "report.html").read_text().startswith("<!DOCTYPE html>")
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (tmp_path / "run" / "report.html").read_text().startswith("<!DOCTYPE html>")
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["status"] == "done"
     assert set(summary["parameters"]) >= {"young_modulus", "poisson_ratio", "trunk_mass", "observation_noise"}
     assert summary["rmse"]["test"]["m4"] > 0
-    record = PosteriorRecord.load(tmp_path / "posterior.nc")
-    assert {r.split for r in record.recordings} == {"fit", "test"}
+    record = PosteriorRecord.load(tmp_path / "run" / "posterior.nc")
+    assert [(r.split, r.repeat_group) for r in record.recordings] == [("fit", -1), ("test", 0), ("test", 0)]
     assert all(np.isfinite(record.flat(p.name)).all() for p in record.parameters)
 
 

@@ -15,7 +15,12 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
+from rfdropo_bayes.policies.randomisation import fitting
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.prediction.predictive import HELD
+from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -202,3 +207,31 @@ def test_policies_whose_folders_are_called_the_same_are_told_apart(tmp_path) -> 
     assert set(found["policies"]) == {"monday_reach", "tuesday_reach"}
     with pytest.raises(InputError, match="given twice"):
         rb.evaluate(rb.Model.read(REACH), [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)
+
+
+def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
+    """Its draws, or its phi, explain the data with these values, and not with nominal ones."""
+    held = {"trunk_mass": 0.31, "observation_noise": 1e-3}
+    modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
+    record = PosteriorRecord((modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: held})
+    record.save(tmp_path / "posterior.nc")
+    normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
+    (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"young_modulus": normal}}))
+    model = rb.Model("trunk_sofa", fixed={"poisson_ratio": 0.4})
+    for kind in ("posterior", "phi"):
+        asked = {"task": "TrunkReach-v0", "randomisation": kind, "source": str(tmp_path)}
+        table, _, simulator = training_of(with_training(model, asked))
+        for given in (None, tmp_path, Calibration(record, {}, "")) if kind == "posterior" else (None,):
+            found = fitting(randomisation_of(table, model.spec, simulator, given), simulator.parameters)
+            assert found.kind == kind
+            drawn = found.draw(np.random.default_rng(0))
+            assert drawn.pop("young_modulus") == pytest.approx(2e6, rel=0.05)
+            assert drawn == {"trunk_mass": 0.31, "poisson_ratio": 0.4}
+
+
+def test_one_episode_is_an_evaluation_and_none_is_not(tmp_path) -> None:
+    found = rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "one", episodes=1, film=False)
+    (policy,) = found["policies"].values()
+    assert policy["interquartile_mean_mm"] == {"value": policy["median_mm"], "low": None, "high": None}
+    with pytest.raises(InputError, match="0 episodes show nothing"):
+        rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "none", episodes=0)
