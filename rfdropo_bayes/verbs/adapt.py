@@ -46,8 +46,8 @@ from rfdropo_bayes.prediction.predictive import (
     predict_fitted,
     predict_new,
     thin,
-    without_cautions,
     with_repeats_marked,
+    without_cautions,
 )
 from rfdropo_bayes.report import build_summary
 from rfdropo_bayes.report.coverage import predictive_bands
