@@ -217,11 +217,12 @@ def build_space(
     pooled, scoped = pooled or {}, scoped or {}
     check_names(list(priors) + list(per_recording) + list(pooled), specs, where=where)
     for name in pooled:
-        if name not in priors or name in per_recording:
+        alone = name in per_recording
+        if name not in priors or alone:
             raise InputError(
                 f"{name} differs between groups about a value that all share, and has none",
                 where="[model.per_group]",
-                remedy="give it a prior, and take it out of [model.per_recording]",
+                remedy="take it out of [model.per_recording]" if alone else "name it under [model.priors], too",
             )
     parameters: list[InferredParameter] = []
     for name, table in priors.items():

@@ -295,16 +295,23 @@ def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers of a checkpoint; InputError if it is missing, damaged, or of other settings."""
+def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Numbers of a checkpoint; InputError if it is damaged, or of other settings.
+
+    A run that was interrupted before its first checkpoint left none: None stands for a start from the beginning.
+    """
     old = folder.with_name(f"{CHECKPOINT}.old")
     if not folder.exists() and old.exists():  # killed between the two renames
         os.replace(old, folder)
+    if not folder.exists():
+        return None
     try:
         state = json.loads((folder / "state.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InputError(
-            "there is no checkpoint to go on from", where=str(folder), remedy="leave out --resume"
+            "the checkpoint is damaged: it has no readable state.json",
+            where=str(folder),
+            remedy="start anew: give --overwrite, not --resume",
         ) from None
     files = ("model.zip", "normalisation.pkl") if known["table"]["normalise"] else ("model.zip",)
     absent = [name for name in STATE if name not in state]

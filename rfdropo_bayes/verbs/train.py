@@ -13,7 +13,7 @@ from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.model.run_folder import run_folder
+from rfdropo_bayes.model.run_folder import command_of, run_folder
 from rfdropo_bayes.policies.episodes import Episodes
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.policies.parity import difference, observations
@@ -64,6 +64,8 @@ def train(
     Raises:
         InputError: bad input, before anything long has started.
     """
+    if resume and command_of(Path(out)) is None:
+        raise InputError("holds no run to go on with", where=str(out), remedy="correct --out, or leave out --resume")
     model = with_training(model, options)
     tables = model.record({"seed": model.settings.seed}, {"seed": seed})
     seed = model.settings.seed if seed is None else seed

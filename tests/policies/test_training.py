@@ -233,8 +233,30 @@ def test_a_checkpoint_without_its_replay_buffer_is_refused(tmp_path) -> None:
         train(Points, TrainingTable(steps=64, **shared), tmp_path, seed=3, gamma=0.9, resume=True)
 
 
-def test_nothing_to_resume_is_an_error(tmp_path) -> None:
-    with pytest.raises(InputError, match="no checkpoint"):
+class KilledEarly(Points):
+    """Points whose process ends before the first checkpoint."""
+
+    steps = 0
+
+    def step_wait(self):
+        self.steps += 1
+        if self.steps == 50:
+            raise KeyboardInterrupt
+        return super().step_wait()
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on_from_its_start(tmp_path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train(KilledEarly, TABLE, tmp_path, seed=3, gamma=0.9)
+    assert not (tmp_path / "checkpoints").exists()
+    resumed = train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)
+    whole = train(Points, TABLE, tmp_path / "whole", seed=3, gamma=0.9)
+    assert [row["reward"] for row in resumed.curve] == [row["reward"] for row in whole.curve]
+
+
+def test_a_checkpoint_that_cannot_be_read_is_refused(tmp_path) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(InputError, match=r"no readable state\.json; start anew"):
         train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)
 
 

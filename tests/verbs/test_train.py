@@ -51,6 +51,12 @@ def test_an_arm_of_another_length_needs_goals_of_its_own() -> None:
     assert 0.25 <= venv.episodes.goal[0, 2] <= 0.27
 
 
+def test_there_must_be_a_run_to_go_on_with(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"holds no run to go on with; correct --out"):
+        rb.train(rb.Model.read(REACH), tmp_path, resume=True)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("task", ["TrunkReach-v0", pytest.param("TrunkPush-v0", marks=pytest.mark.slow)])
 def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
