@@ -52,6 +52,13 @@ KINDS: Mapping[str, Kind] = {
     "rate": Kind(1, (1, -1), "with the speed of {0}", "du_{0}/dt"),
     "direction": Kind(1, (0, 0), "by the direction that {0} moved last", "sign(du_{0})"),
     "low_pass": Kind(1, (1, 0), "with {0} of the last {shape:.2g} s", "lowpass(u_{0}, {shape:.2g} s)", (0.3, 3.0)),
+    "lag": Kind(
+        1,
+        (1, 0),
+        "by how far {0} is ahead of its last {shape:.2g} s",
+        "u_{0} - lowpass(u_{0}, {shape:.2g} s)",
+        (0.1, 0.3),
+    ),
     "play": Kind(
         1, (0, 0), "by what {0} did last, as with a play of {shape:.2g}", "play(u_{0}, {shape:.2g})", (0.05, 0.1, 0.2)
     ),
@@ -59,7 +66,9 @@ KINDS: Mapping[str, Kind] = {
     "travelled": Kind(1, (1, 0), "with all the travel of {0} so far", "travel(u_{0})"),
     "position": Kind(1, (1, 0), "in proportion to {0}", "u_{0}"),
 }
-"""Shapes: of a low pass the time constant [s]; of a play half its width, tried as a share of the commands' stroke."""
+"""Shapes: of a low pass and of a lag the time constant [s]; of a play half its width, tried as a share of the commands'
+stroke. A lag is the difference of two features, of which each alone brings little: a search that adds one term at a
+time does not come to it."""
 
 MOTION_KINDS = ("position", "rate", "largest")
 """Kinds of features of the motion; a position is of nothing else."""
@@ -100,6 +109,7 @@ class Feature(NamedTuple):
             "rate": own,
             "direction": [*own, zero],
             "low_pass": own,
+            "lag": own,
             "play": [*own, zero],
             "largest": [jnp.abs(u) for u in own],
             "travelled": [*own, zero],
@@ -119,7 +129,7 @@ class Feature(NamedTuple):
     def advance(self, memory: Any, given: Float[Array, " channel"], interval: float) -> tuple[Any, Float[Array, ""]]:
         """Memory and value at the end of a step of so many seconds, given the command that has been reached."""
         own = [given[k] for k in self.channels]
-        if self.kind not in ("time", "drift", "rate", "direction", "low_pass", "play", "largest", "travelled"):
+        if self.kind not in ("time", "drift", "rate", "direction", "low_pass", "lag", "play", "largest", "travelled"):
             return memory, self.at_rest(given)
         return self._remembering(memory, own, interval)
 
@@ -131,11 +141,11 @@ class Feature(NamedTuple):
         u, before = own[0], memory[0]
         if self.kind == "rate":
             return own, (u - before) / interval
-        if self.kind == "low_pass":
+        if self.kind in ("low_pass", "lag"):
             assert self.shape is not None
             kept = jnp.exp(-interval / self.shape)
             slow = u + kept * (before - u)
-            return [slow], slow
+            return [slow], slow if self.kind == "low_pass" else u - slow
         if self.kind == "largest":
             most = jnp.maximum(before, jnp.abs(u))
             return [most], most

@@ -50,7 +50,7 @@ class LawTermTable(ExperimentTable):
         " marker begins",
     )
     shape: float | None = Field(
-        default=None, gt=0.0, description="time constant [s] of a low pass, or half the width of a play"
+        default=None, gt=0.0, description="time constant [s] of a low pass or lag, or half the width of a play"
     )
     scale: float = Field(gt=0.0, description="scale of the coefficient's default prior, a normal about zero")
 

@@ -54,17 +54,18 @@ def test_features_are_what_their_formulas_say():
         "rate": np.append(0.0, move / STEP),
         "direction": np.append(0.0, np.sign(move)),
         "low_pass": np.array(slow),
+        "lag": u - np.array(slow),
         "play": np.array(play),
         "largest": np.maximum.accumulate(np.abs(u)),
         "travelled": np.append(0.0, np.cumsum(np.abs(move))),
     }
     truth["position"] = u
     assert set(truth) == set(KINDS)
-    shapes = {"low_pass": 0.3, "play": 2e-3}
+    shapes = {"low_pass": 0.3, "lag": 0.3, "play": 2e-3}
     for name, kind in KINDS.items():
         feature = Feature(name, (0, 1)[: kind.channels], shapes.get(name))
         assert np.allclose(feature.over(jnp.asarray(LEVELS), STEP), truth[name]), name
-    assert len(dictionary(4, 0.01)) == 2 + 4 * 8 + 10 + 4 * 2 + 4 * 3 - 4
+    assert len(dictionary(4, 0.01)) == 2 + 4 * 8 + 10 + 4 * 2 * 2 + 4 * 3 - 4
     own = own_dictionary(0.01)
     assert [feature.of(3) for feature in own] == [f for f in dictionary(4, 0.01) if set(f.channels) <= {3}]
     assert own[-1].formula(["up", "left"]) == "travel(u_own)"
