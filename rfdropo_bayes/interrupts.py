@@ -50,6 +50,13 @@ def check_interrupt() -> None:
         raise KeyboardInterrupt
 
 
+def stop_if_asked_twice() -> None:
+    """Raise KeyboardInterrupt if Ctrl-C was pressed more than once: for long steps, since compiled code that calls back
+    may have lost what the second one raised."""
+    if _pressed > 1:
+        raise KeyboardInterrupt
+
+
 def _note(number: int, frame: FrameType | None) -> None:
     global _pressed
     _pressed += 1

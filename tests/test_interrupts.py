@@ -6,12 +6,20 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from rfdropo_bayes import interrupts
-from rfdropo_bayes.interrupts import EXIT_STATUS, check_interrupt, interrupted, running, watch_interrupts
+from rfdropo_bayes.interrupts import (
+    EXIT_STATUS,
+    check_interrupt,
+    interrupted,
+    running,
+    stop_if_asked_twice,
+    watch_interrupts,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +50,16 @@ def test_a_second_press_stops_at_once():
         press()
         with pytest.raises(KeyboardInterrupt):
             press()
+
+
+def test_a_second_press_that_was_swallowed_is_heard_at_the_next_step():
+    with running(checks=True):
+        press()
+        stop_if_asked_twice()
+        with suppress(KeyboardInterrupt):
+            press()
+        with pytest.raises(KeyboardInterrupt):
+            stop_if_asked_twice()
 
 
 def test_a_run_without_checks_stops_at_once():

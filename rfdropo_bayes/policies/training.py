@@ -21,6 +21,7 @@ from pydantic_core import PydanticSerializationError
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.interrupts import stop_if_asked_twice
 from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options
 from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, play
 from rfdropo_bayes.policies.parity import check_exportable
@@ -235,7 +236,8 @@ def _leg(
 
 
 def _failures(steps: int) -> Any:
-    """A callback that counts training episodes whose simulation failed, and has schedules count the whole run's steps.
+    """A callback that counts training episodes whose simulation failed, has schedules count the whole run's steps, and
+    stops where Ctrl-C was pressed twice.
 
     Stable-Baselines3 imports are heavy, so that the class is made here.
     """
@@ -248,6 +250,7 @@ def _failures(steps: int) -> Any:
             self.model._total_timesteps = steps  # of a leg, otherwise: exploration of DQN would end with the first
 
         def _on_step(self) -> bool:
+            stop_if_asked_twice()
             self.failed += sum(bool(info.get("diverged", False)) for info in self.locals["infos"])
             return True
 
