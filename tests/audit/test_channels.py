@@ -72,6 +72,7 @@ def test_a_weighed_part_holds_its_parameter_where_it_was_weighed():
 WEIGHED = (Weighed(("gain",), 1.4, 1e-4),)
 
 
+@pytest.mark.slow
 def test_without_repeats_each_channel_s_noise_is_that_of_its_own_residuals():
     asked = problem_of_cables({}, 35, True)
     single = [0, *range(3, 10)]

@@ -115,6 +115,7 @@ def test_a_mechanism_that_one_day_of_three_lacks_is_named_for_the_others():
     assert table == {"groups": months, "only_in": {"play": ["january", "march"]}}
 
 
+@pytest.mark.slow
 def test_what_both_days_lack_is_no_difference():
     content = found(compared({"play": 1.0}, {"play": 1.0}, 3))
     assert content["between"]["differences"] == []

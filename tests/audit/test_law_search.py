@@ -147,6 +147,7 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     assert said == ["unseen recordings do not support more than 1 of 2 terms"]
 
 
+@pytest.mark.slow
 def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidates_are_judged_by():
     """Under the noise of the measurement its port had 15,775 nats, and two terms followed that are not there."""
     question, target, base, found = searched(PushedElsewhere())

@@ -345,11 +345,12 @@ def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp
 
 
 class Rough(Toy):
-    """Motion that jumps by hundreds of deviations of the noise where the gain changes by a thousandth."""
+    """Motion whose slope promises, everywhere, what a jump takes back: markers are 100 to 300 deviations of the noise
+    away, however far the gain goes down its saw teeth."""
 
     def rollout(self, parameters, commands, steps=None):
         observed = super().rollout(parameters, commands, steps)
-        jump = jnp.sin(1e5 * parameters["gain"]) * jnp.sin(3e4 * parameters["bend"])
+        jump = 0.5 + (1e5 * parameters["gain"]) % 1.0
         return observed._replace(position=observed.position + 200.0 * NOISE * jump)
 
 

@@ -317,7 +317,12 @@ def test_a_pushed_body_may_come_from_the_bag(tmp_path):
 def test_bags_that_cannot_be_read_say_why(tmp_path):
     folder = rosbag(MOTION, tmp_path / "run", storage="mcap")
     with fails("has no topic '/mocap/tipp'; did you mean '/mocap/tip'"):
-        load(tmp_path, "rosbag", "run", bag_columns(positions=[[f"/mocap/tipp.{axis}" for axis in "xyz"]] * 2))
+        load(
+            tmp_path,
+            "rosbag",
+            "run",
+            bag_columns(positions=[[f"/mocap/{name}.{axis}" for axis in "xyz"] for name in ("tipp", "elbow")]),
+        )
     with fails(r"column '/commands.data\[4\]' is missing; did you mean '/commands.data\[3\]'"):
         load(tmp_path, "rosbag", "run", bag_columns(commands="array") | {"commands": ["/commands.data[4]"]})
     rosbag(MOTION, tmp_path / "two", frames=("world", "elbow"))

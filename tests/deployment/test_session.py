@@ -272,6 +272,7 @@ def test_entries_of_a_deployment_file_are_replaced_and_checked(tmp_path: Path) -
         load_deployment(path, ["robot.name=x"])
 
 
+@pytest.mark.slow
 def test_the_command_line_runs_a_dry_run(robot: Robot, tmp_path: Path) -> None:
     turning(tmp_path / "policy.onnx", robot)
     text = """

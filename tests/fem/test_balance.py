@@ -88,6 +88,7 @@ def test_momentum_changes_by_what_acts(trunk, trace, balance, prepare):
     np.testing.assert_allclose(found.kinetic_energy[1:], energies.kinetic, rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_work_becomes_energy_or_is_lost_to_damping(trunk, trace, balance):
     """What the time stepping loses besides halves with the time step, and is small."""
     material = fem.material(trunk, **SILICONE, rayleigh_mass=2.0, rayleigh_stiffness=0.002, gravity=GRAVITY)

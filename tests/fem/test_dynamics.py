@@ -72,6 +72,7 @@ def test_linear_momentum_is_conserved_without_supports(trunk, trace, prepare):
     assert np.abs(np.asarray(states.position[-1] - start.position)).max() > 0.01
 
 
+@pytest.mark.slow
 def test_energy_never_grows_without_work(trunk, trace, prepare, settle):
     """Released from a strong pull. One linearised solve a step leaves up to a thousandth of the energy."""
     material = fem.material(trunk, **SILICONE, gravity=(0.0, -9.81, 0.0))

@@ -57,6 +57,7 @@ def test_base_and_weight_change_the_momentum_of_a_body_that_is_let_go(trunk):
     np.testing.assert_array_equal(found.cable_work, 0.0)
 
 
+@pytest.mark.slow
 def test_stepwise_and_from_states_implicit_euler_is_the_same(trunk):
     prepared = fem.prepare(trunk, fem.material(trunk, **SILICONE, rayleigh_mass=2.0, rayleigh_stiffness=0.01))
     pulls = 5e-3 * np.sin(np.arange(1, 31)[:, None] / 20.0 + np.arange(3)) ** 2

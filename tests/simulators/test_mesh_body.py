@@ -94,6 +94,7 @@ def test_both_engines_give_the_same_numbers(mesh, sofa):
     assert int(slow.status) == int(fast.status) == Result.OK
 
 
+@pytest.mark.slow
 def test_a_batch_is_one_call_and_a_lost_rollout_leaves_its_neighbours_alone(sofa):
     commands = pulls(sofa)
     young = jnp.array([3e6, 4.5e6, jnp.nan, 6e6, 7e6])
