@@ -155,7 +155,7 @@ def clock_of(columns: CsvColumns) -> Clock:
 def _streams(reader: AnyReader, path: Path, topics: Collection[str] | None, clock: str) -> list[Stream]:
     there = {connection.topic: connection.msgtype for connection in reader.connections}
     known = reader.typestore.fielddefs
-    for topic in topics or ():
+    for topic in sorted(topics or ()):
         if topic not in there:
             remedy = "correct it under [data.columns]"
             raise InputError(f"has no topic {topic!r}; {closest(topic, sorted(there))}", where=str(path), remedy=remedy)

@@ -321,7 +321,7 @@ def test_bags_that_cannot_be_read_say_why(tmp_path):
             tmp_path,
             "rosbag",
             "run",
-            bag_columns(positions=[[f"/mocap/{name}.{axis}" for axis in "xyz"] for name in ("tipp", "elbow")]),
+            bag_columns(positions=[[f"/mocap/{name}.{axis}" for axis in "xyz"] for name in ("tipp", "low")]),
         )
     with fails(r"column '/commands.data\[4\]' is missing; did you mean '/commands.data\[3\]'"):
         load(tmp_path, "rosbag", "run", bag_columns(commands="array") | {"commands": ["/commands.data[4]"]})
