@@ -91,7 +91,7 @@ def serve_on_one_processor(folder: Path, plant: str, where: str) -> str:
     ("plant", "where"),
     [
         # Linux clears the threads of an ended process out of /proc, and whoever waits for the process helps.
-        ("with_threads", "own"),
+        pytest.param("with_threads", "own", marks=pytest.mark.slow),
         ("Slow", "here"),
     ],
 )
