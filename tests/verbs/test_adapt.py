@@ -23,38 +23,12 @@ from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.verbs import adapt as adaptation
 from rfdropo_bayes.verbs import design_day as day_design
 from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
+from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
-STEP, SIGMA, SPREAD = 0.02, 2e-4, 0.01
+SPREAD = 0.01
 GAIN, LAG = 1.4, 0.25
-
-
-def lag(parameters, command):
-    """The tip follows gain * (command + zero) with a time constant; many parameter sets at once."""
-    gain, share = parameters["gain"][:, None], 1.0 - np.exp(-STEP / parameters["time_constant"])
-    wanted = gain * (command[:, :, 0] + parameters["zero"][:, None])
-    place = [wanted[:, 0]]
-    for row in range(1, command.shape[1]):
-        place.append(place[-1] + share * (wanted[:, row] - place[-1]))
-    x = np.stack(place, axis=1)
-    return np.stack([x, np.zeros_like(x), np.full_like(x, 0.1)], axis=-1)[:, :, None]
-
-
-BOX = rb.BlackBox(
-    lag,
-    parameters={
-        "gain": {"low": 0.2, "high": 3.0},
-        "time_constant": {"low": 0.05, "high": 1.0, "unit": "s"},
-        "zero": {"low": -1.0, "high": 1.0, "unit": "m"},
-    },
-    markers=["tip"],
-    channels=["pull"],
-    time_step=STEP,
-    batched=True,
-    name="lag",
-)
 DAYS = {f"day_{k}": f"day_{k}_*" for k in range(5)}
-PRIORS = {"gain": {}, "time_constant": {}, "zero": {"distribution": "Normal", "loc": 0.0, "scale": 0.05}}
 
 
 def recorded(names, zeros, seed):
