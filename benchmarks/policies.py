@@ -1,11 +1,11 @@
 """Environment steps per second of the tasks, beside the library's own ceiling on an empty environment in the same run.
 
-    python benchmarks/policies.py [--lanes N [N ...]] [--seconds S] [--learn STEPS] [--json FILE]
+    python benchmarks/policies.py [--lanes N [N ...]] [--seconds S] [--learn STEPS] [--integrator NAME] [--json FILE]
 
-"Step" is random actions through the VecEnv, resets included, at five solves an action in single precision. "PPO" is
-training with the settings that policies here are trained with. The empty environment has the observation and action
-of TrunkPush and answers with zeros: what it costs is Stable-Baselines3 and PyTorch alone. Rates are those of the clock
-on the wall and of processor time, which a busy machine leaves as it is.
+"Step" is random actions through the VecEnv, resets included, in single precision: an action takes ten solves with
+SDIRK2, five with implicit Euler. "PPO" is training with the settings that policies here are trained with. The empty
+environment has the observation and action of TrunkPush and answers with zeros: what it costs is Stable-Baselines3 and
+PyTorch alone. Rates are those of the clock on the wall and of processor time, which a busy machine leaves as it is.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from rfdropo_bayes.fem.integrators import Integrator
 from rfdropo_bayes.policies.algorithms import algorithm_options
 from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.randomisation import Uniform
@@ -89,12 +90,11 @@ class Empty(VecEnv):
         return [False] * self.num_envs
 
 
-def environments(task: str, lanes: int) -> VecEnv:
+def environments(task: str, lanes: int, integrator: Integrator) -> VecEnv:
     """The environments of a line."""
     chosen = PUSH if task == EMPTY else task
-    episodes = make_episodes(
-        chosen, lanes, randomisation=Uniform(RANGES), actions="continuous", observed="full", precision="float32"
-    )
+    settings: dict[str, Any] = {"actions": "continuous", "observed": "full", "precision": "float32"}
+    episodes = make_episodes(chosen, lanes, randomisation=Uniform(RANGES), integrator=integrator, **settings)
     return Empty(lanes, episodes.layout) if task == EMPTY else TrunkVecEnv(episodes)
 
 
@@ -109,9 +109,9 @@ def timed(run: Callable[[], int], seconds: float) -> tuple[float, float]:
     return wall, cpu
 
 
-def rows_of(task: str, lanes: int, seconds: float, learn: int) -> list[Row]:
-    """Stepping and learning."""
-    venv = environments(task, lanes)
+def rows_of(task: str, lanes: int, seconds: float, learn: int, integrator: Integrator) -> list[Row]:
+    """Stepping, and learning if it is asked for."""
+    venv = environments(task, lanes, integrator)
     random = np.random.default_rng(0)
     moves = random.uniform(-1.0, 1.0, (EPISODE, lanes, *venv.action_space.shape)).astype(np.float32)
     venv.seed(0)
@@ -124,6 +124,8 @@ def rows_of(task: str, lanes: int, seconds: float, learn: int) -> list[Row]:
 
     episode()  # compiles
     found = [Row(task, lanes, "step", *timed(episode, seconds))]
+    if not learn:
+        return found
     gamma = task_named(PUSH if task == EMPTY else task).gamma
     model = PPO("MlpPolicy", VecNormalize(venv, gamma=gamma), device="cpu", seed=0,
                 **algorithm_options("PPO", "continuous", gamma, {}, lanes))  # fmt: skip
@@ -142,14 +144,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lanes", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--seconds", type=float, default=5.0, help="of stepping, for each line")
-    parser.add_argument("--learn", type=int, default=100_000, help="steps of PPO, for each line")
+    parser.add_argument("--learn", type=int, default=100_000, help="steps of PPO, for each line; 0 leaves it out")
+    parser.add_argument("--integrator", choices=["sdirk2", "euler"], default="sdirk2")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     chosen = parser.parse_args()
     torch.set_num_threads(1)  # as the training does
     rows = []
     for lanes in chosen.lanes:
         for task in (EMPTY, REACH, PUSH):
-            rows += rows_of(task, lanes, chosen.seconds, chosen.learn)
+            rows += rows_of(task, lanes, chosen.seconds, chosen.learn, chosen.integrator)
     print("| environment | at once | | steps/s | steps per CPU s | 2 M steps [min] |")
     print("|---|---|---|---|---|---|")
     for row in rows:
