@@ -139,15 +139,20 @@ def holds_on(rules: Rules, gain: Gain) -> bool:
 
 
 def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
-    """Coefficients of a law: mean, deviation, quantiles and unit, by the model's normal approximation."""
+    """Coefficients of a law: mean, deviation, quantiles and unit, by the model's normal approximation.
+
+    Shapes of features stand beside them; their deviation is None where they are not inferred.
+    """
     if described.sizes is None:
         return []
     fit, target = described.sizes
-    coordinates = target.forward.coordinates
+    coordinates, simulator = target.forward.coordinates, target.forward.lanes.simulator
+    unit = str(getattr(simulator, "command_unit", "m"))
     draws = fit.draws(np.random.default_rng([seed, 7]), 1000, *coordinates.bounds)
     values, rows = coordinates.values(draws), []
     for refit in described.found.terms:
         column = values[:, coordinates.names.index(refit.term.spec.name)]
+        shape = None if refit.term.shape is None else values[:, coordinates.names.index(refit.term.shape.name)]
         rows.append(
             {
                 "port": refit.term.port.name,
@@ -158,6 +163,9 @@ def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
                 "q05": float(np.quantile(column, 0.05)),
                 "q95": float(np.quantile(column, 0.95)),
                 "unit": refit.term.spec.unit,
+                "shape": refit.term.feature.shape if shape is None else float(shape.mean()),
+                "shape_sd": None if shape is None else float(shape.std()),
+                "shape_unit": refit.term.feature.shape_unit(unit),
                 "left_out_gain": refit.gain.gain,
                 "left_out_share": refit.gain.share,
                 "score": refit.score,

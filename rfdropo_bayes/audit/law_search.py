@@ -87,6 +87,19 @@ class Refit:
     score: float
 
     @property
+    def shape(self) -> float | None:
+        """Shape of the term's feature; None where it is not inferred."""
+        if self.term.shape is None:
+            return None
+        coordinates = self.target.forward.coordinates
+        return float(coordinates.values(self.fit.x[None])[0, coordinates.names.index(self.term.shape.name)])
+
+    @property
+    def feature(self) -> Feature:
+        """The term's feature, in the shape that it has in the fit."""
+        return self.term.feature if self.shape is None else self.term.feature.in_shape(self.shape)
+
+    @property
     def square(self) -> float:
         """Sum of squares that the model leaves, in deviations of the noise that it was fitted under."""
         return float(self.fit.residual @ self.fit.residual)
@@ -274,6 +287,7 @@ class LawSearch:
                 if best.score <= 0.0:
                     break
                 ties = ties if terms else _tied(best, others)
+                best = self._shaped(known, terms, best)
                 judge, fit = judged_anew(best.target, best.fit)
                 anew = judge is not best.target
                 best = replace(best, target=judge, fit=fit)
@@ -322,7 +336,7 @@ class LawSearch:
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
-        law = f"{best.term.port.words}: {best.term.feature.formula(names)}"
+        law = f"{best.term.port.words}: {best.feature.formula(names)}"
         self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
@@ -347,17 +361,19 @@ class LawSearch:
     ) -> list[TermGain]:  # fmt: skip
         """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`.
 
-        Terms that the law has are none of them: where a port is far from linear, they would bring something again.
+        Terms that the law has are none of them: where a port is far from linear, they would bring something again. A
+        term whose shape is inferred has every shape.
         """
         rows = []
         had = {(refit.term.port, refit.term.feature) for refit in terms}
+        had |= {(refit.term.port, refit.term.feature._replace(shape=None)) for refit in terms if refit.term.shape}
         for port in self.ports.ports:
             features, (sizes, signals) = self._features(port), self._offered(port, values)
             columns = feature_columns(found, port, signals)
             gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
             gain = gains[:, 0]
             passed = np.flatnonzero((gain > gate) & (share >= LEAST)).tolist()
-            for k in (k for k in passed if (port, features[k]) not in had):
+            for k in (k for k in passed if not had & {(port, features[k]), (port, features[k]._replace(shape=None))}):
                 parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                 rows.append(TermGain(port, features[k], float(gain[k]), float(share[k]), *parts))
         return sorted(rows, key=lambda row: -row.gain)
@@ -437,6 +453,25 @@ class LawSearch:
     def _climbed(self, refit: Refit) -> Refit:
         """The same, climbed to its end."""
         return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
+
+    def _shaped(self, known: FitTarget, terms: Sequence[Refit], best: Refit) -> Refit:
+        """The same with the shape of the last term's feature inferred, if the data say that it is another one.
+
+        The dictionary has few shapes. What is left of one between them would ask for further terms, which are false.
+        """
+        if best.term.feature.shape is None:
+            return best
+        term = best.term.with_shape(self.units[1])
+        forward = PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), term])
+        target, start = known.on(forward), np.append(best.fit.x, 0.0)
+        fit = climb(target, start, np.append(best.fit.free, len(best.fit.x)))
+        found = replace(best, term=term, target=target, fit=fit)
+        cost = 0.5 * float(np.log(max(float(np.sum(known.measurements.valid)), 2.0)))
+        gained = 0.5 * (best.square - found.square) - cost
+        if gained <= 0.0:
+            return best
+        self.report(f"its shape is {found.feature.shape:.3g}, {gained:.1f} nats better than {best.feature.shape:.3g}")
+        return replace(found, score=best.score + gained)
 
 
 def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:

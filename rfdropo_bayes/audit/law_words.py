@@ -78,7 +78,7 @@ def _port(row: PortEvidence) -> dict[str, Any]:
 
 
 def _tie(tie: Refit, names: Sequence[str]) -> dict[str, Any]:
-    formula = tie.term.feature.formula(names)
+    formula = tie.feature.formula(names)
     return {"port": tie.term.port.name, "feature": formula, "score": tie.score}
 
 
@@ -87,7 +87,7 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
     parts: dict[str, list[str]] = {}
     for refit in terms:
         own = parts.setdefault(refit.term.port.words, [])
-        own.append(f"c{sum(map(len, parts.values())) + 1} {refit.term.feature.formula(names)}")
+        own.append(f"c{sum(map(len, parts.values())) + 1} {refit.feature.formula(names)}")
     return "; ".join(f"w({port}) = {' + '.join(own)}" for port, own in parts.items())
 
 
@@ -110,9 +110,18 @@ def law_sentence(answer: Answer) -> str:
 
 
 def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:
-    feature, unit = refit.term.feature, "" if row["unit"] == "-" else f" {row['unit']}"
+    feature, unit = refit.feature, "" if row["unit"] == "-" else f" {row['unit']}"
     size = f"{row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
-    return f"at {refit.term.port.words} it changes {feature.words(names)} ({size} times {feature.formula(names)})"
+    found = f"{size} times {feature.formula(names)}{_shape(row)}"
+    return f"at {refit.term.port.words} it changes {feature.words(names)} ({found})"
+
+
+def _shape(row: dict[str, Any]) -> str:
+    """Size and deviation of an inferred shape, in words."""
+    if row["shape_sd"] is None:
+        return ""
+    name = "half a width" if row["shape_unit"] != "s" else "a time constant"
+    return f", with {name} of {row['shape']:.3g} \u00b1 {row['shape_sd']:.2g} {row['shape_unit']}"
 
 
 def _when(described: Described) -> str:
@@ -145,7 +154,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
     ties = described.found.ties[:MOST_TIES]
     if not ties:
         return ""
-    found = ", ".join(f"{tie.term.feature.formula(names)} at {tie.term.port.words}" for tie in ties)
+    found = ", ".join(f"{tie.feature.formula(names)} at {tie.term.port.words}" for tie in ties)
     return f" Not to be told from it by these data: {found}."
 
 
@@ -175,13 +184,15 @@ def law_tables(answer: Answer) -> list[dict[str, Any]]:
     coordinates = described.sizes[1].forward.coordinates
     tables: dict[str, list[dict[str, Any]]] = {}
     for refit in described.found.terms:
-        feature, spec = refit.term.feature, refit.term.spec
+        feature, spec = refit.feature, refit.term.spec
         size = abs(float(fit.x[coordinates.names.index(spec.name)]))
         entry: dict[str, Any] = {"coefficient": spec.name, "feature": feature.kind}
         if feature.channels:
             entry["motion" if feature.of_motion else "commands"] = feature.commands(names)
         if feature.shape is not None:
             entry["shape"] = float(f"{feature.shape:.6g}")
+        if refit.term.shape is not None:
+            entry["shape_parameter"] = refit.term.shape.name
         entry["scale"] = float(f"{spec.prior['scale'] * max(size, 1.0):.3g}")
         tables.setdefault(refit.term.port.name, []).append(entry)
     return [{"port": port, "terms": terms} for port, terms in tables.items()]

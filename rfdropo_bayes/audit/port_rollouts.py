@@ -21,7 +21,7 @@ from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import Feature, gauges_of, motion_dictionary
-from rfdropo_bayes.mechanisms.laws import FAR, unit_of
+from rfdropo_bayes.mechanisms.laws import FAR, shape_spec, unit_of
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands, observed_at
@@ -39,11 +39,21 @@ FINE = 1e-5
 
 
 class PlacedTerm(NamedTuple):
-    """A coefficient of a law: the port, the feature, and the parameter."""
+    """A term of a law: the port, the feature, its coefficient, and its shape where that is a parameter, too."""
 
     port: Port
     feature: Feature
     spec: ParameterSpec
+    shape: ParameterSpec | None = None
+
+    @property
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """Its parameters."""
+        return (self.spec,) if self.shape is None else (self.spec, self.shape)
+
+    def with_shape(self, command_unit: str) -> PlacedTerm:
+        """The same with the shape of its feature as a parameter."""
+        return self._replace(shape=shape_spec(f"{self.spec.name}_shape", self.feature, command_unit))
 
 
 class FeatureTable:
@@ -56,6 +66,7 @@ class FeatureTable:
 
     def __init__(self, lanes: Lanes, features: Sequence[Feature]) -> None:
         self.lanes, self.features = lanes, tuple(features)
+        self._of_shape: dict[Feature, Any] = {}
         simulator: Any = lanes.simulator
         self.time_step = float(simulator.description["time_step_s"])
         carries = isinstance(simulator, RobotSimulator) and simulator.engine.carries_loads
@@ -80,6 +91,20 @@ class FeatureTable:
             return jnp.stack([feature.over(levels, self.time_step) for feature in self.features])
 
         return jax.jit(jax.vmap(one))
+
+    def shaped(
+        self,
+        levels: Float[np.ndarray, "lane row channel"],
+        feature: Feature,
+        shape: Float[np.ndarray, " lane"],
+    ) -> Float[np.ndarray, "lane row"]:
+        """One feature, with a shape of its own in every lane."""
+        once, again = distinct([levels, shape])
+        kind = feature._replace(shape=None)
+        if kind not in self._of_shape:
+            self._of_shape[kind] = jax.jit(jax.vmap(lambda own, shape: kind.in_shape(shape).over(own, self.time_step)))
+        values, lanes = self._of_shape[kind], (levels[once], shape[once])
+        return np.asarray(in_chunks(lambda own: values(*own), lanes, chunk_sizes(self.lanes.width)))[again]
 
     @cached_property
     def _paths(self) -> Any:
@@ -172,7 +197,7 @@ class PortedForward(Forward):
         self.__dict__.update({k: v for k, v in forward.__dict__.items() if k != "identity"})
         self.plain, self.ports, self.table, self.terms = forward, ports, table, tuple(terms)
         self.coordinates = with_terms(forward.coordinates, terms)
-        added = np.full((len(forward.slots), len(terms)), -1)
+        added = np.full((len(forward.slots), len(self._own)), -1)
         self.slots = np.concatenate([forward.slots, added], axis=1)
 
     @cached_property
@@ -180,7 +205,7 @@ class PortedForward(Forward):
         """Digest of what rollouts depend on."""
         own = self.coordinates
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
-        return digest(self.plain.identity, repr([(t.port.name, t.feature, t.spec) for t in self.terms]), scale)
+        return digest(self.plain.identity, repr([(t.port.name, t.feature, t.specs) for t in self.terms]), scale)
 
     def instead_of(self, forward: Forward, table: FeatureTable) -> PortedForward:
         """The same laws on other rollouts, as of other recordings or of a finer simulator."""
@@ -200,30 +225,41 @@ class PortedForward(Forward):
         found = {name: np.nan_to_num((ahead[name] - here[name]) / step) for name in wanted}
         return found | self.coordinates.gain_tangents(points, directions)
 
+    @property
+    def _own(self) -> list[str]:
+        """Names of the laws' parameters, the last coordinates."""
+        return [spec.name for term in self.terms for spec in term.specs]
+
     def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
-        return self.coordinates.values(points)[:, len(self.coordinates.names) - len(self.terms) :]
+        return self.coordinates.values(points)[:, len(self.coordinates.names) - len(self._own) :]
 
     def _acting(self, theta: np.ndarray, commands: Commands, points: Points) -> list[tuple[Port, Signals]]:
         """Signals of every lane at each port that has a law."""
         flat = theta.reshape(-1, theta.shape[-1])
-        sizes = np.repeat(self._beside(points), self.count, axis=0)
-        by_command = [k for k, term in enumerate(self.terms) if not term.feature.of_motion]
-        parts = [(k, member) for k in by_command for member in self.ports.members(self.terms[k].port)]
-        features = [self.terms[k].feature.of(member.number) for k, member in parts]
+        own = dict(zip(self._own, np.repeat(self._beside(points), self.count, axis=0).T, strict=True))
+        parts = [(t, m) for t in self.terms if not t.feature.of_motion for m in self.ports.members(t.port)]
         found: dict[Port, Signals] = {}
         if parts:
-            values = self.table.over(self.table.levels(flat, commands), features)
-            for place, (k, member) in enumerate(parts):
-                found[member] = found.get(member, 0.0) + sizes[:, k, None] * values[:, place]
-        following = [k for k, term in enumerate(self.terms) if term.feature.of_motion]
+            levels = self.table.levels(flat, commands)
+            fixed = [(term, member) for term, member in parts if term.shape is None]
+            values = self.table.over(levels, [t.feature.of(m.number) for t, m in fixed]) if fixed else np.zeros(0)
+            signals = [(*part, values[:, place]) for place, part in enumerate(fixed)]
+            signals += [
+                (t, m, self.table.shaped(levels, t.feature.of(m.number), own[t.shape.name]))
+                for t, m in parts
+                if t.shape is not None
+            ]
+            for term, member, w in signals:
+                found[member] = found.get(member, 0.0) + own[term.spec.name][:, None] * w
+        following = [term for term in self.terms if term.feature.of_motion]
         acting = found
         for _ in range(PASSES if following else 0):
             signals = signals_of(self.ports, list(acting.items()))
             values = self.table.over_motion(flat, commands._replace(signals=signals), self.deadline.check)
             acting = dict(found)
-            for k in following:
-                port, own = self.terms[k].port, values[:, self.table.of_motion.index(self.terms[k].feature)]
-                acting[port] = acting.get(port, 0.0) + sizes[:, k, None] * own
+            for term in following:
+                w = own[term.spec.name][:, None] * values[:, self.table.of_motion.index(term.feature)]
+                acting[term.port] = acting.get(term.port, 0.0) + w
         return list(acting.items())
 
     def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
@@ -250,7 +286,8 @@ def with_laws_of(own: Forward, forward: Forward) -> Forward:
 
 def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
     """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
-    added = build_space([t.spec for t in terms], {t.spec.name: {} for t in terms}, {}, ())
+    specs = [spec for term in terms for spec in term.specs]
+    added = build_space(specs, {spec.name: {} for spec in specs}, {}, ())
     return coordinates.with_further(added)
 
 

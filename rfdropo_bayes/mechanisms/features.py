@@ -94,6 +94,10 @@ class Feature(NamedTuple):
         """The same with a command in the place of `OWN`."""
         return self._replace(channels=tuple(channel if k == OWN else k for k in self.channels))
 
+    def in_shape(self, shape: Any) -> Feature:
+        """The same in another shape, which may be traced."""
+        return self._replace(shape=shape)
+
     def commands(self, names: Sequence[str]) -> list[str]:
         """Names of its commands, or of its gauges."""
         known = GAUGES if self.of_motion else names
@@ -174,6 +178,11 @@ class Feature(NamedTuple):
         length, seconds = KINDS[self.kind].unit
         own = "m" if self.of_motion else command_unit
         return tuple((name, power) for name, power in ((own, length), ("s", seconds)) if power)
+
+    def shape_unit(self, command_unit: str) -> str:
+        """Unit of its shape; "-" without one."""
+        own = "m" if self.of_motion else command_unit
+        return "-" if self.shape is None else own if self.kind == "play" else "s"
 
     def words(self, names: Sequence[str]) -> str:
         """In a sentence."""

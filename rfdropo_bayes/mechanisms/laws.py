@@ -25,13 +25,26 @@ from rfdropo_bayes.simulators.port_signals import BodySignals, read_late
 
 WHERE = "[[model.laws]]"
 FAR = 1e3  # prior scales to each side of null, where a coefficient's hard bounds are
+SHAPES = 10.0  # times a shape, and its inverse, where the hard bounds of an inferred shape are
+WIDE = 0.5  # deviation of a shape's prior, as a share of the shape: audits try shapes that are 2 to 10 times apart
 
 
 class Term(NamedTuple):
-    """One coefficient of a law, and the feature that it belongs to."""
+    """One coefficient of a law, and the feature that it belongs to.
+
+    Attributes:
+        feature: as it is where nothing is known of its shape.
+        spec: of the coefficient.
+        shape: parameter in the place of the feature's own shape; None where that stays.
+    """
 
     feature: Feature
     spec: ParameterSpec
+    shape: ParameterSpec | None = None
+
+    def shaped(self, values: Values) -> Feature:
+        """The feature with the shape of these values."""
+        return self.feature if self.shape is None else self.feature.in_shape(values[self.shape.name])
 
 
 class LawChoice(NamedTuple):
@@ -72,7 +85,7 @@ class Law:
     def __init__(self, port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> None:
         self.port, self.terms, self._ports = port, tuple(terms), ports
         self.name = f"law at {port.name}: {formula}" if formula else f"law at {port.name}"
-        self.parameters = tuple(term.spec for term in terms)
+        self.parameters = tuple(spec for term in terms for spec in (term.spec, term.shape) if spec is not None)
         self.cause = f"something acts at {port.words} by a law that stands for no mechanism of the library"
         self.remedy = f"look at {port.look}"
 
@@ -82,7 +95,7 @@ class Law:
 
 
 def _summed(terms: Sequence[Term], values: Values, levels: Float[Array, "row channel"], time_step: float) -> Array:
-    parts = (values[term.spec.name] * term.feature.over(levels, time_step) for term in terms)
+    parts = (values[term.spec.name] * term.shaped(values).over(levels, time_step) for term in terms)
     return sum(parts, jnp.zeros(len(levels)))
 
 
@@ -137,7 +150,7 @@ def _advanced(
     """Memories and signal at the end of a step."""
     after, w = [], jnp.zeros(())
     for term, kept in zip(terms, memory, strict=True):
-        kept, value = term.feature.advance(kept, given, interval)
+        kept, value = term.shaped(values).advance(kept, given, interval)
         after.append(kept)
         w = w + values[term.spec.name] * value
     return tuple(after), w
@@ -252,6 +265,26 @@ def _feature(table: Mapping[str, Any], port: Port, names: Sequence[str], where: 
     return feature_named(kind, motion, shape, GAUGES, where, of_motion=True)
 
 
+def shape_spec(name: str, feature: Feature, command_unit: str) -> ParameterSpec:
+    """The shape of a feature as a parameter, whose prior is wide about the feature's own shape."""
+    assert feature.shape is not None
+    own, words = feature.shape, "half the width of a play" if feature.kind == "play" else "time constant of a feature"
+    prior = normal(float(f"{WIDE * own:.3g}"), own)
+    return ParameterSpec(name, feature.shape_unit(command_unit), own / SHAPES, own * SHAPES, own, prior, words)
+
+
+def _shape_of(table: Mapping[str, Any], feature: Feature, command_unit: str, where: str) -> ParameterSpec | None:
+    name = table.get("shape_parameter")
+    if name is None:
+        return None
+    if feature.shape is None:
+        raise InputError(
+            f"the feature {feature.kind!r} has no shape that could be inferred", where=where,
+            remedy="leave shape_parameter out",
+        )  # fmt: skip
+    return shape_spec(str(name), feature, command_unit)
+
+
 def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command_unit: str) -> Mechanism:
     """A law as a file has it.
 
@@ -273,8 +306,10 @@ def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command
         unit = unit_of(port.unit, feature, command_unit)
         words = f"of the law at {port.words}: it changes {feature.words(channels)}"
         name = str(table["coefficient"])
-        terms.append(Term(feature, ParameterSpec(name, unit, -FAR * scale, FAR * scale, 0.0, normal(scale), words)))
-    if len({term.spec.name for term in terms}) < len(terms):
-        raise InputError("two terms share a coefficient", where=where, remedy="name each after what it does")
+        spec = ParameterSpec(name, unit, -FAR * scale, FAR * scale, 0.0, normal(scale), words)
+        terms.append(Term(feature, spec, _shape_of(table, feature, command_unit, where)))
+    names_given = [spec.name for term in terms for spec in (term.spec, term.shape) if spec is not None]
+    if len(set(names_given)) < len(names_given):
+        raise InputError("two terms share a parameter", where=where, remedy="name each after what it does")
     formula = " + ".join(f"{term.spec.name} {term.feature.formula(channels)}" for term in terms)
     return law_at(port, terms, ports, formula)

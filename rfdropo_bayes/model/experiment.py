@@ -52,6 +52,11 @@ class LawTermTable(ExperimentTable):
     shape: float | None = Field(
         default=None, gt=0.0, description="time constant [s] of a low pass or lag, or half the width of a play"
     )
+    shape_parameter: str | None = Field(
+        default=None,
+        description="name of a parameter in the place of shape, which is inferred; its default prior is a normal about"
+        " shape with half of it as deviation",
+    )
     scale: float = Field(gt=0.0, description="scale of the coefficient's default prior, a normal about zero")
 
 

@@ -196,7 +196,7 @@ def _laws(
         rivals = search.find(target, base).rivals
     return [
         Hypothesis(
-            f"{refit.term.feature.formula(names)} at {refit.term.port.words}",
+            f"{refit.feature.formula(names)} at {refit.term.port.words}",
             as_measured(refit.target, refit.fit),
             refit.target.forward,
         )

@@ -12,7 +12,7 @@ import pytest
 
 from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
-from rfdropo_bayes.audit.described import NamedModel, describe
+from rfdropo_bayes.audit.described import Described, NamedModel, coefficients, describe
 from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
 from rfdropo_bayes.audit.inadequacy import as_measured, noise_share
 from rfdropo_bayes.audit.law_search import TIED, law_search
@@ -21,6 +21,7 @@ from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.port_responses import responses, under
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.mechanisms.features import Feature
 from rfdropo_bayes.mechanisms.ports import Port, port_map
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.residual_file import residual_dataset
@@ -69,6 +70,21 @@ class PushedElsewhere(Elsewhere):
     """Marker m3 moves along x by the product of both commands, too."""
 
     pushed = LARGE
+
+
+BEHIND = 0.17  # [s], between the time constants that the search tries
+
+
+class Lagging(Toy):
+    """Marker m3 moves along x by how far the first command is ahead of itself low-passed."""
+
+    pushed = SIZE
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level = jnp.concatenate([commands.initial[None], commands.step])
+        ahead = Feature("lag", (0,), BEHIND).over(level, STEP)
+        return seen._replace(position=seen.position.at[:, 2, 0].add(self.pushed * ahead))
 
 
 def searched(toy, alike=False):
@@ -225,3 +241,16 @@ def test_commands_tell_laws_apart_that_recordings_do_not():
     pair = next(pair for pair in now.pairs if set(pair) == {"u_a u_a", "u_a u_b"})
     assert now.pairs[pair] < 1.0
     assert then.pairs[pair] > 100.0
+
+
+def test_the_shape_of_a_feature_is_inferred_and_leaves_no_further_term():
+    """Of one between those of the dictionary the next one would be asked for what is left."""
+    question, _, _, found = searched(Lagging())
+    assert [(refit.term.port.name, refit.term.feature.kind) for refit in found.terms] == [("marker m3 x", "lag")]
+    (row,) = coefficients(Described(found), question.seed)
+    assert abs(row["shape"] - BEHIND) < 4.0 * row["shape_sd"] < 0.4 * BEHIND
+    assert abs(row["mean"] - SIZE) < 4.0 * row["sd"]
+    answer = SimpleNamespace(law=Described(found), problem=question)
+    ((term,),) = [table["terms"] for table in law_tables(answer)]
+    assert term["shape_parameter"] == f"{term['coefficient']}_shape"
+    assert abs(term["shape"] - row["shape"]) < row["shape_sd"]

@@ -12,9 +12,11 @@ from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.law_search import PIECES, LawSearch, TermGain, _pieces, _sums, fresh_terms, left_out_gains
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
+from rfdropo_bayes.audit.port_rollouts import PlacedTerm
 from rfdropo_bayes.audit.verdict import SMALL, negligible
 from rfdropo_bayes.mechanisms.features import OWN, Feature
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 GROUPS, VALUES, ROWS, STEP = 3, 50, 61, 0.01
 PORTS = tuple(
@@ -105,12 +107,17 @@ def test_a_term_that_the_law_has_is_not_asked_for_again():
     """At a port that is far from linear, such as a delay, it would bring something again."""
     found, time = responses(3, signal=3.0), STEP * np.arange(ROWS)
     values = np.stack([np.sin(k * time) for k in (8.0, 3.0, 5.0)])[None].repeat(GROUPS, axis=0)
-    features = [Feature("command", (k,)) for k in range(3)]
+    features = [Feature("lag", (0,), shape) for shape in (0.1, 0.3, 1.0)]
     search = LawSearch(found.ports, SimpleNamespace(features=features, of_motion=()), [], ((), "m"), 0, 0.1)
     best, *others = [(row.port, row.feature) for row in search._ranked(found, values, 0.0)]
     assert best == (PORTS[0], features[0])
-    law = [SimpleNamespace(term=SimpleNamespace(port=best[0], feature=best[1]))]
+    spec = ParameterSpec("c", "m", -1.0, 1.0, 0.0, {}, "c")
+    law = [SimpleNamespace(term=PlacedTerm(*best, spec))]
     assert [(row.port, row.feature) for row in search._ranked(found, values, 0.0, terms=law)] == others
+    law = [SimpleNamespace(term=PlacedTerm(*best, spec).with_shape("m"))]
+    elsewhere = [(port, feature) for port, feature in others if port != best[0]]
+    assert [(row.port, row.feature) for row in search._ranked(found, values, 0.0, terms=law)] == elsewhere
+    assert len(elsewhere) < len(others)
 
 
 def test_a_term_is_tried_at_all_leading_ports():

@@ -108,6 +108,30 @@ def test_a_law_at_a_cable_is_a_change_of_its_command_in_rollouts_and_in_sessions
     assert np.abs(np.stack(seen) - whole.position[1:]).max() < 1e-12
 
 
+def test_a_shape_that_is_a_parameter_moves_the_arm_as_a_stated_one_does():
+    term = {"feature": "lag", "commands": ["left"], "scale": 1.0}
+    free = build_robot_simulator(spec(law("cable left", shape=0.1, shape_parameter="slow", **term)))
+    stated = build_robot_simulator(spec(law("cable left", shape=0.3, **term)))
+    assert [(each.name, each.unit, each.nominal) for each in free.parameters[-2:]] == [
+        ("c", "-", 0.0),
+        ("slow", "s", 0.1),
+    ]
+    given, size = commands(free), {"c": jnp.asarray(0.5)}
+    known = stated.rollout(size, given).position
+    assert np.abs(free.rollout({**size, "slow": jnp.asarray(0.3)}, given).position - known).max() < 1e-12
+    ends = []
+    for simulator, values in (
+        (free, {"c": np.array([0.5]), "slow": np.array([0.3])}),
+        (stated, {"c": np.array([0.5])}),
+    ):
+        lanes = simulator.session(1, 0.1)
+        lanes.reset(np.array([0]), values)
+        for row in np.random.default_rng(1).uniform(0.0, 0.008, (3, 4)):
+            seen = lanes.act(row[None])
+        ends.append(np.asarray(seen.position))
+    assert np.abs(ends[0] - ends[1]).max() < 1e-12
+
+
 HALF = 1.5e-3  # of a play [m]
 
 
