@@ -122,7 +122,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         words = f"Look at {looks}: the library has no mechanism that acts so."
     elif not answer.fitted:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--base)."
-    elif not answer.base.converged:
+    elif not answer.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
     elif answer.doubts.suspected is not None:
         words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."

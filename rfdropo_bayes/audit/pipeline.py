@@ -35,7 +35,7 @@ from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
-from rfdropo_bayes.audit.screen import Screen, p_in_words, screen
+from rfdropo_bayes.audit.screen import Screen, p_in_words
 from rfdropo_bayes.audit.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
@@ -150,6 +150,11 @@ class Answer:
     def fitted(self) -> bool:
         """Whether the base fit came to an end; where it did not, its parameters are where the search had come to."""
         return self.base.converged or not self.cost.stopped
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit of the last model has."""
+        return self.extended.converged
 
     @property
     def extended(self) -> Fit:
@@ -306,7 +311,7 @@ def _verdict(
     rules, last = search.rules, screens[-1].omnibus.p
     members, noise = [len(step.members) for step in steps], search.target.measured.noise
     verdict = decide(rules, screens[0].omnibus.p, last if steps else None, members, gain, noise.doubtful)
-    if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
+    if not (base.converged or steps) or (verdict == UNEXPLAINED and deadline.reached):
         verdict = NO_VERDICT
     suspected = None
     if verdict in (PARTLY, UNEXPLAINED) and last <= rules.extended_passes:
@@ -318,13 +323,19 @@ def _verdict(
 def _searched(search: ExtensionSearch, base: Fit) -> tuple[ExtensionSearch, Fit, list[Added], Screen]:
     """Named causes, and the screen of the model with them; asked once more where the noise is that of residuals.
 
+    What the base model lacks may drive its fit to a corner of the priors where motion is rough, and no climb ends.
+    Causes are asked for all the same; they count if the fit of the model with them has converged.
+
     Returns:
         the search and the base fit that they are of, the steps, and the screen.
     """
-    if not base.converged:
-        return search, base, [], screen(search.target, base, [], [], [search.seed, 0], search.rules.bootstraps)
+    unnamed = search, base, list[Added]()
+    if not base.converged and search.target.forward.deadline.reached:
+        return *unnamed, search.tested(base, 0)
     own = search.target.forward
     base, steps, last = search.name_causes(base)
+    if steps and not steps[-1].fit.converged:
+        return *unnamed, search.tested(unnamed[1], 0)
     if steps and search.target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
             again, renewed = _asked_again(search, own, base, steps[-1].fit)

@@ -27,6 +27,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         _words(answer, findings)
         + ports_sentence(answer)
         + _compared(answer, findings)
+        + _unfitted_alone(answer)
         + _suspicion(answer)
         + _shifted(answer)
         + _numerical(answer)
@@ -67,6 +68,16 @@ def _stopped(answer: Answer) -> str:
     )
 
 
+def _unfitted_alone(answer: Answer) -> str:
+    """What is said where the base model could be fitted with what it lacks only."""
+    if answer.base.converged or not answer.causes.steps:
+        return ""
+    return (
+        " The fit of the base model alone has not converged: a better one may leave less, and what was found then "
+        "explains less."
+    )
+
+
 def _suspicion(answer: Answer) -> str:
     noise = answer.doubts.suspected
     if noise is None:
@@ -101,7 +112,7 @@ def _numerical(answer: Answer) -> str:
 
 def _beginning(answer: Answer) -> str:
     """What is asked where the base model fails in the first block of rows alone."""
-    if answer.verdict == NO_DISCREPANCY or not answer.base.converged:
+    if answer.verdict == NO_DISCREPANCY or not answer.converged:
         return ""
     found = prequential(answer.target, answer.base)
     return f" {BEGINNING}" if begins_wrong(found, answer.problem.rules.base_passes) else ""
@@ -114,7 +125,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         return law_sentence(answer)
     if answer.verdict == NEGLIGIBLE:
         return _small(answer)
-    if not answer.base.converged:
+    if not answer.converged:
         left = answer.base.residual
         return (
             f"No verdict: the fit of the base model has not converged (sum of squares {left @ left:.3g} for "

@@ -365,6 +365,27 @@ def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
     assert "has not converged" in render_audit(shown(answer), content, "rough", "")
 
 
+class RoughAlone(Toy):
+    """Smaller saw teeth, that vanish with all the play of the truth."""
+
+    def rollout(self, parameters, commands, steps=None):
+        observed = super().rollout(parameters, commands, steps)
+        jump = (0.5 + (1e5 * parameters["gain"]) % 1.0) * jnp.abs(1.0 - parameters["play"])
+        return observed._replace(position=observed.position + 5.0 * NOISE * jump)
+
+
+def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it():
+    """What a base model lacks may drive it to where motion is rough; the library was not asked then."""
+    asked = replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(RoughAlone(), np.arange(4)))
+    answer = audit(asked)
+    assert not answer.base.converged
+    assert answer.converged
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert content["findings"][0]["mechanism"] == "play"
+    assert content["verdict"] in ("explained", "equivalent", "partly_explained")
+    assert "of the base model alone has not converged" in content["sentence"]
+
+
 def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
     class Without(Toy):
         parameters = tuple(s for s in Toy.parameters if s.name != "play")
