@@ -156,6 +156,23 @@ def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
     assert (adapted.folder / "report.html").stat().st_size > 10_000
 
 
+def test_the_folder_of_a_day_predicts_the_other_days_too(known, zeros):
+    """A day that was fitted keeps its values, row by row with the draws of the body that the new day has left."""
+    size = 0.03 + 1e-3 * np.arange(60.0)[None]
+    posterior = {**known.record.posterior, "zero_deviation@day_0": size}
+    fit = replace(known, record=replace(known.record, posterior=posterior))
+    run = recorded(["morning"], zeros[9:10], 30)[0]
+    found = rb.adapt(fit, run, seconds=0.5, group="today", seed=1, show=False)
+    rows = np.searchsorted(size[0], found.record.flat("zero_deviation@day_0"))
+    np.testing.assert_array_equal(found.record.flat("gain"), fit.record.flat("gain")[rows])
+    commands = run.time[:-1], run.command_at(run.time[:-1])
+    back = rb.predict(found, commands, group="day_0")
+    assert back.group_fitted
+    wanted, today = (rb.predict(each, commands, group=group) for each, group in ((fit, "day_0"), (found, "today")))
+    off = [float(np.abs(back.bands["mean"] - other.bands["mean"]).max()) for other in (wanted, today)]
+    assert off[0] < 3.0 * SIGMA < 10.0 * SIGMA < off[1]
+
+
 def test_errors_last_as_long_in_rows_of_another_rate(adapted):
     """The model's error forgets its sign over one row of the fit; nothing moves along y. Standard error: 0.02."""
     for step in (STEP, 2.0 * STEP):

@@ -86,7 +86,13 @@ def test_a_day_that_is_adapted_to_is_without(fit):
     (may,) = recorded({"may_new": 0.0}, 40)
     found = rb.adapt(fit, may, seconds=1.0, draws=30, show=False)
     assert [c.code for c in found.cautions].count(Code.GROUP_WITHOUT) == 1
-    assert not [name for name in found.record.posterior if name.startswith("command_delay")]
+    assert [name for name in found.record.posterior if name.startswith("command_delay")] == ["command_delay@april"]
+    (april,) = recorded({"april_new": DELAY}, 30)
+    back = rb.predict(found, april)
+    assert back.group == "may_new"  # the folder is that day's, unless a group is named
+    back = rb.predict(found, april, group="april")
+    assert off(back, april) < 3.0 * SIGMA
+    assert not [c for c in back.cautions if c.code == Code.GROUP_WITHOUT]
     assert found.content["details"]["checks"]["may_new"]["adapted"]["error_mm"] < 3e3 * SIGMA
     with pytest.raises(rb.InputError, match="belongs to april, which was fitted"):
         rb.adapt(fit, recorded({"april_new": DELAY}, 30)[0], show=False)
