@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -71,6 +72,17 @@ def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     assert (held.measured, held.shares) == (whole.measured, whole.shares)
     held.row_log_likelihood(starts, held.n_rows)
     assert sum(told) == pytest.approx(3.0)
+
+
+def test_the_value_of_a_day_stays_within_the_hard_bounds_of_its_parameter():
+    """A time constant of 50 ms, the least that there is, and a day that is said to have 0.2 s less: it has no less."""
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"time_constant": 0.2})
+    program = model.numpyro(recorded(["day_0_a", "day_1_a"], [0.0, 0.0], 0))
+    values = {"gain": 1.0, "time_constant": 0.05, "zero": 0.0, "time_constant_spread": 0.2, "observation_noise": SIGMA}
+    values |= {"time_constant_deviation@day_0": -0.2, "time_constant_deviation@day_1": 0.2}
+    given = {name: jnp.asarray(value) for name, value in values.items()}
+    found = [float(program.rollout_values(given, f"day_{k}_a")["time_constant"]) for k in range(2)]
+    np.testing.assert_allclose(found, [0.05, 0.25])
 
 
 @pytest.mark.slow
