@@ -13,8 +13,8 @@ import pytest
 from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.described import NamedModel, describe
-from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
-from rfdropo_bayes.audit.inadequacy import as_measured, noise_share
+from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
+from rfdropo_bayes.audit.inadequacy import POOR, as_measured, noise_share
 from rfdropo_bayes.audit.law_search import TIED, law_search
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
@@ -24,6 +24,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.mechanisms.ports import Port, port_map
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.residual_file import residual_dataset
+from rfdropo_bayes.verbs.design import _with_laws
 
 from .toys import STEP, Toy, problem, recordings
 
@@ -162,6 +163,21 @@ def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidat
     scale = term.term.spec.prior["scale"]
     assert abs(scale * term.fit.x[-1] - LARGE) < 3.0 * scale * np.sqrt(term.fit.covariance[-1, -1])
     assert 0.0 < term.gain.share < 1.0
+    # A design of what to send next looks at both models under that noise: of that of the measurement, what either
+    # leaves is a hundred times as much, and the commands at hand would seem to tell them apart many times as well.
+    named = [Hypothesis("named", base)]
+    judge, seen, hypotheses = _with_laws(question, target, base, named, found.rivals)
+    assert judge.noise is term.target.noise
+    left = judge.residual(base.x[None])[0]
+    np.testing.assert_allclose(seen.residual, left, atol=1e-6 * np.abs(left).max())
+    np.testing.assert_array_equal(hypotheses[-1].fit.residual, seen.residual)
+    np.testing.assert_array_equal(hypotheses[0].fit.residual, term.fit.residual)
+    assert hypotheses[0].fit.residual @ hypotheses[0].fit.residual < POOR * rows
+    both = [hypotheses[0], hypotheses[-1]]
+    measured = [as_measured(term.target, term.fit), as_measured(target, base)]
+    surer = [replace(h, fit=fit) for h, fit in zip(both, measured, strict=True)]
+    (pair,), (other,) = at_hand(judge, both).values(), at_hand(judge, surer).values()
+    assert 10.0 * pair < other
 
 
 def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
