@@ -213,8 +213,8 @@ def _left_out(
 
 def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray, "group time"]:
     """Rows of every recording that come after the share of its measured ones that is fitted, wherever its gaps are."""
-    seen = valid.any(axis=2)
-    before = np.cumsum(seen, axis=1) - seen
+    seen = np.asarray(valid.any(axis=2))
+    before: np.ndarray = np.cumsum(seen, axis=1) - seen
     return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
 
 

@@ -49,13 +49,13 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     data = columns[:, rows] * noise.scale / np.mean(noise.scale)
     weight = np.sqrt(np.maximum(measurements.count[:, rows, own].max(axis=(1, 2)), 1.0))
     unit = Autoregression(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
-    parts = _parts(measurements.valid[:, rows, own].any(axis=2), unit)
+    parts = _parts(np.asarray(measurements.valid[:, rows, own].any(axis=2)), unit)
     seen = np.concatenate([data[part.groups][:, part.seen].reshape(-1) for part in parts])
     most = max(LARGEST, 3.0 * float(np.sqrt(np.mean(seen**2))))  # a stated noise may be a thousandth of what is left
     amplitudes = np.concatenate([[0.0], np.geomspace(SMALLEST, most, AMPLITUDES)])
     best = (0.0, 0.0, LENGTHS[0])
     for length in LENGTHS:
-        gains = sum(_gains(part, data, rows, length, amplitudes, weight) for part in parts)
+        gains = np.sum([_gains(part, data, rows, length, amplitudes, weight) for part in parts], axis=0)
         place = int(np.argmax(gains))
         if gains[place] > best[0] + 1e-9:
             best = (float(gains[place]), float(amplitudes[place]), float(length))

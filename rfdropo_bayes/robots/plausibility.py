@@ -1,4 +1,4 @@
-"""Numbers of a robot's description that no soft robot has: another unit than the file's, such as millimetres for metres.
+"""Numbers of a robot's description that no soft robot has: in another unit, such as millimetres for metres.
 
 Bounds are far beyond what is built: they catch factors of a thousand, not bad guesses.
 """
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from rfdropo_bayes.robots.robot import Robot
 
 ASIDE = 5.0
-"""Lengths of the body within which its anchors lie, and its half widths and spools end. Of the robots at hand they reach
-a fifth of it; millimetres given as metres are fifty times the length or more."""
+"""Lengths of the body that its anchors, half widths and spools stay within. Those of the robots at hand reach 0.08 of
+it; millimetres given as metres are fifty times the length or more."""
 LONGEST, SHORTEST = 20.0, 1e-3  # [m], of a body
 STRONGEST = 100.0  # [m/s2], ten times the Earth's gravity; that in mm/s2 is a hundred times as much
 SLOWEST = 1.0  # [s], of a time step
@@ -45,9 +45,9 @@ def implausible(robot: Robot) -> str | None:
     density = float(robot.density(robot.parameters["trunk_mass"].nominal))
     if not DENSITIES[0] <= density <= DENSITIES[1]:
         mass = robot.parameters["trunk_mass"].nominal
+        volume = f"a volume of {robot.body.volume_m3:.4g} m3"
         return (
-            f"trunk_mass is {mass:.4g} kg in a volume of {robot.body.volume_m3:.4g} m3, or {density:.3g} kg/m3: are they "
-            "in kilograms and cubic metres?"
+            f"trunk_mass is {mass:.4g} kg in {volume}, or {density:.3g} kg/m3: are they in kilograms and cubic metres?"
         )
     modulus = robot.parameters["young_modulus"].nominal
     if not MODULI[0] <= modulus <= MODULI[1]:
