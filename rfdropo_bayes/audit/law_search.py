@@ -102,7 +102,8 @@ class FoundLaw:
         terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
         ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
         afterwards: largest log evidence of any port with each term and those before it in the model.
-        centre: times of the ports' signals [s].
+        centre: times of the ports' signals [s] from the recordings' first rows on; of recordings whose commands begin
+            before these by different times, from their median on.
         gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
         offered: largest gain [nat] of any feature at any port before the first term; 0 where none brings anything.
     """
@@ -290,7 +291,8 @@ class LawSearch:
             self.report("the time was up before the law was found")
         # The time may be up between a term and what is left beside it.
         terms, gate = terms[: len(afterwards)], next(iter(gates), None)
-        return FoundLaw(self.ports, first, terms, ties, afterwards, found.basis.centre, gate, offered)
+        centre = found.basis.centre - found.begun
+        return FoundLaw(self.ports, first, terms, ties, afterwards, centre, gate, offered)
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]

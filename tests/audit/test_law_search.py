@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -216,6 +217,19 @@ def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
     share = np.mean(1.0 / known.measurements.count) * float(np.mean((known.noise.scale / judge.noise.scale) ** 2))
     assert far.noise == noise_share(judge) == pytest.approx(share)
     assert under(near, known, known) is near
+
+
+def test_signals_are_timed_from_the_first_row_on():
+    """Of recordings whose commands are known for four steps before it."""
+    question = asked(101)
+    target, base = base_model(question, question.seed)
+    forward = copy.copy(target.forward)
+    step = forward.commands.sample_step
+    forward.commands = forward.commands._replace(sample_step=np.minimum(step + 4, step.max()))
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    plain, early = (law_search(t, *options).find(t, base) for t in (target, target.on(forward)))
+    assert plain.centre[0] == 0.0
+    np.testing.assert_allclose(early.centre, plain.centre - 4 * STEP, atol=1e-12)
 
 
 def test_nothing_is_described_where_nothing_is_hidden():

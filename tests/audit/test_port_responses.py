@@ -30,9 +30,8 @@ def responses(seed: int = 0, signal: float = 0.0) -> Responses:
     jacobian = rng.normal(size=(GROUPS, VALUES, 4))
     residual = rng.normal(size=(GROUPS, VALUES)) + jacobian @ rng.normal(size=4)
     residual += signal * whitened[PORTS[0]] @ np.sin(basis.centre * 8.0)
-    duration = np.full(GROUPS, ROWS)
     levels = np.zeros((GROUPS, ROWS, 2))
-    return Responses(PortMap(PORTS, {}, 2, 0, (0.0, 0.0, 0.0)), basis, whitened, residual, jacobian, levels, duration)
+    return Responses(PortMap(PORTS, {}, 2, 0, (0.0, 0.0, 0.0)), basis, whitened, residual, jacobian, levels, 0.0)
 
 
 def dense(found: Responses, port: Port, size: float, memory: float) -> tuple[float, np.ndarray]:
@@ -79,9 +78,7 @@ def test_ports_of_null_data_are_named_as_seldom_as_is_said():
     small = 0
     for _ in range(60):
         residual = rng.normal(size=(GROUPS, VALUES))
-        drawn = Responses(
-            found.ports, found.basis, found.whitened, residual, found.jacobian, found.levels, found.duration
-        )
+        drawn = Responses(found.ports, found.basis, found.whitened, residual, found.jacobian, found.levels, found.begun)
         projected = null - (null @ found.base) @ found.base.T
         small += evidences(drawn, projected)[0].adjusted_p <= 0.1
     assert small < 14
@@ -153,7 +150,7 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups):
         found.residual[:groups],
         found.jacobian[:groups],
         found.levels[:groups],
-        found.duration[:groups],
+        found.begun,
     )
     time = STEP * np.arange(ROWS)
     features = np.stack([np.sin(8.0 * time), np.ones(ROWS)])[None, :, None].repeat(groups, axis=0)
