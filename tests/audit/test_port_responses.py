@@ -12,6 +12,7 @@ from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.law_search import PIECES, LawSearch, TermGain, _pieces, _sums, fresh_terms, left_out_gains
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
+from rfdropo_bayes.audit.port_rollouts import coefficient_name, placed
 from rfdropo_bayes.audit.verdict import SMALL, negligible
 from rfdropo_bayes.mechanisms.features import OWN, Feature
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
@@ -108,6 +109,12 @@ def test_a_term_that_the_law_has_is_not_asked_for_again():
     assert best == (PORTS[0], features[0])
     law = [SimpleNamespace(term=SimpleNamespace(port=best[0], feature=best[1]))]
     assert [(row.port, row.feature) for row in search._ranked(found, values, 0.0, terms=law)] == others
+    # Nor is one of a law that an earlier audit has put into the model: two parameters would have one name.
+    taken = frozenset([coefficient_name(*best, tuple("abc"))])
+    again = replace(search, units=(tuple("abc"), "m"), taken=taken)
+    assert [(row.port, row.feature) for row in again._ranked(found, values, 0.0)] == others
+    term = placed(*best, 1.0, tuple("abc"), "m")
+    assert {term.spec.name} == taken
 
 
 def test_a_term_is_tried_at_all_leading_ports():
