@@ -313,7 +313,7 @@ def _omnibus(screen: Screen) -> dict[str, Any]:
         "p": screen.omnibus.p,
         "finer_mesh": screen.refined,
         "tests": screen.omnibus.single,
-        "blocks": screen.omnibus.blocks.tolist(),
+        "blocks": [None if np.isnan(block) else block for block in screen.omnibus.blocks.tolist()],
     }
 
 

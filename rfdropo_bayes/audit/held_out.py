@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from rfdropo_bayes.audit.audit_problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.deadline import OutOfTime
@@ -191,9 +192,7 @@ def _left_out(
         masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
     else:
         held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"
-        rows = np.arange(measured.count.shape[1])
-        last = HELD_OUT_ROWS * measured.valid.any(axis=2).sum(axis=1)
-        masks = [rows[None, :, None] >= last[:, None, None]]
+        masks = [later_rows(measured.valid)[:, :, None]]
     parts: list[list[np.ndarray]] = [[] for _ in fits]
     for mask in masks:
         mask = np.broadcast_to(mask, measured.count.shape)
@@ -210,6 +209,13 @@ def _left_out(
         predictions.append(UnseenErrors(joined))
     valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
     return held_out, _unseen(measured, valid, problem.model.recordings.names), predictions
+
+
+def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray, "group time"]:
+    """Rows of every recording that come after the share of its measured ones that is fitted, wherever its gaps are."""
+    seen = np.asarray(valid.any(axis=2))
+    before: np.ndarray = np.cumsum(seen, axis=1) - seen
+    return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
 
 
 def supported_steps(

@@ -54,13 +54,18 @@ def fit_with_noise(
 
 def as_measured(judge: FitTarget, fit: Fit) -> Fit:
     """A fit with residuals and slopes in deviations of the measurement's noise; its covariance stays."""
-    if judge.known is None:
+    return fit if judge.known is None else seen_under(judge, judge.known, fit)
+
+
+def seen_under(judge: FitTarget, other: FitTarget, fit: Fit) -> Fit:
+    """A fit with residuals and slopes in deviations of the noise of another target; its covariance stays. One that is
+    judged by the noise of the measurement is no model that is far off, and stays as it is."""
+    if judge.known is None or judge.noise is other.noise:
         return fit
-    known = judge.known
 
     def whitened(white: np.ndarray) -> np.ndarray:
-        weighed = white[..., known.measurements.count.size :]
-        return np.concatenate([rewhitened(judge, known, white), weighed], axis=-1)
+        weighed = white[..., other.measurements.count.size :]
+        return np.concatenate([rewhitened(judge, other, white), weighed], axis=-1)
 
     promise = fit.promise if fit.converged else np.inf
     return replace(fit, residual=whitened(fit.residual), jacobian=whitened(fit.jacobian.T).T, promise=promise)

@@ -28,7 +28,14 @@ from rfdropo_bayes.audit.port_responses import (
     under,
     with_exact_columns,
 )
-from rfdropo_bayes.audit.port_rollouts import FeatureTable, PlacedTerm, PortedForward, placed
+from rfdropo_bayes.audit.port_rollouts import (
+    PREFIX,
+    FeatureTable,
+    PlacedTerm,
+    PortedForward,
+    coefficient_name,
+    placed,
+)
 from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.mechanisms.features import Feature, dictionary, own_dictionary
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
@@ -115,7 +122,8 @@ class FoundLaw:
         terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
         ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
         afterwards: largest log evidence of any port with each term and those before it in the model.
-        centre: times of the ports' signals [s].
+        centre: times of the ports' signals [s] from the recordings' first rows on; of recordings whose commands begin
+            before these by different times, from their median on.
         gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
         offered: largest gain [nat] of any feature at any port before the first term; 0 where none brings anything.
     """
@@ -246,6 +254,7 @@ class LawSearch:
         family: probability that a port is named where nothing is hidden.
         report: called with a line of words.
         most: terms that a law may have.
+        taken: names of coefficients that the model has, of laws that an earlier audit found.
     """
 
     ports: PortMap
@@ -256,6 +265,7 @@ class LawSearch:
     family: float
     report: Callable[[str], None] = lambda line: None
     most: int = TERMS
+    taken: frozenset[str] = frozenset()
 
     def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
         """Where something acts that the model lacks, and by what law.
@@ -304,7 +314,8 @@ class LawSearch:
             self.report("the time was up before the law was found")
         # The time may be up between a term and what is left beside it.
         terms, gate = terms[: len(afterwards)], next(iter(gates), None)
-        return FoundLaw(self.ports, first, terms, ties, afterwards, found.basis.centre, gate, offered)
+        centre = found.basis.centre - found.begun
+        return FoundLaw(self.ports, first, terms, ties, afterwards, centre, gate, offered)
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
@@ -319,6 +330,10 @@ class LawSearch:
         """All features of the commands, then those of the motion."""
         values = self.table.over(found.levels)
         return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
+
+    def _has(self, port: Port, feature: Feature) -> bool:
+        """Whether a law of the model has this term."""
+        return bool(self.taken) and coefficient_name(port, feature, self.units[0]) in self.taken
 
     def _features(self, port: Port) -> Sequence[Feature]:
         """What a law at a port may be made of: on a body of the motion, too."""
@@ -361,12 +376,13 @@ class LawSearch:
     ) -> list[TermGain]:  # fmt: skip
         """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`.
 
-        Terms that the law has are none of them: where a port is far from linear, they would bring something again. A
-        term whose shape is inferred has every shape.
+        Terms that the law has are none of them, nor those of a law that is in the model already: where a port is far
+        from linear, they would bring something again. A term whose shape is inferred has every shape.
         """
         rows = []
         had = {(refit.term.port, refit.term.feature) for refit in terms}
         had |= {(refit.term.port, refit.term.feature._replace(shape=None)) for refit in terms if refit.term.shape}
+        had |= {(port, f) for port in self.ports.ports for f in self._features(port) if self._has(port, f)}
         for port in self.ports.ports:
             features, (sizes, signals) = self._features(port), self._offered(port, values)
             columns = feature_columns(found, port, signals)
@@ -532,4 +548,6 @@ def law_search(
     stroke = max(stroke, 1e-12)
     features = dictionary(len(channels), stroke)
     table = FeatureTable(target.forward.lanes, features)
-    return LawSearch(ports, table, own_dictionary(stroke), (tuple(channels), unit), seed, family, report)
+    own, names = own_dictionary(stroke), target.forward.coordinates.names
+    taken = frozenset(name for name in names if name.startswith(PREFIX))
+    return LawSearch(ports, table, own, (tuple(channels), unit), seed, family, report, taken=taken)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import norm
 
 BLOCK = 10  # rows
@@ -63,6 +63,18 @@ def block_means(white: Float[np.ndarray, "*batch group time channel"]) -> Float[
     count = white.shape[-2] // size
     cut = white[..., : count * size, :]
     return cut.reshape(*cut.shape[:-2], count, size, cut.shape[-1]).sum(axis=-2) / np.sqrt(size)
+
+
+def block_squares(
+    white: Float[np.ndarray, "group time channel"], valid: Bool[np.ndarray, "group time channel"]
+) -> Float[np.ndarray, " block"]:
+    """Mean square of the means of blocks of rows, over groups and channels, 1 where the model is right; rows that were
+    not measured count as none, and a block without any is not a number."""
+    size = min(BLOCK, white.shape[-2])
+    measured = np.round(np.sqrt(size) * block_means(valid.astype(float)))
+    sums = np.sqrt(size) * block_means(np.where(valid, white, 0.0))
+    count = np.sum(measured, axis=(0, 2))
+    return np.where(count > 0, np.sum(sums**2, axis=(0, 2)) / np.maximum(count, 1.0), np.nan)
 
 
 def joint_test(

@@ -71,7 +71,7 @@ class Responses:
         residual: whitened, by group.
         jacobian: of the fit's free coordinates, by group; columns in deviations of their priors.
         levels: commands that reach the ports, by group.
-        duration: rows of the simulator that each group has.
+        begun: when the recordings' first rows are [s] on the simulator's clock, which begins with their commands.
         noise: mean square of the measurement's noise in these deviations; less than 1 where the model is far off.
         of_motion: features of the motion, by group, where the body carries signals that follow it.
         exact: by port: what each feature does, where it was asked for; see `with_exact_columns`.
@@ -83,7 +83,7 @@ class Responses:
     residual: Float[np.ndarray, "group value"]
     jacobian: Float[np.ndarray, "group value d"]
     levels: Float[np.ndarray, "group row channel"]
-    duration: np.ndarray
+    begun: float
     noise: float = 1.0
     of_motion: Float[np.ndarray, "group feature row"] | None = None
     exact: dict[Port, Float[np.ndarray, "group value feature"]] = field(default_factory=dict)
@@ -126,9 +126,10 @@ def responses(
     white = target.measurements.series(fit.residual).reshape(groups, -1)
     slopes = target.measurements.series(fit.jacobian.T) * forward.coordinates.prior_sd[fit.free][:, None, None, None]
     jacobian = np.moveaxis(slopes.reshape(len(fit.free), groups, -1), 0, 2)
-    duration = np.asarray(forward.commands.sample_step).max(axis=1) + 1
+    first = forward.commands.sample_step[:, 0] + forward.commands.sample_fraction[:, 0]
+    begun = float(np.median(table.time_step * np.asarray(first)))
     moving = table.over_motion(theta, forward.commands, forward.deadline.check) if table.of_motion else None
-    return Responses(ports, basis, found, white, jacobian, levels, duration, noise_share(target), moving)
+    return Responses(ports, basis, found, white, jacobian, levels, begun, noise_share(target), moving)
 
 
 def _response(

@@ -30,6 +30,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import PASSES, RobotSimulator
 
 Signals = Float[np.ndarray, "lane row"]
+PREFIX = "law_"
+"""Of the names of coefficients."""
 STEP = 1e-4
 """Prior deviations of a one-sided difference: rounding of 1e-13 m then errs by 1e-9 m a deviation."""
 COARSE = 0.03
@@ -294,15 +296,20 @@ def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordin
 def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str) -> PlacedTerm:
     """A term whose coefficient has a prior of so many sizes of its port over the feature's own size."""
     scale = float(f"{SPREAD * port.size / max(size, 1e-300):.3g}")
-    at = f"{port.name} {feature.kind} {' '.join(feature.commands(channels))}".strip()
-    shape = "" if feature.shape is None else f"_{feature.shape:.3g}"
-    name = f"law_{at.replace(' ', '_')}{shape}"
+    name = coefficient_name(port, feature, channels)
     words = f"of the law at {port.words}: it changes {feature.words(channels)}"
     return PlacedTerm(
         port,
         feature,
         ParameterSpec(name, unit_of(port.unit, feature, unit), -FAR * scale, FAR * scale, 0.0, normal(scale), words),
     )
+
+
+def coefficient_name(port: Port, feature: Feature, channels: Sequence[str]) -> str:
+    """Name of the parameter that is the coefficient of a feature at a port."""
+    at = f"{port.name} {feature.kind} {' '.join(feature.commands(channels))}".strip()
+    shape = "" if feature.shape is None else f"_{feature.shape:.3g}"
+    return f"{PREFIX}{at.replace(' ', '_')}{shape}"
 
 
 SPREAD = 3.0

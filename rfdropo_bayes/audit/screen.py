@@ -17,7 +17,7 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.candidates import Probe
 from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.omnibus import Omnibus, block_means, joint_test, statistics
+from rfdropo_bayes.audit.omnibus import Omnibus, block_squares, joint_test, statistics
 from rfdropo_bayes.audit.score import project_out, span, statistic
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
@@ -106,7 +106,7 @@ def screen(
     tests = []
     for index, residual in enumerate(residuals):
         white = target.measurements.series(residual)
-        blocks = np.nanmean(block_means(white) ** 2, axis=(0, 2))
+        blocks = block_squares(white, target.measurements.valid)
         tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
     rows = [_row(name, seen, surprises[0], most, fit) for name in names]
     return Screen(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)

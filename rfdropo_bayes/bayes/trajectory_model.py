@@ -79,15 +79,23 @@ class TrajectoryModel:
         own |= {name.partition(SEPARATOR)[0] for name in self.fixed if SEPARATOR in name}
         return {spec.name: spec.nominal for spec in self.simulator.parameters if spec.name in own}
 
+    @cached_property
+    def _ends_of_sums(self) -> dict[str, tuple[float, float]]:
+        """Hard bounds of the parameters that are a shared value and a group's deviation from it."""
+        summed = {parameter.added_to for parameter in self.space.parameters if parameter.added_to}
+        return {spec.name: (spec.low, spec.high) for spec in self.simulator.parameters if spec.name in summed}
+
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
         """What the simulator is given for one recording: fixed and inferred physical parameters.
 
-        A body whose poses are measured starts at the first of them.
+        The sum of a shared value and a group's deviation ends at the parameter's hard bounds, as in audits. A body
+        whose poses are measured starts at the first of them.
         """
         parts = ((name.partition(SEPARATOR), value) for name, value in self.fixed.items())
         fixed = {name: value for (name, _, owner), value in parts if owner in ("", recording)}
         chosen = {**self._absent, **fixed, **self.space.for_recording(values, recording)}
         physical = {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
+        physical |= {name: jnp.clip(physical[name], *ends) for name, ends in self._ends_of_sums.items()}
         if self._poses is None:
             return physical
         assert isinstance(self.simulator, Placing)

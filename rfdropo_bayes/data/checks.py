@@ -26,6 +26,7 @@ _LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres 
 _SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are
 _UNLIMITED = {"N": np.inf, "N m": np.inf, "-": np.inf}
 _LARGEST_COMMAND = {"m": 5.0, "rad": 20.0} | _UNLIMITED  # unclipped cumulative commands stay below in the right unit
+LARGEST = "largest_command"  # among the settings of a recording: in its unit, of drives that go farther than most
 _LARGEST_COMMAND_STEP = {"m": 0.5, "rad": 20.0} | _UNLIMITED
 
 
@@ -117,10 +118,12 @@ def _check_commands(dataset: xr.Dataset, name: str) -> None:
     command = np.concatenate([dataset["initial_command"].values[None], dataset["command"].values])
     largest = float(np.abs(command).max())
     step = float(np.abs(np.diff(command, axis=0)).max())
-    if largest > _LARGEST_COMMAND[unit] or step > _LARGEST_COMMAND_STEP[unit]:
+    stated = float(json.loads(str(dataset.attrs.get("settings", "{}"))).get(LARGEST, 0.0))
+    if largest > max(_LARGEST_COMMAND[unit], stated) or step > max(_LARGEST_COMMAND_STEP[unit], stated):
         other = "millimetres given as metres" if unit == "m" else "degrees given as radians"
         raise InputError(
             f"commands reach {largest:.4g} {unit} with steps of {step:.4g} {unit}",
             where=name,
-            remedy=f"they look like {other}: state the unit the file is in",
+            remedy=f"they look like {other}: state the unit the file is in; where drives do go so far, as a winch or a "
+            "lead screw of many turns does, state largest_command beside it",
         )

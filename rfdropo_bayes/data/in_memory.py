@@ -30,6 +30,7 @@ def from_arrays(
     time_unit: str = "s",
     position_unit: str = "m",
     command_unit: str = "m",
+    largest_command: float | None = None,
     tension: Float[Any, "time channel"] | None = None,
     motor_angle: Float[Any, "time channel"] | None = None,
     object_pose: Float[Any, "time 7"] | None = None,
@@ -49,6 +50,7 @@ def from_arrays(
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
         command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
+        largest_command: that is to be believed, in ``command_unit``, of drives that go farther than 20 rad or 5 m.
         tension: [N]; not a number where it is missing.
         motor_angle: [rad]; not a number where it is missing.
         object_pose: centre and unit quaternion x, y, z, w of a pushed body.
@@ -78,7 +80,9 @@ def from_arrays(
         pose = _numbers(object_pose, "poses", rows | {"": 7}, name) * np.repeat([metres, 1.0], [3, 4])
     return Recorded(
         Origin(name, robot, MEMORY, settings=faults.settings),
-        SentCommands(stamps, sent, unit, channels, sent[0]),
+        SentCommands(
+            stamps, sent, unit, channels, sent[0], None if largest_command is None else factor * largest_command
+        ),
         Measured(
             clock,
             fill_missing(clock, place),

@@ -81,6 +81,12 @@ class CsvColumns(BaseModel):
         description='unit of the commands: a length of cable, an angle of a motor, a force or torque; "-" for what a '
         "simulator of one's own takes"
     )
+    largest_command: float | None = Field(
+        default=None,
+        gt=0,
+        description="largest command that is to be believed, in command_unit, where drives go farther than 20 rad or "
+        "5 m, as a winch or a lead screw of many turns does",
+    )
     command_time: str | None = Field(
         default=None,
         description="column of the commands' own times, in their file; by default command k is sent in row k of the "
@@ -208,7 +214,7 @@ def read_tables(
     settings = faults.settings | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)})
     return Recorded(
         replace(origin or origin_of(table, columns), settings=settings),
-        SentCommands(sent, command, *_channels(columns), command[0]),
+        SentCommands(sent, command, *_channels(columns), command[0], _largest(columns)),
         Measured(
             time=time,
             position=fill_missing(time, position),
@@ -225,7 +231,7 @@ def read_commands(table: CsvTable, columns: CsvColumns) -> SentCommands:
     """The commands in a table that may hold nothing else; their times count from the first one."""
     clock, unit = command_clock(columns)
     time = _times(table, columns) if clock is None else _from_first(table, clock, unit)
-    return SentCommands(time, _commands(table, table, columns), *_channels(columns))
+    return SentCommands(time, _commands(table, table, columns), *_channels(columns), largest=_largest(columns))
 
 
 def origin_of(table: CsvTable, columns: CsvColumns) -> Origin:
@@ -242,6 +248,12 @@ def marker_names(columns: CsvColumns) -> list[str]:
 def _channels(columns: CsvColumns) -> tuple[str, list[str]]:
     """Unit of the commands in a recording, and the names of their channels."""
     return COMMAND_UNITS[columns.command_unit][0], columns.cables or columns.commands
+
+
+def _largest(columns: CsvColumns) -> float | None:
+    """Largest command that is to be believed, in the unit of a recording; None for what most drives do."""
+    stated = columns.largest_command
+    return None if stated is None else COMMAND_UNITS[columns.command_unit][1] * stated
 
 
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +57,7 @@ class SentCommands:
         command_unit: "m" of cable or "rad" of a motor.
         cable_names: of the channels.
         initial_command: in force before the first; zero by default.
+        largest: that is to be believed, in their unit, where it is more than most drives do; None for what these do.
     """
 
     command_time: Float[np.ndarray, " command_time"]
@@ -64,6 +65,12 @@ class SentCommands:
     command_unit: str
     cable_names: Sequence[str]
     initial_command: Float[np.ndarray, " cable"] | None = None
+    largest: float | None = None
+
+    def believed(self) -> SentCommands:
+        """The same, of which the largest is to be believed: commands of a simulator or of a controller's own log."""
+        size = np.abs(np.asarray(self.command, dtype=float))
+        return replace(self, largest=float(size.max())) if size.size and np.isfinite(size).all() else self
 
 
 @dataclass(frozen=True)
@@ -109,6 +116,7 @@ def assembled(recorded: Recorded) -> xr.Dataset:
     tension, tension_mask = present_readings(measured.tension)
     motor_angle, angle_mask = present_readings(measured.motor_angle)
     facts |= _missing(tension_mask, angle_mask, measured.object_pose)
+    facts |= {} if sent.largest is None else {checks.LARGEST: float(sent.largest)}
     new = _angle_mask(measured.time, motor_angle, float(facts.get("motor_angle_hold", 0.0)))
     pose, mask, initial = measured.object_pose, measured.position_mask, sent.initial_command
     arrays = {

@@ -177,7 +177,8 @@ def predict_new(
         for p, k in zip(predictions, keys, strict=True)
     ]
     patterns = groups or {}
-    without = without_cautions(model.space, list(gather_groups(names, patterns)), gather_groups(fitted, patterns))
+    known = {*gather_groups(fitted, patterns), *(p.recording for p in model.space.parameters if p.added_to or p.scoped)}
+    without = without_cautions(model.space, list(gather_groups(names, patterns)), known)
     return NewPredictions(predictions, unmatched, far_first_rows(predictions, left), without)
 
 

@@ -19,6 +19,7 @@ from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, un
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables
 from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.robots.plausibility import implausible
 from rfdropo_bayes.robots.table import Name, Positive, RobotTable, Vector
 from rfdropo_bayes.tables import changed, nearest, parse_table
 
@@ -131,6 +132,8 @@ class Robot(RobotTable):
             raise ValueError("poisson_ratio may not exceed 0.499, where the material is incompressible")
         if self.parameters["trunk_mass"].low <= 0 or any(self.parameters[name].low < 0 for name in masses):
             raise ValueError("the bounds of a mass let it be negative, or the trunk massless")
+        if found := implausible(self):
+            raise ValueError(found)
         self._check_inside()
         self._check_motors()
         for table in self.drives:

@@ -503,18 +503,29 @@ def _record(
     """The draws, with what predictions of further recordings need."""
     problem, attrs = adapted.problem, asked.fit.record.attrs
     recordings, noise = problem.model.recordings, problem.model.markers.known
+    elsewhere, drawn = _of_other_groups(asked, len(adapted.found.chosen))
     infos = tuple(
         ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
-        for p in problem.model.space.parameters
+        for p in (*problem.model.space.parameters, *elsewhere)
     )
+    draws = result.draws | {name: column[adapted.found.chosen][None] for name, column in drawn.items()}
     known: dict[str, Any] = (
         {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
     )
     known |= {DAY_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
     predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
-    record = PosteriorRecord(infos, result.draws, dict(prior), tuple(predictions), attrs=attributes)
+    record = PosteriorRecord(infos, draws, {**prior, **drawn}, tuple(predictions), attrs=attributes)
     return with_ratios(record, problem.names)
+
+
+def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:
+    """What the groups that were fitted have of their own, and its values under each draw of the body before: the
+    folder of a day predicts recordings of the other days, too."""
+    known = asked.space.names
+    others = [p for p in fitted_parts(asked.fit)[1].parameters if p.added_to or p.scoped]
+    others = [p for p in others if p.name not in known]
+    return others, thin({p.name: asked.fit.record.posterior[p.name] for p in others}, draws) if others else {}
 
 
 def _checks(

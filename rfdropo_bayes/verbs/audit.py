@@ -465,9 +465,12 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
     found = {}
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
+        if parameter.spec.name != parameter.physical:  # how far one group's value is off, of which no file has a prior
+            continue
         table = dict(parameter.table or parameter.spec.prior)
-        if "loc" in table:  # a size in one group is measured from null
-            table["loc"] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
+        for key in ("loc", "low", "high"):  # a size in one group is measured from null
+            if key in table and parameter.added_to:
+                table[key] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
         found[parameter.spec.name] = table

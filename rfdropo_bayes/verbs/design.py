@@ -20,8 +20,8 @@ from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
 from rfdropo_bayes.audit.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
 from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, FitTarget
-from rfdropo_bayes.audit.inadequacy import as_measured
-from rfdropo_bayes.audit.law_search import law_search
+from rfdropo_bayes.audit.inadequacy import seen_under
+from rfdropo_bayes.audit.law_search import Refit, law_search
 from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.recordings import commands_after
@@ -135,10 +135,8 @@ def _design(
         found, _ = search.screened(fitted)
     hypotheses = [] if found is None else _hypotheses(search, found, clock, report)
     wrong = found is not None and found.omnibus.p <= problem.rules.base_passes
-    if wrong and (laws := _laws(problem, target, fitted, clock, report)):
-        # Under the noise of the measurement, and so are all then.
-        own = [replace(h, fit=as_measured(target, h.fit)) for h in hypotheses]
-        target, fitted, hypotheses = target.measured, as_measured(target, fitted), [*laws, *own][:HYPOTHESES]
+    if wrong and (rivals := _rivals(problem, target, fitted, clock, report)):
+        target, fitted, hypotheses = _with_laws(problem, target, fitted, hypotheses, rivals)
     tried = list(proposals(runs[0], runs, rng))
     outlook = _outlooks(problem, target, fitted, hypotheses, runs[0], tried, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
@@ -181,27 +179,39 @@ def _hypotheses(
     return hypotheses[:HYPOTHESES]
 
 
-def _laws(
+def _rivals(
     problem: AuditProblem, target: FitTarget, base: Fit, clock: Clock, report: Callable[[str], None]
-) -> list[Hypothesis]:
+) -> list[Refit]:
     """The law at a port that the library has no name for, and those that the recordings do not tell from it."""
     if problem.ports is None:
         return []
     simulator: Any = problem.lanes.simulator
     names, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
     options = (problem.ports, names, unit, problem.seed, problem.rules.family, report)
-    rivals = []
+    rivals: list[Refit] = []
     with clock.part(LAWS_BY, "laws at ports"):
         search = replace(law_search(target, *options), most=1)
         rivals = search.find(target, base).rivals
-    return [
+    return rivals
+
+
+def _with_laws(
+    problem: AuditProblem, target: FitTarget, base: Fit, hypotheses: Sequence[Hypothesis], rivals: Sequence[Refit]
+) -> tuple[FitTarget, Fit, list[Hypothesis]]:
+    """Target, base fit and hypotheses with laws before them, all under one noise: that by which the model with the
+    leading law is judged. Under the noise of the measurement a model that is far off would seem sure of anything."""
+    simulator: Any = problem.lanes.simulator
+    names, judge = tuple(simulator.channel_names), rivals[0].target.on(target.forward)
+    laws = [
         Hypothesis(
             f"{refit.feature.formula(names)} at {refit.term.port.words}",
-            as_measured(refit.target, refit.fit),
+            seen_under(refit.target, judge, refit.fit),
             refit.target.forward,
         )
         for refit in rivals
     ]
+    own = [replace(h, fit=seen_under(target, judge, h.fit)) for h in hypotheses]
+    return judge, seen_under(target, judge, base), [*laws, *own][:HYPOTHESES]
 
 
 def _outlooks(

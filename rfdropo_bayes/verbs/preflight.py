@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
-from scipy.linalg import solve_triangular
+from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.batches import chunk_sizes
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
@@ -337,21 +336,15 @@ class _Whitening:
     def __init__(self, problem: CalibrationProblem, noise: _Noise) -> None:
         self.noise, recordings = noise, problem.model.recordings
         self.rows = [int(n) for n in recordings.rows]
-        self.valid = np.asarray(recordings.line.valid)
-        self.factors = []
-        for times, rows in zip(np.asarray(recordings.time), self.rows, strict=True):
-            apart = np.abs(times[:rows, None] - times[None, :rows])
-            lasting = noise.lasting**2 * np.exp(-apart / noise.time)
-            self.factors.append(np.linalg.cholesky(noise.white**2 * np.eye(rows) + lasting))
+        self.valid, self.time = np.asarray(recordings.line.valid), np.asarray(recordings.time)
 
     def positions(self, slope: Float[np.ndarray, "draw parameter recording time marker 3"]) -> np.ndarray:
         """Over the noise of the positions; masked ones count for nothing."""
         parts = []
-        for index, (rows, factor) in enumerate(zip(self.rows, self.factors, strict=True)):
-            own = slope[:, :, index, :rows] * self.valid[index, :rows, :, None]
-            flat = np.moveaxis(own, 2, 0).reshape(rows, -1)
-            white = solve_triangular(factor, flat, lower=True).reshape(rows, *own.shape[:2], -1)
-            parts.append(np.moveaxis(white, 0, 2).reshape(*own.shape[:2], -1))
+        for index, rows in enumerate(self.rows):
+            own = np.moveaxis(slope[:, :, index, :rows], 2, 0)
+            white = innovations(own, self.time[index, :rows], self.valid[index, :rows], self.noise)
+            parts.append(np.moveaxis(white, 0, 2).reshape(*slope.shape[:2], -1))
         return np.concatenate(parts, axis=-1)
 
     def tensions(self, slope: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -360,6 +353,28 @@ class _Whitening:
         error = TENSION_ERROR * np.where(typical > 0.0, typical, np.inf)
         parts = [(slope / error)[:, :, index, :rows] for index, rows in enumerate(self.rows)]
         return np.concatenate([part.reshape(*part.shape[:2], -1) for part in parts], axis=-1)
+
+
+def innovations(
+    series: Float[np.ndarray, "time *many marker 3"],
+    time: Float[np.ndarray, " time"],
+    valid: Bool[np.ndarray, "time marker"],
+    noise: _Noise,
+) -> Float[np.ndarray, "time *many marker 3"]:
+    """Series over a white noise and one that lasts, as independent unit normals: each row less what those before it
+    say of it (Kalman's filter), in as many operations as there are rows; zero where not valid."""
+    found = np.zeros_like(series)
+    mean, variance = np.zeros(series.shape[1:]), np.full(valid.shape[1], noise.lasting**2)
+    for row, seen in enumerate(valid):
+        if row:
+            kept = np.exp(-(time[row] - time[row - 1]) / noise.time)
+            mean, variance = kept * mean, kept**2 * variance + (1.0 - kept**2) * noise.lasting**2
+        whole = variance + noise.white**2
+        left = np.where(seen[:, None], series[row] - mean, 0.0)
+        found[row] = left / np.sqrt(whole)[:, None]
+        gain = np.where(seen, variance / whole, 0.0)
+        mean, variance = mean + gain[:, None] * left, (1.0 - gain) * variance
+    return found
 
 
 def _information(white: Float[np.ndarray, "draw parameter row"]) -> Float[np.ndarray, "draw parameter parameter"]:

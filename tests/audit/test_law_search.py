@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,8 +14,8 @@ import pytest
 from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.described import Described, NamedModel, coefficients, describe
-from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
-from rfdropo_bayes.audit.inadequacy import as_measured, noise_share
+from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
+from rfdropo_bayes.audit.inadequacy import POOR, as_measured, noise_share
 from rfdropo_bayes.audit.law_search import TIED, law_search
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
@@ -25,6 +26,7 @@ from rfdropo_bayes.mechanisms.features import Feature
 from rfdropo_bayes.mechanisms.ports import Port, port_map
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.residual_file import residual_dataset
+from rfdropo_bayes.verbs.design import _with_laws
 
 from .toys import STEP, Toy, problem, recordings
 
@@ -178,6 +180,21 @@ def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidat
     scale = term.term.spec.prior["scale"]
     assert abs(scale * term.fit.x[-1] - LARGE) < 3.0 * scale * np.sqrt(term.fit.covariance[-1, -1])
     assert 0.0 < term.gain.share < 1.0
+    # A design of what to send next looks at both models under that noise: of that of the measurement, what either
+    # leaves is a hundred times as much, and the commands at hand would seem to tell them apart many times as well.
+    named = [Hypothesis("named", base)]
+    judge, seen, hypotheses = _with_laws(question, target, base, named, found.rivals)
+    assert judge.noise is term.target.noise
+    left = judge.residual(base.x[None])[0]
+    np.testing.assert_allclose(seen.residual, left, atol=1e-6 * np.abs(left).max())
+    np.testing.assert_array_equal(hypotheses[-1].fit.residual, seen.residual)
+    np.testing.assert_array_equal(hypotheses[0].fit.residual, term.fit.residual)
+    assert hypotheses[0].fit.residual @ hypotheses[0].fit.residual < POOR * rows
+    both = [hypotheses[0], hypotheses[-1]]
+    measured = [as_measured(term.target, term.fit), as_measured(target, base)]
+    surer = [replace(h, fit=fit) for h, fit in zip(both, measured, strict=True)]
+    (pair,), (other,) = at_hand(judge, both).values(), at_hand(judge, surer).values()
+    assert 10.0 * pair < other
 
 
 def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
@@ -216,6 +233,19 @@ def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
     share = np.mean(1.0 / known.measurements.count) * float(np.mean((known.noise.scale / judge.noise.scale) ** 2))
     assert far.noise == noise_share(judge) == pytest.approx(share)
     assert under(near, known, known) is near
+
+
+def test_signals_are_timed_from_the_first_row_on():
+    """Of recordings whose commands are known for four steps before it."""
+    question = asked(101)
+    target, base = base_model(question, question.seed)
+    forward = copy.copy(target.forward)
+    step = forward.commands.sample_step
+    forward.commands = forward.commands._replace(sample_step=np.minimum(step + 4, step.max()))
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    plain, early = (law_search(t, *options).find(t, base) for t in (target, target.on(forward)))
+    assert plain.centre[0] == 0.0
+    np.testing.assert_allclose(early.centre, plain.centre - 4 * STEP, atol=1e-12)
 
 
 def test_nothing_is_described_where_nothing_is_hidden():

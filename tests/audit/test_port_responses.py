@@ -12,7 +12,7 @@ from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.law_search import PIECES, LawSearch, TermGain, _pieces, _sums, fresh_terms, left_out_gains
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
-from rfdropo_bayes.audit.port_rollouts import PlacedTerm
+from rfdropo_bayes.audit.port_rollouts import PlacedTerm, coefficient_name, placed
 from rfdropo_bayes.audit.verdict import SMALL, negligible
 from rfdropo_bayes.mechanisms.features import OWN, Feature
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
@@ -32,9 +32,8 @@ def responses(seed: int = 0, signal: float = 0.0) -> Responses:
     jacobian = rng.normal(size=(GROUPS, VALUES, 4))
     residual = rng.normal(size=(GROUPS, VALUES)) + jacobian @ rng.normal(size=4)
     residual += signal * whitened[PORTS[0]] @ np.sin(basis.centre * 8.0)
-    duration = np.full(GROUPS, ROWS)
     levels = np.zeros((GROUPS, ROWS, 2))
-    return Responses(PortMap(PORTS, {}, 2, 0, (0.0, 0.0, 0.0)), basis, whitened, residual, jacobian, levels, duration)
+    return Responses(PortMap(PORTS, {}, 2, 0, (0.0, 0.0, 0.0)), basis, whitened, residual, jacobian, levels, 0.0)
 
 
 def dense(found: Responses, port: Port, size: float, memory: float) -> tuple[float, np.ndarray]:
@@ -81,9 +80,7 @@ def test_ports_of_null_data_are_named_as_seldom_as_is_said():
     small = 0
     for _ in range(60):
         residual = rng.normal(size=(GROUPS, VALUES))
-        drawn = Responses(
-            found.ports, found.basis, found.whitened, residual, found.jacobian, found.levels, found.duration
-        )
+        drawn = Responses(found.ports, found.basis, found.whitened, residual, found.jacobian, found.levels, found.begun)
         projected = null - (null @ found.base) @ found.base.T
         small += evidences(drawn, projected)[0].adjusted_p <= 0.1
     assert small < 14
@@ -118,6 +115,12 @@ def test_a_term_that_the_law_has_is_not_asked_for_again():
     elsewhere = [(port, feature) for port, feature in others if port != best[0]]
     assert [(row.port, row.feature) for row in search._ranked(found, values, 0.0, terms=law)] == elsewhere
     assert len(elsewhere) < len(others)
+    # Nor is one of a law that an earlier audit has put into the model: two parameters would have one name.
+    taken = frozenset([coefficient_name(*best, tuple("abc"))])
+    again = replace(search, units=(tuple("abc"), "m"), taken=taken)
+    assert [(row.port, row.feature) for row in again._ranked(found, values, 0.0)] == others
+    term = placed(*best, 1.0, tuple("abc"), "m")
+    assert {term.spec.name} == taken
 
 
 def test_a_term_is_tried_at_all_leading_ports():
@@ -160,7 +163,7 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups):
         found.residual[:groups],
         found.jacobian[:groups],
         found.levels[:groups],
-        found.duration[:groups],
+        found.begun,
     )
     time = STEP * np.arange(ROWS)
     features = np.stack([np.sin(8.0 * time), np.ones(ROWS)])[None, :, None].repeat(groups, axis=0)

@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.fixed_quantities import with_fixed_quantities
 from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer, audit
 from rfdropo_bayes.bayes.space import ParameterSpace
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.report.audit_page import shown
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import specs_of
 
@@ -45,6 +48,20 @@ def test_nothing_else_is_at_work_where_all_that_remains_is_noise(answer):
     assert "no more than repeats differ by" in noise
     assert "(joint test p < 0.005): something else is at work" in more
     assert "of it noise" in more
+
+
+def test_the_page_shows_the_markers_that_all_recordings_have(answer):
+    """The first recording has one more, and in another order than the robot."""
+    first, *rest = answer.problem.trajectories
+    dataset = first.dataset.isel(marker=[3, 2, 1, 0])
+    more = xr.concat(
+        [dataset, dataset.isel(marker=[0]).assign_coords(marker=["m9"])], dim="marker", data_vars="minimal"
+    )
+    found = replace(answer, problem=replace(answer.problem, trajectories=[Trajectory(more), *rest]))
+    tracks, wanted = shown(found).tracks, shown(answer).tracks
+    assert [track.markers for track in tracks] == [("m1", "m2", "m3", "m4")] * len(wanted)
+    for track, other in zip(tracks, wanted, strict=True):
+        np.testing.assert_array_equal(track.series["measured"], other.series["measured"])
 
 
 def test_the_next_step_is_about_the_largest_share(answer):

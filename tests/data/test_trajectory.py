@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from hypothesis import given, settings
@@ -52,6 +53,29 @@ def test_a_wrong_unit_of_length_is_named(build, scale, message):
 def test_a_wrong_unit_of_command_is_named(build, unit, value, message):
     with pytest.raises(InputError, match=message):
         build(command=np.full((10, 2), value), command_unit=unit)
+
+
+def test_drives_of_many_turns_say_how_far_they_go(build, tmp_path):
+    """A lead screw of ten turns: refused as degrees, and believed as far as it is said to go, in every later form."""
+    screw = np.linspace(0.0, 62.0, 10)[:, None] * np.ones(2)
+    with pytest.raises(InputError, match="state largest_command"):
+        build(command=screw, command_unit="rad")
+    built = build(command=screw, command_unit="rad", largest=65.0)
+    built.save(tmp_path / "screw.nc")
+    for run in (built, Trajectory.load(tmp_path / "screw.nc"), built.slice_rows(0, 5), built.resample(0.2)):
+        assert np.abs(run.command).max() > 20.0
+    with pytest.raises(InputError, match="degrees given as radians"):
+        build(command=10.0 * screw, command_unit="rad", largest=65.0)
+    arrays = {"time": built.time, "position": built.position, "markers": ["a", "b"], "channels": ["u", "v"]}
+    found = Trajectory.from_arrays(command=360.0 * screw, command_unit="deg", largest_command=360.0 * 65.0, **arrays)
+    assert found.command.max() == pytest.approx(2.0 * np.pi * 62.0)
+    place = dict(zip("xyz", built.position[:-1, 0].T, strict=True))
+    table = pd.DataFrame({"t": built.time[:-1], "u": screw[:, 0], **place})
+    columns = {"time": "t", "commands": ["u"], "command_unit": "rad", "positions": [["x", "y", "z"]]}
+    columns |= {"position_unit": "m", "largest_command": 65.0}
+    assert Trajectory.from_pandas(table, columns).command.max() == 62.0
+    with pytest.raises(InputError, match="state largest_command"):
+        Trajectory.from_pandas(table, columns | {"largest_command": 50.0})
 
 
 def test_nan_is_placed(build):

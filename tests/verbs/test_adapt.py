@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -71,6 +72,17 @@ def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     assert (held.measured, held.shares) == (whole.measured, whole.shares)
     held.row_log_likelihood(starts, held.n_rows)
     assert sum(told) == pytest.approx(3.0)
+
+
+def test_the_value_of_a_day_stays_within_the_hard_bounds_of_its_parameter():
+    """A time constant of 50 ms, the least that there is, and a day that is said to have 0.2 s less: it has no less."""
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"time_constant": 0.2})
+    program = model.numpyro(recorded(["day_0_a", "day_1_a"], [0.0, 0.0], 0))
+    values = {"gain": 1.0, "time_constant": 0.05, "zero": 0.0, "time_constant_spread": 0.2, "observation_noise": SIGMA}
+    values |= {"time_constant_deviation@day_0": -0.2, "time_constant_deviation@day_1": 0.2}
+    given = {name: jnp.asarray(value) for name, value in values.items()}
+    found = [float(program.rollout_values(given, f"day_{k}_a")["time_constant"]) for k in range(2)]
+    np.testing.assert_allclose(found, [0.05, 0.25])
 
 
 @pytest.mark.slow
@@ -154,6 +166,23 @@ def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
     np.testing.assert_array_equal(back.record.flat("zero_spread"), adapted.record.flat("zero_spread"))
     assert json.loads((adapted.folder / "summary.json").read_text())["method"] == "adapt"
     assert (adapted.folder / "report.html").stat().st_size > 10_000
+
+
+def test_the_folder_of_a_day_predicts_the_other_days_too(known, zeros):
+    """A day that was fitted keeps its values, row by row with the draws of the body that the new day has left."""
+    size = 0.03 + 1e-3 * np.arange(60.0)[None]
+    posterior = {**known.record.posterior, "zero_deviation@day_0": size}
+    fit = replace(known, record=replace(known.record, posterior=posterior))
+    run = recorded(["morning"], zeros[9:10], 30)[0]
+    found = rb.adapt(fit, run, seconds=0.5, group="today", seed=1, show=False)
+    rows = np.searchsorted(size[0], found.record.flat("zero_deviation@day_0"))
+    np.testing.assert_array_equal(found.record.flat("gain"), fit.record.flat("gain")[rows])
+    commands = run.time[:-1], run.command_at(run.time[:-1])
+    back = rb.predict(found, commands, group="day_0")
+    assert back.group_fitted
+    wanted, today = (rb.predict(each, commands, group=group) for each, group in ((fit, "day_0"), (found, "today")))
+    off = [float(np.abs(back.bands["mean"] - other.bands["mean"]).max()) for other in (wanted, today)]
+    assert off[0] < 3.0 * SIGMA < 10.0 * SIGMA < off[1]
 
 
 def test_errors_last_as_long_in_rows_of_another_rate(adapted):

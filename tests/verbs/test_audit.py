@@ -11,9 +11,11 @@ import pytest
 
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.mechanisms import REGISTRY
-from rfdropo_bayes.verbs.audit import extended_tables
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.verbs.audit import extended_tables, sized_priors
 
 
 def answered(candidate: Candidate, x: list[float]) -> Any:
@@ -50,3 +52,30 @@ def test_the_priors_are_those_under_which_the_sizes_were_found(tmp_path: Path, x
     found = extended_tables(tables, answer, tmp_path)["model"]["priors"]
     assert found["drive_creep"] == {"distribution": "Normal", "loc": 0.0, "scale": pytest.approx(scale)}
     assert found["drive_creep_time"] == {"distribution": "LogNormal", "median": 1.0, "sigma": 1.2}
+
+
+def test_a_mechanism_of_one_group_has_the_priors_of_its_own_parameters(tmp_path: Path) -> None:
+    """A factor, whose null is one, within its ends; and a time, which has no size that is measured from null."""
+    factor = {"distribution": "TruncatedNormal", "loc": 1.2, "scale": 0.5, "low": 0.5, "high": 3.0}
+    time = {"distribution": "LogNormal", "median": 0.02, "sigma": 0.5}
+    specs = (
+        ParameterSpec("stretch", "-", 0.1, 10.0, 1.0, factor, "a factor"),
+        ParameterSpec("blur", "s", 1e-3, 1.0, 0.01, time, "a time"),
+    )
+    library = [Candidate(spec.name, (k,), REGISTRY["drive_creep"](), spec.name) for k, spec in enumerate(specs)]
+    groups = Groups({"april": ("a",), "june": ("b",)}, compared=False)
+    known = build_space(specs, {spec.name: {} for spec in specs}, {}, ("a", "b"))
+    space, candidates = with_differences(known, 0, (), library, groups, spreads={})
+    nominal = {spec.name: spec.nominal for spec in specs}
+    found = [candidate for candidate in candidates if candidate.group == "april"]
+    answer = answered(found[0], np.zeros(len(space.names)).tolist())
+    answer.extended.free = np.array([0])
+    answer.problem.coordinates = Coordinates(space, 0, tuple(nominal), nominal, {})
+    (priors,) = [sized_priors(answer, each) for each in found if each.title == "stretch"]
+    assert priors["stretch"] == pytest.approx(factor)
+    answer.adopted[:] = [SimpleNamespace(name="blur@april")]
+    answer.problem.groups = groups
+    answer.problem.candidate = lambda name: next(each for each in found if each.name == name)
+    model = extended_tables({"robot": "smooth_arm"}, answer, tmp_path)["model"]
+    assert model["only_in"] == {"blur": ["april"]}
+    assert set(model["priors"]) <= set(nominal)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import REGISTRY
 from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
 DELAY = 0.1
@@ -86,7 +89,13 @@ def test_a_day_that_is_adapted_to_is_without(fit):
     (may,) = recorded({"may_new": 0.0}, 40)
     found = rb.adapt(fit, may, seconds=1.0, draws=30, show=False)
     assert [c.code for c in found.cautions].count(Code.GROUP_WITHOUT) == 1
-    assert not [name for name in found.record.posterior if name.startswith("command_delay")]
+    assert [name for name in found.record.posterior if name.startswith("command_delay")] == ["command_delay@april"]
+    (april,) = recorded({"april_new": DELAY}, 30)
+    back = rb.predict(found, april)
+    assert back.group == "may_new"  # the folder is that day's, unless a group is named
+    back = rb.predict(found, april, group="april")
+    assert off(back, april) < 3.0 * SIGMA
+    assert not [c for c in back.cautions if c.code == Code.GROUP_WITHOUT]
     assert found.content["details"]["checks"]["may_new"]["adapted"]["error_mm"] < 3e3 * SIGMA
     with pytest.raises(rb.InputError, match="belongs to april, which was fitted"):
         rb.adapt(fit, recorded({"april_new": DELAY}, 30)[0], show=False)
@@ -103,6 +112,25 @@ def test_another_recording_of_a_fitted_group_keeps_the_value_of_the_group(runs):
     assert found.content["details"]["moved"] == ["zero@april_new[0:15]"]
     (later,) = recorded({"april_later": DELAY}, 50)
     assert off(rb.predict(found, later), later) < 3.0 * SIGMA
+
+
+@pytest.mark.slow
+def test_the_file_that_an_audit_writes_is_calibrated_with_the_mechanism_in_its_group(runs, tmp_path):
+    """What the audit finds in April alone: written, read back, calibrated, and predicted in April and in June."""
+    base = rb.Model(BOX, noise="white", priors=PRIORS, groups=GROUPS)
+    known = [*runs, *recorded({"june_b": 0.0}, 60)]
+    options = {"exclude": [name for name in REGISTRY if name != "command_delay"], "ports": False, "bootstraps": 199}
+    unseen = recorded({"april_tested": DELAY, "june_tested": 0.0}, 20)
+    rb.audit(base, known, test=unseen, noise={"standard_deviation": SIGMA}, out=tmp_path / "audit", **options)
+    tables = tomllib.loads((tmp_path / "audit" / "extended.toml").read_text())["model"]
+    assert tables["only_in"] == {"command_delay": ["april"]}
+    model = rb.Model(BOX, **tables)
+    fit = rb.calibrate(model, known, rb.Laplace(draws=60, starts=1, screen=16), show=False)
+    names = [info.name for info in fit.record.free if info.name.startswith("command_delay")]
+    assert names == ["command_delay@april"]
+    assert fit.record.flat(names[0]).mean() == pytest.approx(DELAY, abs=0.003)
+    for run in recorded({"april_new": DELAY, "june_new": 0.0}, 30):
+        assert off(rb.predict(fit, run), run) < 3.0 * SIGMA
 
 
 def test_a_fit_without_the_group_is_one_without_the_parameter(runs):

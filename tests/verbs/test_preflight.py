@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
-from rfdropo_bayes.verbs.preflight import _covariance, preflight
+from rfdropo_bayes.verbs.preflight import _covariance, _Noise, innovations, preflight
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -104,6 +104,27 @@ def test_what_is_measured_leaves_no_ridge():
     assert rb.check(model(tension=True), [recording()]).directions == []
     weighed = model(weighed=[{"parameters": ["mass"], "value": 0.5, "sd": 0.005}])
     assert rb.check(weighed, [recording()]).directions == []
+
+
+def test_rows_over_lasting_noise_are_those_of_the_whole_covariance_and_lost_ones_say_nothing():
+    """Against the dense covariance of the rows that were measured; and twenty minutes at 100 Hz take no longer than
+    their rows."""
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.01, 0.05, 60))
+    noise, series = _Noise(1e-3, 2e-3, 0.2, ""), rng.normal(size=(60, 2, 3, 2, 3))
+    valid = np.ones((60, 2), dtype=bool)
+    valid[10:25, 0], valid[0, 1] = False, False
+    white = innovations(series, time, valid, noise)
+    covariance = noise.lasting**2 * np.exp(-np.abs(np.subtract.outer(time, time)) / noise.time)
+    covariance += noise.white**2 * np.eye(60)
+    for marker in range(2):
+        seen = valid[:, marker]
+        own = series[seen, 1, 2, marker, 0]
+        expected = own @ np.linalg.solve(covariance[np.ix_(seen, seen)], own)
+        assert np.sum(white[:, 1, 2, marker, 0] ** 2) == pytest.approx(expected)
+    assert np.all(white[~valid[:, 0], :, :, 0] == 0.0)
+    rows = 120_000
+    assert innovations(np.ones((rows, 1, 3)), 0.01 * np.arange(rows), np.ones((rows, 1), dtype=bool), noise)[-1].all()
 
 
 def test_commands_that_do_not_move_excite_nothing():

@@ -1,0 +1,55 @@
+"""Numbers of a robot's description that no soft robot has: in another unit, such as millimetres for metres.
+
+Bounds are far beyond what is built: they catch factors of a thousand, not bad guesses.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.robots.robot import Robot
+
+ASIDE = 5.0
+"""Lengths of the body that its anchors, half widths and spools stay within. Those of the robots at hand reach 0.08 of
+it; millimetres given as metres are fifty times the length or more."""
+LONGEST, SHORTEST = 20.0, 1e-3  # [m], of a body
+STRONGEST = 100.0  # [m/s2], ten times the Earth's gravity; that in mm/s2 is a hundred times as much
+SLOWEST = 1.0  # [s], of a time step
+DENSITIES = 1.0, 3e4  # [kg/m3]: less than any foam has, and more than any metal
+MODULI = 10.0, 1e13  # [Pa]: softer than any gel, and stiffer than diamond
+
+
+def implausible(robot: Robot) -> str | None:
+    """What cannot be in the unit that the file has it in; None where all may be."""
+    station, half = np.array(robot.body.station_m), np.array(robot.body.half_width_m)
+    length = float(station[-1] - station[0])
+    if not SHORTEST <= length <= LONGEST:
+        return f"the body is {length:.4g} m long: are lengths in metres?"
+    sizes = {"half_width_m of the body": float(half.max())}
+    for cable in robot.cables:
+        sizes[f"anchor_radius_m of the cable {cable.name}"] = cable.anchor_radius_m
+        sizes[f"distance of anchor_z_m of the cable {cable.name} from the body"] = station[0] - cable.anchor_z_m
+    if robot.channels.radius_parameter is not None:
+        sizes[robot.channels.radius_parameter] = robot.parameters[robot.channels.radius_parameter].nominal
+    for name, size in sizes.items():
+        if size > ASIDE * length:
+            return f"the {name} is {size:.4g} m, and the body is {length:.4g} m long: are all lengths in metres?"
+    gravity = float(np.linalg.norm(robot.gravity_m_s2))
+    if gravity > STRONGEST:
+        return f"gravity_m_s2 is {gravity:.4g} m/s2: is it in metres?"
+    if robot.time_step_s > SLOWEST:
+        return f"time_step_s is {robot.time_step_s:.4g} s: is it in seconds?"
+    density = float(robot.density(robot.parameters["trunk_mass"].nominal))
+    if not DENSITIES[0] <= density <= DENSITIES[1]:
+        mass = robot.parameters["trunk_mass"].nominal
+        volume = f"a volume of {robot.body.volume_m3:.4g} m3"
+        return (
+            f"trunk_mass is {mass:.4g} kg in {volume}, or {density:.3g} kg/m3: are they in kilograms and cubic metres?"
+        )
+    modulus = robot.parameters["young_modulus"].nominal
+    if not MODULI[0] <= modulus <= MODULI[1]:
+        return f"young_modulus is {modulus:.4g} Pa: is it in pascals?"
+    return None
