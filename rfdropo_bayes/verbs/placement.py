@@ -76,8 +76,8 @@ class Read(NamedTuple):
         """The line that turns what was read, and then shifts it [m]."""
         if not self.unit:
             return f"a shift by {_millimetres(shift)} mm"
-        origin = (self.origin - (turn @ self.turn).T @ shift) / METRES[self.unit]
-        return f"origin = [{', '.join(f'{value:.4g}' for value in origin)}]"
+        origin = np.round(self.origin - (turn @ self.turn).T @ shift, 3) / METRES[self.unit]  # a bent robot tells no more
+        return f"origin = [{', '.join(f'{value:g}' for value in origin + 0.0)}]"
 
 
 def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | None = None) -> list[str]:
