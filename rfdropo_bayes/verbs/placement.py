@@ -76,7 +76,8 @@ class Read(NamedTuple):
         """The line that turns what was read, and then shifts it [m]."""
         if not self.unit:
             return f"a shift by {_millimetres(shift)} mm"
-        origin = np.round(self.origin - (turn @ self.turn).T @ shift, 3) / METRES[self.unit]  # a bent robot tells no more
+        # A robot that rests bent tells no more than millimetres.
+        origin = np.round(self.origin - (turn @ self.turn).T @ shift, 3) / METRES[self.unit]
         return f"origin = [{', '.join(f'{value:g}' for value in origin + 0.0)}]"
 
 
