@@ -47,6 +47,17 @@ def test_the_keywords_of_arrays_are_shown_and_a_mistyped_one_is_named():
         Trajectory.from_arrays(time=TIME, position=PLACE, command=PULL, markers=["middle", "tip"])
 
 
+def test_a_marker_that_is_seen_alone_may_stand_still():
+    """As in a prediction from a first row in which the other markers were lost."""
+    dataset = arrays().dataset.copy(deep=True)
+    dataset["position_mask"][:] = False
+    dataset["position_mask"][0, 0] = True
+    assert Trajectory(dataset).position_mask.sum() == 1
+    dataset["position"] *= 1e-3
+    with pytest.raises(InputError, match="metres given as millimetres"):
+        Trajectory(dataset)
+
+
 def test_a_recording_shows_itself_in_a_line():
     lost = PLACE.copy()
     lost[3, 1] = np.nan
