@@ -115,9 +115,11 @@ def simulate(
 ) -> None:
     """Simulate the commands of an experiment. Writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
+    from rfdropo_bayes.inference.progress import say_step
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.simulate import simulate_all
 
+    say_step(f"simulating the recordings of {experiment}", show=False if quiet or as_json else None)
     found = simulate_all(Model.read(experiment, overrides), folder, balance=balance, overwrite=overwrite)
     show_simulation(found, quiet=quiet, as_json=as_json)
 
