@@ -223,3 +223,15 @@ def test_the_problem_of_a_document_is_inferred() -> None:
     time, data = scope["Line"].time, scope["Line"].data
     precision = 1.0 + time @ time / 0.1**2  # of a standard normal prior and noise of 0.1
     assert float(draws.mean()) == pytest.approx(float(time @ data / 0.1**2 / precision), abs=5.0 * precision**-0.5)
+
+
+def test_every_page_of_the_site_is_in_its_navigation():
+    """A page outside it has no list of neighbours beside it, and is found by links alone."""
+    listed = set(re.findall(r": (\S+\.md)$", (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE))
+    moved = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+    outside = {"docs/reference/README.md"}  # a list of the pages beside it
+    pages = [*DOCUMENTS, *REPOSITORY.glob("reports/*/details.md"), REPOSITORY / "reports" / "README.md"]
+    paths = {path.relative_to(REPOSITORY).as_posix() for path in pages} - outside
+    rooms = ("docs/", "reports/", "models/")
+    wanted = {moved.get(path, path.removeprefix("docs/")) for path in paths if path in moved or path.startswith(rooms)}
+    assert sorted(wanted - listed) == []

@@ -12,7 +12,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGE = REPOSITORY / "rfdropo_bayes"
 
 # Modules at the bottom, open to every room.
-FOUNDATION = {"cautions", "errors", "files", "groups", "interrupts", "runtime", "tables"}
+FOUNDATION = {"cautions", "errors", "files", "groups", "interrupts", "runtime", "signatures", "tables"}
 
 # In the order of docs/architecture.md, which says why: a room imports from rooms above it, of these from those
 # named here; from the foundation and the standard library, too.

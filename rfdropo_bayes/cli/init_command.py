@@ -142,8 +142,8 @@ def init(
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
     if unit not in UNITS:
         raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}")
-    answers = _body(ask, shape, length, radius, tip_radius)
-    answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness, "cable_radius": cable_radius}
+    answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
+    answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
     answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
     if unit in ("deg", "rad"):
@@ -174,15 +174,24 @@ def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) ->
 
 
 def _body(
-    ask: Questions, shape: str | None, length: float | None, radius: float | None, tip: float | None
+    ask: Questions,
+    shape: str | None,
+    length: float | None,
+    radius: float | None,
+    tip: float | None,
+    cables: float | None,
 ) -> dict[str, Any]:
-    """Shape and size of the body [mm]."""
+    """Shape and size of the body, and how far off its axis the cables begin [mm]."""
+    from rfdropo_bayes.robots.outline import CABLES_AT
+
     form = ask.answer("shape", shape, "Shape: cylinder, cone, tube or disks", "cylinder")
     long = ask.answer("length", length, "Length of the body [mm]", 200.0)
     wide = ask.answer("radius", radius, "Radius at the base [mm]", 12.0)
     if form == "cone":
         tip = ask.answer("tip_radius", tip, "Radius at the tip [mm]", 0.6 * wide)
-    return {"shape": form, "length": long, "radius": wide, "tip_radius": tip}
+    words = "Distance of the cables from the axis at the base [mm]"
+    apart = ask.answer("cable_radius", cables, words, round(CABLES_AT * wide, 3))
+    return {"shape": form, "length": long, "radius": wide, "tip_radius": tip, "cable_radius": apart}
 
 
 def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed: set[str]) -> RobotOutline:

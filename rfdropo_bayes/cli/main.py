@@ -66,7 +66,6 @@ def version(show: Annotated[bool, typer.Option("--version", help="print the vers
     keep_compilations()
 
 
-@app.command()
 def calibrate(
     experiment: ExperimentFile,
     out: OutFolder = None,
@@ -103,7 +102,6 @@ def calibrate(
     show_calibration(found, quiet=quiet, as_json=as_json)
 
 
-@app.command()
 def simulate(
     experiment: ExperimentFile,
     out: OutFolder = None,
@@ -117,29 +115,40 @@ def simulate(
 ) -> None:
     """Simulate the commands of an experiment. Writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
+    from rfdropo_bayes.inference.progress import say_step
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.simulate import simulate_all
 
+    say_step(f"simulating the recordings of {experiment}", show=False if quiet or as_json else None)
     found = simulate_all(Model.read(experiment, overrides), folder, balance=balance, overwrite=overwrite)
     show_simulation(found, quiet=quiet, as_json=as_json)
 
 
-app.command("init")(init_command.init)
-app.command("check")(check_command.check)
-app.command()(report_command.report)
-app.command()(audit_commands.audit)
-app.command()(audit_commands.design)
-app.command()(posterior_commands.export)
-app.command()(picture_commands.view)
-app.command()(prediction_commands.predict)
-app.command()(prediction_commands.adapt)
-app.command()(policy_commands.train)
-app.command()(policy_commands.evaluate)
-app.command()(listing_commands.robots)
-app.command()(listing_commands.mechanisms)
-app.command()(listing_commands.formats)
-app.command()(listing_commands.methods)
+# In the order in which they are used, which --help shows.
+for command in (
+    init_command.init,
+    check_command.check,
+    simulate,
+    picture_commands.view,
+    calibrate,
+    report_command.report,
+    audit_commands.audit,
+    audit_commands.design,
+    prediction_commands.predict,
+    prediction_commands.adapt,
+    posterior_commands.export,
+    policy_commands.train,
+    policy_commands.evaluate,
+):
+    app.command()(command)
 motor_commands.register(app)
+for listing in (
+    listing_commands.robots,
+    listing_commands.mechanisms,
+    listing_commands.formats,
+    listing_commands.methods,
+):
+    app.command()(listing)
 
 benchmark = typer.Typer(help="Comparisons that take hours. Each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(posterior_commands.table1)

@@ -56,9 +56,11 @@ def predict(
     see_calibration(posterior, "--posterior")
     look_through(experiment, overrides or [])
     check_folder(out, "predict", overwrite=overwrite)
+    from rfdropo_bayes.inference.progress import say_step
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.predict import run_prediction
 
+    say_step(f"predicting {commands} with draws of {posterior}", show=False if quiet or as_json else None)
     facts = run_prediction(
         Model.read(experiment, overrides),
         posterior,

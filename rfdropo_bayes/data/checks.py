@@ -102,7 +102,8 @@ def _check_lengths(dataset: xr.Dataset, name: str) -> None:
             where=name,
             remedy="they look like millimetres given as metres: state the unit the file is in",
         )
-    size = extent if dataset.sizes["marker"] > 1 else float(np.abs(position).max())
+    seen = int(dataset["position_mask"].values.any(axis=0).sum())
+    size = extent if seen > 1 else float(np.abs(position).max())  # one marker may stand still
     if size < _SMALLEST_EXTENT:
         raise InputError(
             f"the positions span {extent * 1e3:.3g} mm in all",

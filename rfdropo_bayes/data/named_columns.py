@@ -111,6 +111,11 @@ class CsvColumns(BaseModel):
         description="the base frame's x, y, z in terms of the file's axes, e.g. "
         '["x", "z", "-y"] for a trunk that hangs in a frame with y up',
     )
+    origin: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0),
+        description="where the robot's base is in the file's frame: x, y, z along the file's axes, in position_unit; "
+        "the base is the middle of the body where it leaves the clamp",
+    )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
     )
@@ -182,6 +187,12 @@ def axes_matrix(axes: tuple[str, str, str]) -> Float[np.ndarray, "3 3"]:
         if letter in ("x", "y", "z"):
             matrix[row, "xyz".index(letter)] = sign
     return matrix
+
+
+def axes_words(matrix: Float[np.ndarray, "3 3"]) -> str:
+    """The inverse of `axes_matrix`, as ``axes`` of [data.columns] is written in a file."""
+    names = [f'"{"-" if row.min() < 0.0 else ""}{"xyz"[np.argmax(np.abs(row))]}"' for row in matrix]
+    return f"[{', '.join(names)}]"
 
 
 def read_frame(frame: pd.DataFrame, columns: CsvColumns, name: str, *, mask_missing: bool = False) -> Recorded:
@@ -259,7 +270,7 @@ def _largest(columns: CsvColumns) -> float | None:
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
     """Positions of the markers [m] in the base frame."""
     place = table.points(coordinates(columns), allow_missing=mask_missing)
-    return METRES[columns.position_unit] * place @ axes_matrix(columns.axes).T
+    return METRES[columns.position_unit] * (place - columns.origin) @ axes_matrix(columns.axes).T
 
 
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
@@ -315,9 +326,8 @@ def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[n
 def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] | None:
     if columns.object_pose is None:
         return None
-    pose = table.numbers(columns.object_pose, allow_missing=True) * np.array(
-        [METRES[columns.position_unit]] * 3 + [1.0] * 4
-    )
+    pose = table.numbers(columns.object_pose, allow_missing=True)
+    pose[:, :3] = METRES[columns.position_unit] * (pose[:, :3] - columns.origin)
     rotation, known = axes_matrix(columns.axes), np.isfinite(pose).all(axis=1)
     turned = np.full((len(pose), 4), np.nan)
     turned[known] = (Rotation.from_matrix(rotation) * Rotation.from_quat(pose[known, 3:])).as_quat()

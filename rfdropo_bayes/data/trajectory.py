@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,13 @@ from rfdropo_bayes.data.recorded import (
 )
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
+from rfdropo_bayes.signatures import see_keywords, with_keywords_of
 
 _HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
 _OPTIONAL = ("tension", "tension_mask", "motor_angle", "motor_angle_mask", "object_pose")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """One recording: what was commanded, what was observed, and when.
 
@@ -75,6 +77,7 @@ class Trajectory:
         return cls(assembled(Recorded(origin, sent, measured)))
 
     @classmethod
+    @with_keywords_of(in_memory.from_arrays)
     def from_arrays(cls, *, initial_command: Any = None, **given: Any) -> Trajectory:
         """A recording from arrays in any unit.
 
@@ -82,12 +85,20 @@ class Trajectory:
             initial_command: in force before the first one, in the unit of the others: "first" (that one was already),
                 "zero", or one value per channel; recognised from motor angles or the first rows by default, as in files
                 (`first_command`).
-            given: arrays, their names and units; see `in_memory.from_arrays`.
+            given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
+                marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
+                away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in force
+                until the next; ``markers`` and ``channels``, their names. These five are required. ``command_time``:
+                from when each command is in force, on the clock of ``time``. ``tension`` (time, channel) [N],
+                ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7): centre and unit quaternion x, y, z, w.
+                ``name`` of the recording; ``robot`` that was recorded.
 
         Raises:
-            InputError: an unknown unit, what is not a number, shapes that do not fit, times that do not increase, or
-                lengths that cannot be in the unit that was given.
+            InputError: an unknown or missing keyword, an unknown unit, what is not a number, shapes that do not fit,
+                times that do not increase, or lengths that cannot be in the unit that was given.
         """
+        see_keywords(given, in_memory.from_arrays, "Trajectory.from_arrays")
         recording = cls.build(*in_memory.from_arrays(**given))
         if not (initial_command is None or isinstance(initial_command, str)):
             unit, channels = given.get("command_unit", "m"), len(recording.cable_names)
@@ -133,6 +144,17 @@ class Trajectory:
         if "schema" in dataset.attrs:  # one of ours
             return cls(dataset)
         return cls.from_arrays(name=name, robot=robot, **in_memory.labelled_arrays(dataset, name))
+
+    def __repr__(self) -> str:
+        rows, last = len(self.time), float(self.time[-1])
+        channels = f"{len(self.cable_names)} commands [{self.command_unit}]: {', '.join(self.cable_names)}"
+        left = int((~self.position_mask).sum())
+        out = f"; {left} of {self.position_mask.size} positions left out" if left else ""
+        markers = f"markers {', '.join(self.marker_names)}"
+        return f"<Trajectory {self.name}: {rows} rows over {last:.4g} s; {markers}; {channels}{out}>"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self)[1:-1])}</p>{self.dataset._repr_html_()}"
 
     @property
     def name(self) -> str:

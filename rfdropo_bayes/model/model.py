@@ -237,6 +237,11 @@ class Model:
             return {ROBOT_COPY: describe(self.robot.model_dump(mode="json", exclude_none=True))}
         return {}
 
+    def __repr__(self) -> str:
+        effects = ", ".join(choice.source for choice in self.spec.mechanisms)
+        inferred = ", ".join(self.spec.priors)
+        return f"<Model {self.name}: mechanisms {effects or 'none'}; priors {inferred or 'none'}>"
+
     def _repr_html_(self) -> str:
         rows = self.parameters
         inferred = rows[[prior is not None for prior in rows["prior"]]]

@@ -15,7 +15,7 @@ from rfdropo_bayes.files import output_folder, whole, write_json
 COMMANDS, DESIGN = "next_commands.csv", "design.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Design:
     """The commands to record next, and what they will decide.
 
@@ -39,6 +39,9 @@ class Design:
             self.commands.to_csv(partial, index=False, float_format="%.6f")
         write_json(folder / DESIGN, {**self.content, "commands": str(folder / COMMANDS)})
         return folder / COMMANDS
+
+    def __repr__(self) -> str:
+        return f"{self.sentence}\n{self.commands.head().to_string()}"
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(self.sentence)}</p>{self.commands.head().to_html()}"

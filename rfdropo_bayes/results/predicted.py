@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
 OBJECT = "object"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prediction:
     """What a calibrated simulator expects of commands that were never run.
 
@@ -73,8 +74,15 @@ class Prediction:
             self.frame.to_csv(partial, index=False, float_format="%.6f")
         return files
 
+    def __repr__(self) -> str:
+        time = self.bands["time"].values
+        markers = ", ".join(str(name) for name in self.bands["marker"].values)
+        lines = [f"{len(time)} rows over {time[-1] - time[0]:.4g} s of markers {markers}; .bands, .frame [m], .plot()"]
+        return "\n".join([*lines, *(caution.sentence for caution in self.cautions)])
+
     def _repr_html_(self) -> str:
-        return self.bands._repr_html_()
+        said = "".join(f"<p>{escape(line)}</p>" for line in repr(self).splitlines())
+        return said + self.bands._repr_html_()
 
 
 def _columns(table: xr.Dataset) -> pd.DataFrame:

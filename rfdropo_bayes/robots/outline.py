@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,8 @@ SILICONE = 1070.0
 GRAVITY = 9.81
 DIRECTIONS = {f"{sign}{axis}": (sign, "xyz".index(axis)) for sign in "+-" for axis in "xyz"}
 SHAPES = ("cylinder", "cone", "tube", "disks")
+CABLES_AT = 0.75
+"""Distance of cables from the axis over the body's radius, where it is not given."""
 LEAST_LAYERS, LAYERS_PER_SEGMENT = 8, 4
 KNOWN, ASSUMED = 0.3, 1.0
 """Standard deviation of the logarithm in the prior of what was given, and of what was taken as a default."""
@@ -63,10 +65,13 @@ class RobotOutline:
     assumed: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        where = "init"
+        where = "robot outline"
         if self.gravity not in DIRECTIONS:
             remedy = f"one of {', '.join(DIRECTIONS)}: where things fall, z being away from the clamp"
             raise InputError(f"gravity = {self.gravity!r} is no direction", where=where, remedy=remedy)
+        if self.command_unit not in ("m", "rad"):
+            remedy = '"m" of cable or "rad" of a motor; recordings in mm or deg are converted when they are read'
+            raise InputError(f"command_unit = {self.command_unit!r} is no unit of a robot", where=where, remedy=remedy)
         if self.shape not in SHAPES:
             raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"one of {', '.join(SHAPES)}")
         for key in ("length", "radius", "young_modulus", "spool_radius"):
@@ -118,6 +123,11 @@ class RobotOutline:
         if self.segments == 1:
             return [f"{word}_{k + 1}" for k in range(count)]
         return [f"s{s + 1}_{word}_{k + 1}" for s in range(self.segments) for k in range(count)]
+
+
+def not_given(answers: Collection[str]) -> frozenset[str]:
+    """Names of the answers of a `RobotOutline` that are taken as defaults."""
+    return frozenset(field.name for field in fields(RobotOutline) if field.name not in answers) - {"assumed"}
 
 
 def robot_text(outline: RobotOutline) -> str:
@@ -184,9 +194,12 @@ def _channels(o: RobotOutline) -> list[str]:
 def _cables(o: RobotOutline) -> list[str]:
     heights = o.guide_heights()
     tip = o.radius if o.tip_radius is None or o.shape in ("cylinder", "disks") else o.tip_radius
-    at_base = 0.75 * o.radius if o.cable_radius is None else o.cable_radius
+    at_base = CABLES_AT * o.radius if o.cable_radius is None else o.cable_radius
     radius = at_base * (1.0 + (tip / o.radius - 1.0) * heights / o.length)
-    lines = ["# Cables at their azimuth, from +x towards +y, through guides up to where they end." + _mark(o, "cables")]
+    lines = [
+        "# Cables at their azimuth, from +x towards +y, through guides up to where they end."
+        + _mark(o, "cables", "cable_radius")
+    ]
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
         azimuth = 360.0 / o.cables * (cable + segment / o.segments)

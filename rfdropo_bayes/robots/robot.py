@@ -17,10 +17,11 @@ from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
-from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables
+from rfdropo_bayes.robots.outline import RobotOutline, not_given, outlined_tables
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.plausibility import implausible
 from rfdropo_bayes.robots.table import Name, Positive, RobotTable, Vector
+from rfdropo_bayes.signatures import see_keywords, with_keywords_of
 from rfdropo_bayes.tables import changed, nearest, parse_table
 
 REQUIRED = (
@@ -184,13 +185,34 @@ class Robot(RobotTable):
         return parse_table(cls, robot_tables(path), where=str(path))
 
     @classmethod
+    @with_keywords_of(RobotOutline, without=("assumed",))
     def outline(cls, **answers: Any) -> Robot:
-        """A robot from a few answers, such as its length, radius, cables and markers; see `RobotOutline`.
+        """A robot from a few answers, in SI units and in the frame of the base: z along the body, away from the clamp.
+
+        Defaults are assumptions: mass and spool radius have wide priors unless they are given, and so has Young's
+        modulus in any case. ``rfdropo init`` asks the same, and writes the robot as a file to go on from.
+
+        Args:
+            answers: ``name``; ``length`` and ``radius`` (at the base) of the body; ``markers``, heights along the axis
+                by name. These four are required. ``shape``: "cylinder", "cone" (with ``tip_radius``), "tube" (with
+                ``inner_radius``), or "disks" on a backbone of ``inner_radius`` (``disks`` of ``disk_thickness``).
+                ``segments``, each with its own ``cables`` evenly around it, at ``cable_radius`` from the axis at the
+                base; with ``pairs`` opposite cables share a motor. ``command_unit``: "m" of cable or "rad" of a motor
+                with ``spool_radius``. ``gravity``: where things fall, "+z" for a robot that hangs. ``mass`` [kg], that
+                of silicone by default; ``young_modulus`` [Pa].
 
         Raises:
-            InputError: answers that make no robot.
+            InputError: an unknown answer, one that is missing, or answers that make no robot.
         """
-        return parse_table(cls, outlined_tables(RobotOutline(**answers)), where="outline")
+        see_keywords(answers, RobotOutline, "outline", without=("assumed",))
+        outlined = RobotOutline(**answers, assumed=not_given(answers))
+        return parse_table(cls, outlined_tables(outlined), where="outline")
+
+    def __repr__(self) -> str:
+        long = 1e3 * (self.body.station_m[-1] - self.body.station_m[0])
+        commands = f"{len(self.channel_names)} commands [{self.command_unit}] ({', '.join(self.channel_names)})"
+        markers = f"markers {', '.join(marker.name for marker in self.markers)}"
+        return f"<Robot {self.name}: {long:.4g} mm long, {len(self.cables)} cables, {commands}, {markers}>"
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""

@@ -24,8 +24,8 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import DataSpec, RecordingEntry, Trajectory, load_recordings, one_at_a_time
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.groups import gather_groups, group_of, in_group
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.groups import gather_groups, group_of, in_group, whole
+from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.assembly import pooling
 from rfdropo_bayes.model.experiment import NoiseTable
@@ -102,6 +102,7 @@ def adapt(
     day = group_of(recording.name, model.spec.groups) if group is None else group
     left = model_error_of(fit.record)
     moved = _adapted(model, left, recording, group)
+    say_step(f"adapting to {day}: {len(head.time)} rows of {recording.name}", show=show)
     space = day_space(fitted_parts(fit)[1], moved, [head.name], day, fit.record.attrs[FITTED])
     own = _own_of_day(fit.record, space, recording.name, day)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
@@ -113,6 +114,7 @@ def adapt(
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
         found = run(folder, (folder / CONFIG).read_text(encoding="utf-8"))
+        say_step("the day is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
         found.save(folder)
     return found
 
@@ -144,6 +146,8 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     """Fit the day and predict its recording; ``text`` is the experiment as TOML."""
     began, key = time.monotonic(), jax.random.key(seed)
     before_key, fit_key = jax.random.split(key)
+    if asked.tested:
+        say_step(f"predicting from first rows alone, to compare: {_named(asked.tested)}", show=show)
     before = _from_first_rows(asked, draws, before_key)
     adapted = _fitted(asked, draws, fit_key, show)
     checks = _checks(before, adapted.predictions)
@@ -152,6 +156,7 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     check = checks.get(asked.rest)
     if check and check["adapted"]["error_mm"] > check["from_first_row"]["error_mm"]:
         cautions.append(_kept_caution(check))
+        say_step("the rest of the recording is predicted worse: fitting the day to the first row alone", show=show)
         adapted = _fitted(asked._replace(head=_first_row(asked.head)), draws, fit_key, show)
         checks = _checks(before, adapted.predictions)
     found = adapted.found
@@ -227,6 +232,7 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
         )
     noise = replace(noise, scale=found.excess * noise.scale)
     problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
+    say_step(f"the day is fitted: predicting {_named([head, *asked.tested])}", show=show)
     predictions = predict_fitted(problem, found.values, fitted_key)
     cautions = _cautions(found)
     slow = _error_beyond(fit.record, predictions[0])
@@ -238,6 +244,11 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
         new = predict_new(problem.model, asked.tested, found.values, rest_key, **known)
         predictions, cautions = predictions + new.recordings, cautions + match_cautions(new)
     return Adapted(found, body, problem, predictions, cautions, float(np.sum(evaluations)), slow)
+
+
+def _named(recordings: Sequence[Trajectory]) -> str:
+    """Their names, each once: a recording that was parted has one name."""
+    return ", ".join(dict.fromkeys(whole(recording.name) for recording in recordings))
 
 
 def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayError | None:

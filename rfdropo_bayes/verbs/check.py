@@ -23,6 +23,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json
 from rfdropo_bayes.groups import unmatched
 from rfdropo_bayes.inference.methods import make_config
+from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
 from rfdropo_bayes.model.experiment import AuditTable, Experiment, load_experiment
@@ -34,6 +35,7 @@ from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
+from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
 from rfdropo_bayes.verbs.preflight import Preflight, preflight
@@ -119,8 +121,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     _say_model(found, experiment, folder, recordings["fit"])
     if ahead and recordings["fit"] and not found.problems:
         if isinstance(robot, Robot):
-            spec = spec_of(experiment, folder)
-            found.lines += _try(found, partial(numerical_error_lines, spec, recordings["fit"][0])) or []
+            _say_motion(found, experiment, folder, recordings["fit"])
         _say_ahead(found, experiment, folder, recordings["fit"])
     if any(recordings.values()):
         out = output_folder(out)
@@ -136,8 +137,20 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     return found
 
 
+def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
+    """What the nominal model shows: errors of time step and mesh, and motions in another direction."""
+    say_step(f"simulating {runs[0].name} with a finer time step and a finer mesh")
+    spec = spec_of(experiment, folder)
+    found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
+    columns = None if experiment.data is None else experiment.data.columns
+    direction = _try(found, partial(measure_direction, spec, runs))
+    doubt = None if direction is None else direction_doubt(direction, None if columns is None else columns.axes)
+    found.doubts += [] if doubt is None else [doubt]
+
+
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
     """What a fit could determine; a model that cannot be simulated is no problem of its description."""
+    say_step("simulating draws of the prior, to say what a fit could determine")
     try:
         found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
     except InputError as error:
@@ -240,7 +253,7 @@ def _say_placement(found: Check, experiment: Experiment, robot: Robot, trajector
     columns = None if experiment.data is None else experiment.data.columns
     shared: dict[str, list[str]] = {}
     for trajectory in trajectories:
-        for hint in placement_hints(robot, trajectory, *([columns.axes] if columns else [])):
+        for hint in placement_hints(robot, trajectory, columns):
             shared.setdefault(hint, []).append(trajectory.name)
     found.doubts += [f"{_names(names)}: {hint}" for hint, names in shared.items()]
 

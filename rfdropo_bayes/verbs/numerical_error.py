@@ -41,22 +41,34 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
     """
     simulator = build_robot_simulator(spec)
     layered = simulator.engine.layered
-    longest = LONGEST if layered else LONGEST_MESH
+    longest = longest_of(layered)
     fine = spec.simulator.model_copy(update={"time_step": simulator.time_step / FINER})
-    here, finer = _markers(spec, recording, longest), _markers(replace(spec, simulator=fine), recording, longest)
+    here, finer = (
+        nominal_markers(spec, recording, longest),
+        nominal_markers(replace(spec, simulator=fine), recording, longest),
+    )
     mesh = None
     if layered:
         more = spec.simulator.model_copy(update={"refine": MORE_LAYERS * spec.simulator.refine})
-        mesh = _distance(here, _markers(replace(spec, simulator=more), recording, longest))
+        mesh = _distance(here, nominal_markers(replace(spec, simulator=more), recording, longest))
     return NumericalError(min(longest, float(recording.time[-1])), _distance(here, finer), mesh)
+
+
+def longest_of(layered: bool) -> float:
+    """Seconds that are simulated of a recording: fewer of a mesh of tetrahedra."""
+    return LONGEST if layered else LONGEST_MESH
 
 
 def _distance(one: Float[np.ndarray, "time marker 3"], other: Float[np.ndarray, "time marker 3"]) -> float:
     return float(1e3 * np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))))
 
 
-def _markers(spec: ModelSpec, recording: Trajectory, longest: float) -> Float[np.ndarray, "time marker 3"]:
-    """Markers that the recording has, at its times up to ``longest`` [s]."""
+def nominal_markers(spec: ModelSpec, recording: Trajectory, longest: float) -> Float[np.ndarray, "time marker 3"]:
+    """Markers of the nominal model that the recording has [m], at its times up to ``longest`` [s].
+
+    Raises:
+        InputError: a black box, commands that do not fit, or a rollout that did not end well.
+    """
     simulator = build_robot_simulator(spec)
     commands, values = commands_of(simulator, recording), physical_values(spec, simulator)
     rows = int(np.sum(recording.time <= longest))

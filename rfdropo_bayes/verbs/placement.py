@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import pdist, squareform
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.named_columns import axes_matrix
+from rfdropo_bayes.data.named_columns import METRES, CsvColumns, axes_matrix, axes_words
 from rfdropo_bayes.robots import Robot
 
 FAR = 0.4
@@ -51,7 +51,37 @@ def far_from_rest(robot: Robot, trajectory: Trajectory) -> dict[str, float] | No
     return dict(zip(start.names, distance.tolist(), strict=True))
 
 
-def placement_hints(robot: Robot, trajectory: Trajectory, axes: tuple[str, str, str] = ("x", "y", "z")) -> list[str]:
+class Read(NamedTuple):
+    """How a file's positions were brought into the frame of the base: turned, after the origin was taken off.
+
+    Attributes:
+        turn: from the file's frame to that of the base.
+        origin: of the base in the file's frame [m].
+        unit: in which the file has positions, and ``origin`` of [data.columns]; "" for formats without that table.
+    """
+
+    turn: Float[np.ndarray, "3 3"]
+    origin: Float[np.ndarray, "3"]
+    unit: str
+
+    @classmethod
+    def by(cls, columns: CsvColumns | None) -> Read:
+        """What [data.columns] says."""
+        if columns is None:
+            return cls(np.eye(3), np.zeros(3), "")
+        origin = METRES[columns.position_unit] * np.array(columns.origin)
+        return cls(axes_matrix(columns.axes), origin, columns.position_unit)
+
+    def shifted(self, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> str:
+        """The line that turns what was read, and then shifts it [m]."""
+        if not self.unit:
+            return f"a shift by {_millimetres(shift)} mm"
+        # A robot that rests bent tells no more than millimetres.
+        origin = np.round(self.origin - (turn @ self.turn).T @ shift, 3) / METRES[self.unit]
+        return f"origin = [{', '.join(f'{value:g}' for value in origin + 0.0)}]"
+
+
+def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | None = None) -> list[str]:
     """What may be wrong with axes, origin, units or the order of markers, in words; nothing where all looks well.
 
     A soft robot hangs or rests bent, so only a first row far from the undeformed robot is looked at, and a cause is
@@ -59,8 +89,8 @@ def placement_hints(robot: Robot, trajectory: Trajectory, axes: tuple[str, str, 
 
     Args:
         robot: with the undeformed markers.
-        trajectory: the recording, in the frame that ``axes`` made of its file's.
-        axes: under which it was read, as [data.columns] has them. A hint says what to write in their place.
+        trajectory: the recording, in the frame that ``axes`` and ``origin`` made of its file's.
+        columns: the table by which it was read. A hint says what to write in its place.
     """
     start = start_of(robot, trajectory)
     length = robot.body.station_m[-1] - robot.body.station_m[0]
@@ -69,34 +99,40 @@ def placement_hints(robot: Robot, trajectory: Trajectory, axes: tuple[str, str, 
     hints = _stretched(start)
     if _rms(start.first - start.rest) <= FAR * length:
         return hints
-    found = _cause(start, length, axes_matrix(axes))
+    found = _cause(start, length, Read.by(columns))
     head = f"the first row is {float(f'{1e3 * _rms(start.first - start.rest):.2g}'):g} mm off the undeformed robot"
-    return [*hints, f"{head}; {found or 'look at axes, units, the order of markers and their point_m'}"]
+    if found is None and len(start.names) == 1 < len(trajectory.marker_names):
+        found = f"{start.names[0]} alone is seen in it, too few markers to name a cause"
+    return [*hints, f"{head}; {found or 'look at axes, origin, units, the order of markers and their point_m'}"]
 
 
-def _cause(start: Start, length: float, read: Float[np.ndarray, "3 3"]) -> str | None:
+def _cause(start: Start, length: float, read: Read) -> str | None:
     """The simplest of a shift, an order of markers, axes, or axes and a shift, that brings the first row near."""
     names, rest, first = start
     shift = np.mean(rest - first, axis=0)
     if _rms(first + shift - rest) <= NEAR * length and len(names) > 1:
-        remedy = "move the origin to the robot's base, or give offset_x, offset_y and offset_z priors as wide"
-        return f"a shift by {_millimetres(shift)} mm would bring it there: {remedy}"
+        line = read.shifted(np.eye(3), shift)
+        if not read.unit:
+            return f"{line} would bring it there: give offset_x, offset_y and offset_z priors as wide"
+        return f"{line} in [data.columns] would bring it there: the robot's base in the file's frame, in {read.unit}"
     cost = np.linalg.norm(first[:, None] - rest[None], axis=2)
     order = linear_sum_assignment(cost**2)[1]
     if _rms(first - rest[order]) <= NEAR * length:
         meant = ", ".join(names[index] for index in order)
         return f"another order of the markers would bring it there: {', '.join(names)} look like {meant}"
     straight = bool(np.all(2.0 * np.linalg.norm(rest[:, :2], axis=1) <= NEAR * length))  # half a turn moves them little
-    twist = ". Markers along the body do not show its turn about z: compare a motion with its command"
+    twist = (
+        ". Markers along the body do not show its turn about z; check compares motions with commands once they are near"
+    )
     twist = twist if straight else ""
     for turn in _turns():
         if _rms(first @ turn.T - rest) <= NEAR * length:
-            return f"axes = {_words(turn @ read)} in [data.columns] would bring it there{twist}"
+            return f"axes = {axes_words(turn @ read.turn)} in [data.columns] would bring it there{twist}"
     for turn in _turns():
         shift = np.mean(rest - first @ turn.T, axis=0)
         if len(names) > 1 and _rms(first @ turn.T + shift - rest) <= NEAR * length:
             return (
-                f"axes = {_words(turn @ read)} in [data.columns], and a shift by {_millimetres(shift)} mm, would bring "
+                f"axes = {axes_words(turn @ read.turn)} and {read.shifted(turn, shift)} in [data.columns] would bring "
                 f"it there{twist}"
             )
     return None
@@ -126,12 +162,6 @@ def _turns() -> list[Float[np.ndarray, "3 3"]]:
         if np.linalg.det(matrix) > 0 and not np.allclose(matrix, np.eye(3)):
             turns.append(matrix)
     return turns
-
-
-def _words(turn: Float[np.ndarray, "3 3"]) -> str:
-    """A turn as ``axes`` of [data.columns] has it."""
-    names = [f'"{"-" if row.min() < 0.0 else ""}{"xyz"[np.argmax(np.abs(row))]}"' for row in turn]
-    return f"[{', '.join(names)}]"
 
 
 def _rms(vectors: Float[np.ndarray, "marker 3"]) -> float:

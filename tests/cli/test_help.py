@@ -28,6 +28,14 @@ def test_the_list_of_commands_has_a_whole_sentence_of_each(name):
     assert not COMMANDS[name].get_short_help_str(60).endswith("...")
 
 
+def test_the_list_of_commands_begins_with_the_way_from_a_recording_to_a_prediction():
+    """A newcomer reads the list from the top: init and check before calibrate, audit and predict."""
+    names = list(typer.main.get_command(app).commands)
+    steps = [names.index(name) for name in ("init", "check", "calibrate", "audit", "predict", "train", "deploy")]
+    assert steps == sorted(steps)
+    assert names[0] == "init"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_described_and_none_shows_a_type_of_python(name):
     node = COMMANDS[name]

@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+from typer.testing import CliRunner
+
+from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.cli.terminal_summary import show_audit, show_calibration
 from rfdropo_bayes.inference.progress import Progress
 
@@ -44,3 +47,18 @@ def test_a_bar_shows_its_title_as_it_is(capsys):
     with Progress("[red] fit", show=True) as progress:
         progress.stage(0.5)
     assert "[red] fit" in capsys.readouterr().err
+
+
+def test_a_prediction_says_what_it_does_before_it_has_done_it(tmp_path, monkeypatch):
+    """Unless it is to be quiet; what it says is no part of the result."""
+    (tmp_path / "posterior.nc").touch()
+    monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.see_calibration", lambda *_: None)
+    monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.look_through", lambda *_: None)
+    monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.show_prediction", lambda *_, **__: None)
+    monkeypatch.setattr("rfdropo_bayes.model.model.Model.read", lambda *_: None)
+    monkeypatch.setattr("rfdropo_bayes.verbs.predict.run_prediction", lambda *_, **__: {})
+    asked = ["predict", str(tmp_path), "--commands", "next.csv", "--out", str(tmp_path / "out")]
+    spoken = CliRunner().invoke(app, asked)
+    assert spoken.stderr == f"predicting next.csv with draws of {tmp_path}\n"
+    assert spoken.stdout == ""
+    assert CliRunner().invoke(app, [*asked, "--quiet"]).stderr == ""

@@ -173,6 +173,14 @@ def test_plain_csv_converts_through_its_mapping(plain):
     assert recording.cable_names == ("motor",)
 
 
+def test_the_origin_of_the_base_is_taken_off_in_the_frame_and_unit_of_the_file(plain):
+    """The base is 100, 20 and -30 mm along the file's axes, which the base frame calls x, -z and y."""
+    read = read_plain_csv(plain, CsvColumns.model_validate(MAPPING))
+    moved = read_plain_csv(plain, CsvColumns.model_validate(MAPPING | {"origin": [100.0, 20.0, -30.0]}))
+    shift = np.broadcast_to([0.1, -0.03, -0.02], read.position.shape)
+    np.testing.assert_allclose(read.position - moved.position, shift, atol=1e-12)
+
+
 def test_plain_csv_takes_commands_from_a_file_of_their_own(plain, tmp_path):
     (tmp_path / "commands.csv").write_text("motor\n" + "\n".join(["7"] * 39))
     recording = read_plain_csv(plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
@@ -199,6 +207,9 @@ def test_plain_csv_turns_the_object_with_the_frame(tmp_path):
     )
     pose = read_plain_csv(tmp_path / "object.csv", columns).object_pose
     np.testing.assert_allclose(pose[0, :3], [0.0, 0.0, -0.5e-3], atol=1e-12)
+    moved = CsvColumns.model_validate(columns.model_dump() | {"origin": [10.0, 0.0, 0.0]})
+    shifted = read_plain_csv(tmp_path / "object.csv", moved).object_pose
+    np.testing.assert_allclose(shifted, pose - [0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
     # a cube turned by 90 degrees about the file's y: its x axis points to -z there, which is -y in the base frame
     x, y, z, w = pose[0, 3:]
     first_axis = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -30,6 +32,40 @@ def test_units_are_converted_and_names_kept():
     turned = arrays(command=np.degrees(PULL), command_unit="deg")
     assert turned.command_unit == "rad"
     np.testing.assert_allclose(turned.command, PULL)
+
+
+def test_the_keywords_of_arrays_are_shown_and_a_mistyped_one_is_named():
+    """What help and tab completion show is what may be given."""
+    shown = inspect.signature(Trajectory.from_arrays).parameters
+    assert {"time", "position", "command", "markers", "channels", "command_unit", "initial_command"} <= set(shown)
+    assert "given" not in shown
+    documented = Trajectory.from_arrays.__doc__ or ""
+    assert [name for name in shown if f"``{name}``" not in documented] == ["initial_command"]
+    with pytest.raises(InputError, match=r"from_arrays: unknown keyword 'positions'; did you mean 'position'\?"):
+        arrays(positions=PLACE)
+    with pytest.raises(InputError, match="not given: channels"):
+        Trajectory.from_arrays(time=TIME, position=PLACE, command=PULL, markers=["middle", "tip"])
+
+
+def test_a_marker_that_is_seen_alone_may_stand_still():
+    """As in a prediction from a first row in which the other markers were lost."""
+    dataset = arrays().dataset.copy(deep=True)
+    dataset["position_mask"][:] = False
+    dataset["position_mask"][0, 0] = True
+    assert Trajectory(dataset).position_mask.sum() == 1
+    dataset["position"] *= 1e-3
+    with pytest.raises(InputError, match="metres given as millimetres"):
+        Trajectory(dataset)
+
+
+def test_a_recording_shows_itself_in_a_line():
+    lost = PLACE.copy()
+    lost[3, 1] = np.nan
+    run = arrays(position=lost, name="a<b")
+    line = "Trajectory a<b: 20 rows over 1.9 s; markers middle, tip; 2 commands [m]: left, right; 1 of 40 positions"
+    assert repr([run]) == f"[<{line} left out>]"
+    assert run._repr_html_().startswith("<p>Trajectory a&lt;b: 20 rows")
+    assert "left out" not in repr(arrays())
 
 
 def test_a_table_and_a_data_set_give_the_same():

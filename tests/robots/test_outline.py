@@ -2,14 +2,43 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.outline import SILICONE, RobotOutline, robot_text
+from rfdropo_bayes.robots.outline import ASSUMED, KNOWN, SILICONE, RobotOutline, robot_text
 
 ARM = {"name": "arm", "length": 0.3, "radius": 0.015, "markers": {"low": 0.15, "tip": 0.3}}
+
+
+def test_the_answers_are_shown_and_a_mistyped_one_is_named():
+    """Help and tab completion of `Robot.outline` show every answer, and the text explains each."""
+    shown = set(inspect.signature(Robot.outline).parameters)
+    assert shown == set(inspect.signature(RobotOutline).parameters) - {"assumed"}
+    assert [name for name in shown if f"``{name}``" not in (Robot.outline.__doc__ or "")] == []
+    with pytest.raises(InputError, match="outline: not given: markers"):
+        Robot.outline(name="arm", length=0.3, radius=0.015)
+    with pytest.raises(InputError, match="unknown keyword 'length_mm'; did you mean 'length'"):
+        Robot.outline(**ARM, length_mm=300.0)
+    with pytest.raises(InputError, match="command_unit = 'deg' is no unit of a robot"):
+        Robot.outline(**ARM, command_unit="deg")
+
+
+def test_what_is_not_given_has_a_wide_prior():
+    """A robot made in Python is no surer of its defaults than one that ``rfdropo init`` writes."""
+    assumed, given = Robot.outline(**ARM), Robot.outline(**ARM, mass=0.1)
+    assert assumed.parameters["trunk_mass"].prior["sigma"] == ASSUMED
+    assert given.parameters["trunk_mass"].prior["sigma"] == KNOWN
+
+
+def test_a_robot_shows_itself_in_a_line():
+    robot = Robot.outline(**ARM, cables=3, command_unit="rad")
+    assert repr(robot) == (
+        "<Robot arm: 300 mm long, 3 cables, 3 commands [rad] (motor_1, motor_2, motor_3), markers low, tip>"
+    )
 
 
 def written(tmp_path, **answers):

@@ -247,14 +247,22 @@ def test_a_first_row_that_nothing_explains_has_a_caution(known, zeros):
     assert times == pytest.approx(25.0 / np.sqrt(3.0), rel=0.1)  # a row's noise is 4 % of it
 
 
-def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros):
+def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros, capsys):
     """A bump of 10 mm that is over after the seconds that are shown moves the zero; the first row knows nothing of
     it."""
     run = recorded(["b"], zeros[1:2], 51)[0]
     bump = 0.01 * np.sin(np.pi * np.minimum(run.time / 0.5, 1.0))
     along = xr.DataArray(bump, dims="time") * xr.DataArray([1.0, 0.0, 0.0], dims="axis")
     off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + along))
-    found = rb.adapt(known, off, seconds=0.5, show=False)
+    found = rb.adapt(known, off, seconds=0.5, group="today", show=None)
+    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("adapt: ")]
+    assert said == [
+        "adapting to today: 26 rows of b",
+        "predicting from first rows alone, to compare: b",
+        "the day is fitted: predicting b",
+        "the rest of the recording is predicted worse: fitting the day to the first row alone",
+        "the day is fitted: predicting b",
+    ]
     check = found.content["details"]["checks"]["b"]
     assert check["adapted"]["error_mm"] < check["from_first_row"]["error_mm"] + 1e3 * SIGMA
     assert [c for c in found.cautions if "makes the rest of the recording worse" in c.sentence]

@@ -11,12 +11,13 @@ from PIL import Image
 
 from rfdropo_bayes.cli.check_command import ending
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.named_columns import axes_matrix
+from rfdropo_bayes.data.named_columns import METRES, CsvColumns, axes_matrix
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.check import Check, run_check
+from rfdropo_bayes.verbs.motion_direction import Direction, direction_doubt, measure_direction
 from rfdropo_bayes.verbs.numerical_error import NumericalError, measure_numerical_error, numerical_error_lines
 from rfdropo_bayes.verbs.placement import placement_hints
 
@@ -125,7 +126,84 @@ def test_a_recording_in_place_needs_no_hint():
 def test_a_moved_origin_is_named():
     (hint,), _ = moved(lambda position: position + np.array([0.3, 0.0, -0.2]))
     assert "a shift by (-2" in hint or "a shift by (-3" in hint
-    assert "origin" in hint
+    assert "give offset_x, offset_y and offset_z priors as wide" in hint
+
+
+MILLIMETRES = {"sample_time": 0.05, "commands": ["c"], "command_unit": "m", "positions": [["x", "y", "z"]]}
+
+
+@pytest.mark.parametrize(("unit", "axes"), [("mm", ("x", "y", "z")), ("cm", ("z", "x", "y"))])
+def test_the_line_that_moves_the_origin_leaves_nothing_to_correct(unit, axes):
+    """Read with one origin, the hint's takes its place, whatever turn the axes make."""
+    demo, robot = Trajectory.load(DEMO), Robot.load("smooth_arm")
+    columns = CsvColumns(**MILLIMETRES, position_unit=unit, axes=axes, origin=(7.0, 0.0, 0.0))
+    base = np.array([0.3, -0.1, 0.4])
+    in_file = demo.position @ axes_matrix(axes) + base
+
+    def read(table: CsvColumns) -> list[str]:
+        dataset = demo.dataset.copy(deep=True)
+        shifted = in_file - METRES[unit] * np.array(table.origin)
+        dataset["position"] = dataset["position"].copy(data=shifted @ axes_matrix(table.axes).T)
+        return placement_hints(robot, Trajectory(dataset), table)
+
+    (hint,) = read(columns)
+    found = [float(value) for value in hint.split("origin = [")[1].split("]")[0].split(",")]
+    assert METRES[unit] * np.array(found) == pytest.approx(base, abs=0.02)
+    assert read(columns.model_copy(update={"origin": tuple(found)})) == []
+
+
+def test_a_first_row_with_one_marker_says_so():
+    def change(position):
+        return position + 0.3
+
+    demo = Trajectory.load(DEMO)
+    dataset = demo.dataset.copy(deep=True)
+    dataset["position"] = dataset["position"].copy(data=change(demo.position))
+    mask = demo.position_mask.copy()
+    mask[0, 1:] = False
+    dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
+    (hint,) = placement_hints(Robot.load("smooth_arm"), Trajectory(dataset))
+    assert "m1 alone is seen in it" in hint
+
+
+def turned(matrix: np.ndarray) -> tuple[Direction, Trajectory]:
+    """The direction of a recording of the demo whose positions were turned or mirrored."""
+    demo = Trajectory.load(DEMO)
+    dataset = demo.dataset.copy(deep=True)
+    dataset["position"] = dataset["position"].copy(data=demo.position @ matrix.T)
+    return measure_direction(demo_spec("sdirk2"), [Trajectory(dataset)]), demo
+
+
+def test_a_recording_in_its_frame_moves_as_commanded():
+    found, _ = turned(np.eye(3))
+    assert abs(np.degrees(found.turn)) < 6.0
+    assert found.agreement > 0.9
+    assert direction_doubt(found, ("x", "y", "z")) is None
+
+
+@pytest.mark.parametrize("axes", [("y", "-x", "z"), ("-x", "-y", "z")])
+def test_a_frame_turned_about_the_body_is_named_with_the_axes_that_mend_it(axes):
+    """The file has the base's motion in a frame of its own; the named axes read it right."""
+    found, _ = turned(axes_matrix(axes))
+    doubt = direction_doubt(found, ("x", "y", "z"))
+    assert doubt is not None
+    named = tuple(word.strip(' "') for word in doubt.split("axes = [")[1].split("]")[0].split(","))
+    assert axes_matrix(named) @ axes_matrix(axes) == pytest.approx(np.eye(3))
+    assert ("commands of the other sign" in doubt) == (axes[0] == "-x")
+
+
+def test_a_turn_between_quarters_names_the_cables_and_a_mirror_is_told_apart():
+    angle = np.radians(60.0)
+    c, s = np.cos(angle), np.sin(angle)
+    found, _ = turned(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+    doubt = direction_doubt(found, ("x", "y", "z"))
+    assert doubt is not None
+    assert "axes =" not in doubt
+    assert abs(float(doubt.split("add ")[1].split()[0]) - 60.0) < 6.0
+    mirror, _ = turned(np.diag([-1.0, 1.0, 1.0]))
+    doubt = direction_doubt(mirror, None)
+    assert doubt is not None
+    assert "as in a mirror" in doubt
 
 
 @pytest.mark.parametrize("axes", [(2, 0, 1), (1, 2, 0)])
@@ -142,12 +220,13 @@ def test_axes_are_named_as_the_file_needs_them():
     dataset = demo.dataset.copy(deep=True)
     file = demo.position @ axes_matrix(("x", "z", "-y"))  # what reads right with these axes
     dataset["position"] = dataset["position"].copy(data=file @ axes_matrix(axes).T)
-    (hint,) = placement_hints(robot, Trajectory(dataset), axes)
+    columns = CsvColumns(**MILLIMETRES, position_unit="m", axes=axes)
+    (hint,) = placement_hints(robot, Trajectory(dataset), columns)
     named = tuple(word.strip(' "') for word in hint.split("axes = [")[1].split("]")[0].split(","))
     assert named[2] == "-y"
     assert "do not show its turn about z" in hint
     dataset["position"] = dataset["position"].copy(data=file @ axes_matrix(named).T)
-    assert placement_hints(robot, Trajectory(dataset), named) == []
+    assert placement_hints(robot, Trajectory(dataset), columns.model_copy(update={"axes": named})) == []
 
 
 def test_recordings_alike_share_a_note(tmp_path):

@@ -94,6 +94,7 @@ def test_a_robot_from_answers_goes_through_its_tables():
     assert "finger" in model.texts()["robot.toml"]
     assert model.parameters.loc["young_modulus", "prior"]["distribution"] == "LogNormal"
     assert model.with_mechanisms("backlash").mechanisms == ("backlash",)
+    assert repr(model.with_mechanisms("backlash")) == "<Model finger: mechanisms backlash; priors young_modulus>"
 
 
 @pytest.fixture(scope="module")

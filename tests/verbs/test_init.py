@@ -125,6 +125,7 @@ def test_init_writes_files_that_read_the_recordings(tmp_path, monkeypatch, capsy
     status, told = init(monkeypatch, capsys, "Arm 7", "--recording", "run_*.csv", "--length-mm", "200")
     assert status == 0
     assert "rfdropo check" in told
+    assert "ASSUMED in the robot file: cable_radius, gravity, markers, mass," in told
     experiment, _ = load_experiment(tmp_path / "Arm 7" / "experiment.toml")
     robot = find_robot(experiment.robot, tmp_path / "Arm 7")
     assert robot.name == "arm_7"

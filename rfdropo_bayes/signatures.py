@@ -1,0 +1,52 @@
+"""Keywords that a function hands on, shown as its own: by help, by tab completion, and by the error on a typo."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection, Container
+from typing import Any, TypeVar
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import nearest
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+
+def with_keywords_of(source: Callable[..., Any], *, without: Container[str] = ()) -> Callable[[Called], Called]:
+    """Put the keywords of ``source`` into the signature of a function, in the place of its ``**given``.
+
+    Args:
+        source: the function or class that the keywords are handed on to.
+        without: names of ``source`` that the function does not take.
+    """
+
+    def decorate(function: Called) -> Called:
+        own = inspect.signature(function)
+        kept = [entry for entry in own.parameters.values() if entry.kind is not entry.VAR_KEYWORD]
+        taken = {entry.name for entry in kept}
+        added = [
+            entry.replace(kind=entry.KEYWORD_ONLY)
+            for entry in inspect.signature(source).parameters.values()
+            if entry.name not in taken and entry.name not in without
+        ]
+        function.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
+        return function
+
+    return decorate
+
+
+def see_keywords(
+    given: Collection[str], source: Callable[..., Any], where: str, *, without: Container[str] = ()
+) -> None:
+    """See that ``source`` can be called with these keywords.
+
+    Raises:
+        InputError: a keyword that it does not have, with the nearest that it has; or keywords that are missing.
+    """
+    known = {name: entry for name, entry in inspect.signature(source).parameters.items() if name not in without}
+    for name in given:
+        if name not in known:
+            raise InputError(f"unknown keyword {name!r}", where=where, remedy=nearest(name, known))
+    missing = [name for name, entry in known.items() if entry.default is entry.empty and name not in given]
+    if missing:
+        raise InputError(f"not given: {', '.join(missing)}", where=where, remedy="add them")
