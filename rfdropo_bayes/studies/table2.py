@@ -259,7 +259,7 @@ def _trained(study: Study, task: str, row: str, seed: int) -> Path:
     path = _written(tables, study.out / task / "experiments" / f"{_slug(row)}_{seed}.toml")
     out, asked = _place(study, task, "policies", row, seed), path.read_text(encoding="utf-8")
     if not _ran(out, asked):
-        train(Model.read(path), out, resume=(out / CHECKPOINTS).exists())
+        train(Model.read(path), out, resume=(out / CHECKPOINTS).exists(), page=False)
         write_text(out / ASKED, asked)
     return out
 
