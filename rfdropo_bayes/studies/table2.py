@@ -351,8 +351,10 @@ def _judged_on(study: Study, row: str) -> dict[str, Any]:
 
 
 def _learning(policy: Path) -> dict[str, float]:
+    """What a training took, and how its policy does at home: reward, and final distances [m]."""
     found = json.loads((policy / "summary.json").read_text(encoding="utf-8"))
-    return {"steps": found["steps"], "seconds": found["seconds"], "diverged": found["diverged_episodes"]}
+    home = {f"home_{name}": found["evaluation"][name] for name in ("reward", "distance_median", "distance_q95")}
+    return {"steps": found["steps"], "seconds": found["seconds"], "diverged": found["diverged_episodes"], **home}
 
 
 def _cell(study: Study, task: str, row: str, seed: int) -> dict[str, Any] | None:
