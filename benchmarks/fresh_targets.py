@@ -1,10 +1,11 @@
 """Table II's rows on a target that nobody has looked at; resumable.
 
-    python benchmarks/fresh_targets.py --kind unknown --seed 1 [--only-done]
+    python benchmarks/fresh_targets.py --scene push --kind unknown --seed 1 [--only-done]
 
-Makes the target of `rfdropo_bayes/studies/fresh_targets.py` from kind and seed, trains the policies of every row on
-what is learnt from its six recordings, and plays them on it. Settings are the constants below. Writes table2.json
-(every distance) and table.md into reports/fresh_targets/KIND_SEED; a second call goes on where the first stopped.
+Makes the target of `rfdropo_bayes/studies/fresh_targets.py` from scene, kind and seed, trains the policies of every row
+on what is learnt from its six recordings, and plays them on it. Settings are the constants below. Writes table2.json
+(every distance) and table.md into reports/fresh_targets/SCENE_KIND_SEED, of reaching into KIND_SEED; a second call goes
+on where the first stopped.
 """
 
 from __future__ import annotations
@@ -14,25 +15,30 @@ import importlib.util
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rfdropo_bayes.files import write_text
-from rfdropo_bayes.studies.fresh_targets import KINDS, make_target
+from rfdropo_bayes.studies.fresh_targets import KINDS, SCENES, make_target
 from rfdropo_bayes.studies.table2 import ORACLE, OURS, ROWS, Table2Size, run_table2, share_of
 
-SIZE = Table2Size(seeds=3, steps=200_000, episodes=200, budget=3_000, minutes=25.0, exact_oracle=True)
+SIZES = {
+    "reach": Table2Size(seeds=1, steps=200_000, episodes=200, budget=3_000, minutes=25.0, exact_oracle=True),
+    "push": Table2Size(seeds=1, steps=600_000, episodes=200, budget=2_000, minutes=15.0, exact_oracle=True),
+}
+LEADING, RIVALS = (ORACLE, OURS, "ours", "no randomisation"), ("UDR", "BayesSim", "NPDR", "RF-DROPO as published")
+STAGES = ((LEADING, 1), (LEADING, 2), (RIVALS, 2), (ROWS, 3))  # rows, trainings of each
 WITHIN = (5.0, 10.0, 15.25)  # mm
 NEEDS_SBI = ("BayesSim", "NPDR")
 
 
-def rows_at_hand() -> tuple[str, ...]:
-    """Rows of Table II that this environment can compute, those that decide most first."""
+def rows_at_hand(rows: Sequence[str] = tuple(ROWS)) -> tuple[str, ...]:
+    """Those rows of Table II that this environment can compute."""
     missing = importlib.util.find_spec("sbi") is None
-    order = dict.fromkeys((ORACLE, OURS, "ours", *ROWS))
-    return tuple(name for name in order if not (missing and name in NEEDS_SBI))
+    return tuple(name for name in rows if not (missing and name in NEEDS_SBI))
 
 
 def table(content: Mapping[str, Any], rows: Sequence[str]) -> str:
@@ -59,20 +65,24 @@ def table(content: Mapping[str, Any], rows: Sequence[str]) -> str:
 def main() -> None:
     """Go on with the study of a target."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", choices=SCENES, default="reach")
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--out", type=Path, default=Path("reports/fresh_targets"))
     parser.add_argument("--only-done", action="store_true")
     given = parser.parse_args()
-    out = given.out / f"{given.kind}_{given.seed}"
-    files = make_target(given.kind, given.seed, out / "target")
-    rows = rows_at_hand()
-    content = run_table2(
-        [files["reach"]], files["truth"], files["audit"], out, SIZE, rows=rows, resume=(out / "run.json").exists(),
-        only_done=given.only_done, command=shlex.join(["python", *sys.argv]),
-    )  # fmt: skip
-    write_text(out / "table.md", table(content, rows))
-    print(table(content, rows))
+    name = f"{given.kind}_{given.seed}"
+    out = given.out / (name if given.scene == "reach" else f"{given.scene}_{name}")
+    files = make_target(given.kind, given.seed, out / "target", given.scene)
+    content: dict[str, Any] = {}
+    for rows, seeds in STAGES:
+        content = run_table2(
+            [files[given.scene]], files["truth"], files["audit"], out, replace(SIZES[given.scene], seeds=seeds),
+            rows=rows_at_hand(rows), resume=(out / "run.json").exists(), only_done=given.only_done,
+            command=shlex.join(["python", *sys.argv]),
+        )  # fmt: skip
+        write_text(out / "table.md", table(content, rows_at_hand()))
+    print(table(content, rows_at_hand()))
 
 
 if __name__ == "__main__":

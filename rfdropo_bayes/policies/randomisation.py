@@ -142,6 +142,42 @@ class Draws:
 
 
 @dataclass(frozen=True)
+class Days:
+    """Rows of a posterior, each on a day of its own that no fit has seen.
+
+    Attributes:
+        draws: the rows; their parameters are what all days share.
+        spreads: standard deviations between days of the parameters that differ, one for each row.
+        ends: hard bounds of these parameters, beyond which no day is.
+    """
+
+    draws: Draws
+    spreads: Mapping[str, Float[np.ndarray, " draw"]]
+    ends: Mapping[str, tuple[float, float]]
+    kind: str = "posterior"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters of the rows."""
+        return self.draws.names
+
+    @property
+    def sha256(self) -> str:
+        """Of rows and spreads."""
+        return _digest([self.draws.sha256, {name: column.tolist() for name, column in self.spreads.items()}])
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """One row, and a day's deviations from it: normal, of the row's own spread, cut off at the hard bounds."""
+        index = int(rng.integers(len(self.draws.rows)))
+        found = dict(zip(self.names, map(float, self.draws.rows[index]), strict=True))
+        for name, column in self.spreads.items():
+            mean, std = found[name], max(float(column[index]), 1e-300)
+            low, high = ((end - mean) / std for end in self.ends[name])
+            found[name] = float(truncnorm.rvs(low, high, loc=mean, scale=std, random_state=rng))
+        return found
+
+
+@dataclass(frozen=True)
 class Layers:
     """Several randomisations at once; where two vary one parameter, the later one has the say.
 
@@ -177,6 +213,9 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     if isinstance(randomisation, Layers):
         for part in randomisation.parts:
             fitting(part, specs)
+        return randomisation
+    if isinstance(randomisation, Days):
+        fitting(randomisation.draws, specs)
         return randomisation
     where = f"randomisation ({randomisation.kind})"
     check_names(randomisation.names, specs, where=where)

@@ -34,6 +34,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError
+from rfdropo_bayes.prediction.day_spread import draw_deviation
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -253,9 +254,8 @@ def _for_new_recordings(
     for parameter in _deviations(deviating, gathered):
         drawn = values.get(parameter.name)
         if drawn is None:
-            drawn = np.asarray(parameter.prior.sample(jax.random.fold_in(key, len(names) + len(parameters)), (count,)))
-            if parameter.scaled_by:
-                drawn = drawn * values[parameter.scaled_by] / float(parameter.prior.scale)
+            own_key = jax.random.fold_in(key, len(names) + len(parameters))
+            drawn = draw_deviation(parameter, values, own_key, count)
         extended[parameter.name] = drawn
         parameters.append(parameter)
     return ParameterSpace(tuple(parameters)), extended

@@ -259,7 +259,7 @@ def _trained(study: Study, task: str, row: str, seed: int) -> Path:
     path = _written(tables, study.out / task / "experiments" / f"{_slug(row)}_{seed}.toml")
     out, asked = _place(study, task, "policies", row, seed), path.read_text(encoding="utf-8")
     if not _ran(out, asked):
-        train(Model.read(path), out, resume=(out / CHECKPOINTS).exists())
+        train(Model.read(path), out, resume=(out / CHECKPOINTS).exists(), page=False)
         write_text(out / ASKED, asked)
     return out
 
@@ -351,8 +351,10 @@ def _judged_on(study: Study, row: str) -> dict[str, Any]:
 
 
 def _learning(policy: Path) -> dict[str, float]:
+    """What a training took, and how its policy does at home: reward, and final distances [m]."""
     found = json.loads((policy / "summary.json").read_text(encoding="utf-8"))
-    return {"steps": found["steps"], "seconds": found["seconds"], "diverged": found["diverged_episodes"]}
+    home = {f"home_{name}": found["evaluation"][name] for name in ("reward", "distance_median", "distance_q95")}
+    return {"steps": found["steps"], "seconds": found["seconds"], "diverged": found["diverged_episodes"], **home}
 
 
 def _cell(study: Study, task: str, row: str, seed: int) -> dict[str, Any] | None:

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import AnySimulator, build_robot_simulator, build_simulator, physical_values
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
@@ -14,6 +16,8 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.randomisation import (
+    Days,
+    Draws,
     Layers,
     Point,
     Randomisation,
@@ -26,6 +30,7 @@ from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.prediction.day_spread import day_deviations
 from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
@@ -144,7 +149,7 @@ def randomisation_of(
         fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
         check_fitted_integrator(fitted, simulator.integrator, where="posterior")
         rows = drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot)
-        parts.append(_beside_held(rows, posterior.record.attrs, simulator))
+        parts.append(_beside_held(_on_its_day(rows, posterior.record, simulator), posterior.record.attrs, simulator))
     elif posterior is not None:
         parts.append(_of_run(Path(posterior), simulator))
     elif table.randomisation != "none":
@@ -179,13 +184,33 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     Raises:
         InputError: it was fitted with another integrator than the simulator's.
     """
-    found = (read_phi if phi else read_posterior)(source, simulator.parameters, simulator.robot)
     folder = source if source.is_dir() else source.parent
     file = source if source.is_file() and not phi else folder / POSTERIOR
-    attributes = PosteriorRecord.load(file).attrs if file.is_file() else {}
+    found: Randomisation
+    if phi:
+        found = read_phi(source, simulator.parameters, simulator.robot)
+        attributes = PosteriorRecord.load(file).attrs if file.is_file() else {}
+    else:
+        rows, record = read_posterior(source, simulator.parameters, simulator.robot), PosteriorRecord.load(file)
+        found, attributes = _on_its_day(rows, record, simulator), record.attrs
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
     return _beside_held(found, attributes, simulator)
+
+
+def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -> Randomisation:
+    """A posterior's rows on the day it was adapted to, else each on a day that no fit has seen, as predictions are.
+
+    Policies meet neither the mean of the fitted days nor one of them, but the next day.
+    """
+    own = {name: each for name, each in day_deviations(record, simulator.parameters).items() if name in rows.names}
+    if not own:
+        return rows
+    shifts = np.stack([own[name].shift if name in own else np.zeros(len(rows.rows)) for name in rows.names], axis=1)
+    moved = replace(rows, rows=rows.rows + shifts)
+    spreads = {name: each.spread for name, each in own.items() if each.spread.any()}
+    ends = {spec.name: (spec.low, spec.high) for spec in simulator.parameters if spec.name in spreads}
+    return Days(moved, spreads, ends) if spreads else moved
 
 
 def _beside_held(found: Randomisation, attributes: Mapping[str, Any], simulator: AnySimulator) -> Randomisation:

@@ -16,7 +16,7 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
+from rfdropo_bayes.bayes.pooling import DEVIATION
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
@@ -39,6 +39,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
+from rfdropo_bayes.prediction.day_spread import pooled_parameters, spread_families
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
@@ -311,16 +312,10 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec], of_gr
     scoped: dict[str, dict[str, tuple[str, ...]]] = {}
     priors: dict[str, dict[str, Any]] = {}
     known = {spec.name for spec in specs}
-    pooled: dict[str, Pooled] = {}
-    families = [i.name.removesuffix(SPREAD) for i in record.free if i.name.endswith(SPREAD) and i.name not in known]
-    families.sort(key=len, reverse=True)  # the longest name that fits: one cable's own spread, before that of all
+    pooled, families = pooled_parameters(record, specs), spread_families(record, specs)
     for info in record.free:
         name, _, recording = info.name.partition(SEPARATOR)
-        shared = name.removesuffix(DEVIATION)
-        if name not in known and shared in known:
-            groups = pooled[shared].groups if shared in pooled else {}
-            family = next((key for key in families if shared == key or shared.startswith(f"{key}_")), "")
-            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()}, family)
+        if name not in known and name.removesuffix(DEVIATION) in pooled:
             continue
         if name.endswith(SPREAD) and name.removesuffix(SPREAD) in families:
             continue

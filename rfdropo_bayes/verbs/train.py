@@ -44,6 +44,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     show: bool | None = None,
+    page: bool = True,
     **options: Any,
 ) -> dict[str, Any]:
     """Train a policy on a model, and export it.
@@ -56,6 +57,7 @@ def train(
         seed: of all that is random; that of the model's experiment by default.
         resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
         show: progress on the terminal, as in `calibrate`.
+        page: whether to play the policy and draw report.html, which takes 20 s of processor time.
         options: keys of an experiment file's [training].
 
     Returns:
@@ -82,7 +84,8 @@ def train(
         found = learn(
             environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known, show=show
         )
-        say_step("the training is done: exporting the policy, playing it and drawing report.html", show=show)
+        rest = ", playing it and drawing report.html" if page else ""
+        say_step(f"the training is done: exporting the policy{rest}", show=show)
         layout = found.model.get_env().get_attr("layout")[0]
         facts = {
             "rfdropo_version": software_versions()["rfdropo_bayes"],
@@ -98,9 +101,10 @@ def train(
         summary = _summary(table, found, policy, facts)
         curve_figure(found.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
-        played = play_policy(policy, Episodes(simulator, task, PLAYED, randomisation, settings), seed)
-        text = (out / CONFIG).read_text(encoding="utf-8")
-        write_text(out / PAGE, render_policy(summary, played, str(tables.get("title", task.name)), text))
+        if page:
+            played = play_policy(policy, Episodes(simulator, task, PLAYED, randomisation, settings), seed)
+            text = (out / CONFIG).read_text(encoding="utf-8")
+            write_text(out / PAGE, render_policy(summary, played, str(tables.get("title", task.name)), text))
         write_json(out / SUMMARY, summary)
     return summary
 

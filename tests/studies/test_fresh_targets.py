@@ -17,6 +17,8 @@ from rfdropo_bayes.studies.fresh_laws import BOUC_WEN_WAY, LAWS, Crosstalk, Hyst
 from rfdropo_bayes.studies.fresh_targets import KINDS, RECORDINGS, draw_flaws, make_target
 from rfdropo_bayes.studies.table2 import ROWS, Study, Table2Size
 
+REPOSITORY = Path(__file__).resolve().parents[2]
+
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory):
@@ -29,6 +31,17 @@ def test_a_seed_draws_one_target(kind) -> None:
     assert draw_flaws(kind, 0) == draw_flaws(kind, 0)
     assert draw_flaws(kind, 0) != draw_flaws(kind, 3)
     assert draw_flaws(KINDS[0], 0)["mechanisms"] != draw_flaws(KINDS[1], 0)["mechanisms"]
+
+
+def test_the_committed_target_is_that_of_its_seed() -> None:
+    truth = read_tables(REPOSITORY / "reports/fresh_targets/unknown_1/target/truth.toml")
+    assert draw_flaws("unknown", 1) == truth["model"]
+
+
+def test_laws_of_the_trunk_act_on_four_cables_each() -> None:
+    model = draw_flaws("unknown", 1, "push")
+    assert len(model["mechanisms"]) == 2
+    assert len([name for name in model["fixed"] if name.startswith("fresh_")]) == 8
 
 
 def test_a_seed_makes_the_same_files_and_recordings(target, tmp_path) -> None:
@@ -99,6 +112,11 @@ def test_laws_are_what_they_say() -> None:
     np.testing.assert_allclose(reached(LaggingCable, 0.2), 0.01 * (1.0 - np.exp(-time / 0.2)), rtol=1e-6)
     np.testing.assert_allclose(reached(HystereticCable, 1e-3), 0.01 - 1e-3)  # saturated: 10 mm is far over
     assert BOUC_WEN_WAY < 0.01
+
+
+def test_an_unknown_scene_is_refused() -> None:
+    with pytest.raises(InputError, match="unknown scene"):
+        draw_flaws("unknown", 0, "fly")
 
 
 def test_an_unknown_kind_is_refused(tmp_path) -> None:

@@ -174,6 +174,10 @@ def test_a_small_study_from_recording_to_table_goes_on_where_it_stopped(tmp_path
     first = run_table2(*run, rows=["no randomisation"])
     assert [row["row"] for row in first["rows"]] == ["no randomisation"]
     policy = tmp_path / "study" / "reach" / "policies" / "no_randomisation_0" / "policy.onnx"
+    assert not (policy.parent / "report.html").exists()  # a page takes longer than so short a training
+    ledger = tmp_path / "study" / "reach" / "evaluations" / "no_randomisation_0" / "policy.json"
+    home = json.loads((policy.parent / "summary.json").read_text())["evaluation"]
+    assert json.loads(ledger.read_text())["home_distance_q95"] == home["distance_q95"]
     before = policy.stat().st_mtime
     second = run_table2(*run, rows=["no randomisation", "oracle"], resume=True)
     assert [row["row"] for row in second["rows"]] == ["no randomisation", "oracle"]
