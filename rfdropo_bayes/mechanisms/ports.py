@@ -16,6 +16,10 @@ from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BODIES
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 
 AXES = "xyz"
+SIZES = {"m": 1e-3, "rad": 0.05}
+"""Of an effect on a command in each unit."""
+SHARE = 0.05
+"""Of usual commands in any other unit, likewise."""
 EVERY_CABLE, EVERY_ACTUATOR = "every cable", "every actuator"
 PLACES = ("base", "middle", "tip")
 """Names of the places that forces may act on, as many as the engine has; see `simulators.engine.LOAD_PLACES`."""
@@ -141,7 +145,8 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     if robot is None:
         left_out["cables, command delay"] = "the simulator takes no signals"
     else:
-        ports += _of_actuation(channels, getattr(simulator, "command_unit", "m"), wound=engine is not None)
+        unit, stroke = getattr(simulator, "command_unit", "m"), getattr(robot, "stroke", None)
+        ports += _of_actuation(channels, unit, stroke, wound=engine is not None)
     gravity, places = (0.0, 0.0, 0.0), 0
     if engine is not None and robot is not None and engine.carries_loads:
         places = len(engine.load_stations)
@@ -154,9 +159,10 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     return PortMap(tuple(ports), left_out, len(channels), places, gravity)
 
 
-def _of_actuation(channels: Sequence[str], unit: str, *, wound: bool) -> list[Port]:
-    """Ports of drives that wind cables, or of the commands of a simulator of one's own; metres are those of cables."""
-    cables, size = wound or unit == "m", 1e-3 if unit == "m" else 0.05
+def _of_actuation(channels: Sequence[str], unit: str, stroke: float | None, *, wound: bool) -> list[Port]:
+    """Ports of drives that wind cables, or of the commands of a simulator of one's own; metres are those of cables. In
+    other units than metres and radians an effect is measured by the size of usual commands, ``stroke``."""
+    cables, size = wound or unit == "m", SIZES.get(unit, SHARE * (stroke or 1.0))
     look = "guide, spool and tension of cable {0}, and what it shares with other cables"
     look = look if wound else "the drive of {0}, what it moves, and what it shares with other drives"
     found = []

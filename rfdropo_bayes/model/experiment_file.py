@@ -151,7 +151,13 @@ def code_placed(source: str, folder: Path, out: Path | None = None) -> str:
     if not colon:
         return source
     code = folder / f"{file}.py"
-    return f"{_brought(code, out, code.name)}:{name}" if code.is_file() else source
+    return f"{_brought(code, out, _copy_name(f'{file}.py'))}:{name}" if code.is_file() else source
+
+
+def _copy_name(file: str) -> str:
+    """Name of a copy: files of one name in two folders stay two."""
+    *folders, own = [part for part in Path(file).parts if part != Path(file).anchor]
+    return "_".join(["above" if part == ".." else part for part in folders[-1:]] + [own])
 
 
 def _brought(file: Path, out: Path | None, name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -15,8 +16,10 @@ from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.simulators.black_box import BlackBoxSimulator
 from rfdropo_bayes.simulators.robot_simulator import PASSES
 from rfdropo_bayes.tables import parse_table
+from tests.verbs.toys import BOX
 
 STEP = 0.01
 LEVELS = np.cumsum(np.random.default_rng(0).normal(size=(40, 2)), axis=0) * 1e-3
@@ -207,6 +210,14 @@ def test_a_law_of_the_motion_is_given_the_motion_that_it_makes(port, term, size,
     settled, moved = by_hand(plain, given, port, signal, 8), np.abs(seen - still).max()
     assert moved > 5e-4
     assert np.abs(seen - settled).max() < 0.05 * moved
+
+
+@pytest.mark.parametrize(("unit", "stroke", "size"), [("-", 200.0, 10.0), ("N", None, 0.05), ("m", None, 1e-3)])
+def test_an_effect_on_commands_of_another_unit_is_measured_by_their_size(unit, stroke, size):
+    """A duty cycle of 200 counts is disturbed by counts, not by hundredths of one."""
+    simulator = BlackBoxSimulator(replace(BOX, command_unit=unit, stroke=stroke))
+    port = port_map(simulator, simulator.marker_names).named("cable pull")
+    assert (port.size, port.unit) == (pytest.approx(size), unit)
 
 
 def test_what_a_law_cannot_be_is_said():

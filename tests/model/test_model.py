@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.errors import InputError
+from tests.verbs.toys import BOX, STEP
 
 FILE = """
 robot = "smooth_arm"
@@ -54,3 +56,14 @@ def test_recordings_come_from_the_call_or_from_the_file(model: rb.Model) -> None
     assert model.runs(given, given) == (given, given)
     with pytest.raises(rb.InputError, match=r"\[data\]"):
         model.runs(None)
+
+
+def test_a_stated_noise_that_lasts_wants_rows_of_one_rate() -> None:
+    walk = {"duration": 1.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
+    fast, other = rb.simulate(rb.Model(BOX), walk | {"recordings": ["fast", "other"]})
+    model = rb.Model(BOX, noise={"standard_deviation": 1e-3, "correlation_time": 0.1})
+    with pytest.raises(InputError, match=r"rows come every 20 to 60 ms.*resample"):
+        model.problem([fast, other.resample(3 * STEP)])
+    assert model.problem([fast, other]).n_rows == len(fast.time)
+    white = rb.Model(BOX, noise={"standard_deviation": 1e-3})
+    assert white.problem([fast, other.resample(3 * STEP)]).n_rows == len(fast.time)

@@ -135,6 +135,22 @@ def test_the_folder_of_a_run_holds_what_it_needs(tmp_path, monkeypatch):
     finish(out, tables=again, folder=out, overwrite=True)
 
 
+def test_code_of_one_name_in_two_folders_stays_two(tmp_path, monkeypatch):
+    monkeypatch.delenv("RFDROPO_DATA", raising=False)
+    path, out = own_experiment(tmp_path / "project"), tmp_path / "run"
+    sources = ["mine.py:Mine", "lab/mine.py:Mine", "../mine.py:Mine"]
+    for number, source in enumerate(sources):
+        file = path.parent / source.partition(":")[0]
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(f"class Mine:\n    number = {number}\n")
+    path.write_text(path.read_text().replace('"mine.py:Mine"', ", ".join(f'"{source}"' for source in sources)))
+    finish(out, tables=load_experiment(path)[1], folder=path.parent)
+    copies = [name.partition(":")[0] for name in load_experiment(out / "config.toml")[0].model.mechanisms[:3]]
+    assert [f"number = {number}" in (out / name).read_text() for number, name in enumerate(copies)] == [True] * 3
+    again = load_experiment(out / "config.toml")[1]
+    assert self_contained(again, out, out) == again
+
+
 def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkeypatch):
     monkeypatch.delenv("RFDROPO_DATA", raising=False)
     path = own_experiment(tmp_path)

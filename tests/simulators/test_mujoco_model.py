@@ -230,6 +230,15 @@ def test_mechanisms_take_the_unit_of_the_commands_and_change_nothing_at_null(spr
     np.testing.assert_allclose(moved, plain.rollout({}, commands).position, atol=1e-12)
 
 
+def test_a_model_whose_parameter_is_another_joint_s_is_another_model(tmp_path):
+    """Its name, bounds and nominal value are the same; what an audit has kept of the one is nothing of the other."""
+    path, tables = written(tmp_path, ARM), {"low": 0.01, "high": 0.2, "nominal": 0.05}
+    joints = ("shoulder", "shoulder", "elbow")
+    given = [{"damping": {"address": f"joint/{joint}/damping", **tables}} for joint in joints]
+    one, same, other = (MuJoCo(path, markers=["tip"], parameters=each).function.digest for each in given)
+    assert one == same != other
+
+
 @pytest.mark.parametrize("canonical", [False, True])
 def test_a_model_that_is_written_and_read_again_moves_alike(tmp_path, canonical):
     text = ARM

@@ -323,7 +323,8 @@ class MuJoCoRollouts:
 
         content = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, content)
-        told = repr((self.start, sorted(self.channels.items()), sorted(self.cables.items()), sorted(self.edits)))
+        edits = sorted((name, edit.form, edit.elements) for name, edit in self.edits.items())
+        told = repr((self.start, sorted(self.channels.items()), sorted(self.cables.items()), edits))
         return hashlib.sha256(content.tobytes() + told.encode()).hexdigest()
 
     def _first_state(self) -> tuple[np.ndarray, np.ndarray]:
