@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot
@@ -60,6 +59,8 @@ def _tried(grid: Sequence[float]) -> str:
 
 def method_rows() -> list[Row]:
     """The methods of inference."""
+    from rfdropo_bayes.inference.methods import METHODS  # loads ArviZ, which a list of mechanisms needs not wait for
+
     return [{"method": name, "description": first_paragraph(method.config.__doc__)} for name, method in METHODS.items()]
 
 

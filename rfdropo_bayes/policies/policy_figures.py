@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from rfdropo_bayes.policies.evaluation import Episode
 from rfdropo_bayes.report.style import CYCLE, WIDTH, empty, styled
 
 MILLIMETRES = 1e3
+INTERVALS = 4
+"""Between the ticks of a panel in a third of the page: the labels of more would overlap."""
 
 
 @styled
@@ -63,6 +66,7 @@ def draws_figure(parameters: Mapping[str, np.ndarray], distances: np.ndarray) ->
     for axes, (name, values) in zip(panels, parameters.items(), strict=False):
         axes.plot(values, MILLIMETRES * distances, ".", markersize=4)
         axes.set(xlabel=name, ylabel="final distance [mm]", yscale="log")
+        axes.xaxis.set_major_locator(MaxNLocator(INTERVALS))
     for axes in panels[len(parameters) :]:
         empty(axes)
     return figure

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import LogFormatter
 
 from rfdropo_bayes.report import style
 from rfdropo_bayes.report.replay import Track
@@ -164,7 +163,7 @@ def draw_blocks(axes: Axes, shown: Shown) -> None:
     axes.axhline(1.0, color=style.MEASURED, linewidth=0.8)
     axes.set_yscale("log")
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-        ticks(LogFormatter(minor_thresholds=(1.5, 0.6)))
+        ticks(style.PlainLogFormatter(minor_thresholds=(1.5, 0.6)))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("mean square / that of noise [-]")
 

@@ -165,11 +165,15 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     if summary["log_evidence"]["value"] is not None:
         sd = summary["log_evidence"]["sd"]
         words = "log evidence" if sd is None else f"log evidence ± {number(sd, 2)}"
-        tiles.append((f"{summary['log_evidence']['value']:.1f}", "nat", words))
-    tiles.append(
-        (f"{summary['rollouts']:,.0f}".replace(",", "\u202f"), "", f"rollouts in {duration(summary['seconds'])}")
-    )
+        tiles.append((_grouped(summary["log_evidence"]["value"]), "nat", words))
+    tiles.append((_grouped(summary["rollouts"]), "", f"rollouts in {duration(summary['seconds'])}"))
     return tiles
+
+
+def _grouped(value: float) -> str:
+    """A number with at most one decimal, narrow spaces between its thousands, and a minus sign; it fits into a tile."""
+    decimals = 1 if isinstance(value, float) and abs(value) < 1000.0 and value != round(value) else 0
+    return f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
 
 
 def _prior_rows(record: PosteriorRecord) -> list[tuple[str, ParameterInfo]]:

@@ -13,6 +13,7 @@ from rfdropo_bayes.posteriors import PosteriorRecord, contradiction, contradicts
 from rfdropo_bayes.report.headline import best_baseline
 
 BAND = "0.9"
+TIP = "tip"  # a marker of this name needs no other words
 OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
 FEW_DRAWS = 100.0  # effective ones
 CHOSEN = ("rfdropo", "adapt")  # methods whose draws are as many as were asked for, and no chain
@@ -96,7 +97,9 @@ def _role(summary: Mapping[str, Any]) -> str:
 
 
 def _place(marker: str, markers: Mapping[str, Any]) -> str:
-    return f"the tip ({marker})" if marker == list(markers)[-1] else marker
+    if marker != list(markers)[-1]:
+        return marker
+    return "the tip" if marker == TIP else f"the tip ({marker})"
 
 
 def _systematic(summary: Mapping[str, Any]) -> list[str]:

@@ -17,6 +17,7 @@ from cycler import cycler
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from matplotlib.transforms import Bbox
 
 from rfdropo_bayes.report.units import display_name
@@ -194,6 +195,13 @@ def thin(rows: int) -> np.ndarray:
 
 def label_with_unit(name: str, unit: str) -> str:
     return f"{display_name(name)} [{unit}]" if unit else display_name(name)
+
+
+class PlainLogFormatter(LogFormatter):
+    """Numbers of a logarithmic axis as they are read: 0.6, and not 6e-01."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def empty(axes: Axes) -> None:

@@ -18,7 +18,7 @@ from rfdropo_bayes.policies.episodes import Episodes
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.policies.parity import difference, observations
 from rfdropo_bayes.policies.policy_figures import curve_figure
-from rfdropo_bayes.policies.policy_page import play_policy, render_policy
+from rfdropo_bayes.policies.policy_page import EPISODES, play_policy, render_policy
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training import train as learn
 from rfdropo_bayes.policies.training_config import TrainingTable
@@ -84,8 +84,7 @@ def train(
         found = learn(
             environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known, show=show
         )
-        rest = ", playing it and drawing report.html" if page else ""
-        say_step(f"the training is done: exporting the policy{rest}", show=show)
+        say_step("the training is done: exporting the policy", show=show)
         layout = found.model.get_env().get_attr("layout")[0]
         facts = {
             "rfdropo_version": software_versions()["rfdropo_bayes"],
@@ -102,7 +101,9 @@ def train(
         curve_figure(found.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
         if page:
+            say_step(f"playing the policy in {EPISODES} episodes, and filming the median and the worst", show=show)
             played = play_policy(policy, Episodes(simulator, task, PLAYED, randomisation, settings), seed)
+            say_step("drawing report.html", show=show)
             text = (out / CONFIG).read_text(encoding="utf-8")
             write_text(out / PAGE, render_policy(summary, played, str(tables.get("title", task.name)), text))
         write_json(out / SUMMARY, summary)

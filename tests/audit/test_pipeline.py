@@ -338,7 +338,9 @@ def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp
     assert "fit of the base model is not done" in content["sentence"]
     assert "--resume" in content["sentence"]
     assert "--resume" in content["next_experiment"]["sentence"]
-    assert "no_verdict" in render_audit(shown(answer), content, "", "").replace(" ", "_")
+    page = render_audit(shown(answer), content, "", "")
+    assert "no_verdict" in page.replace(" ", "_")
+    assert ("No candidate was screened" in page) == (content["candidates"] == [])
     if stated and share > 0.5:
         resumed = audit(asked, journal=Journal(tmp_path, resume=True))
         assert resumed.verdict == "explained"

@@ -84,6 +84,8 @@ def test_every_parameter_has_its_panel_however_the_grid_fills(count: int):
     shown = [axes for axes in figure.axes if axes.axison]
     assert [axes.get_xlabel() for axes in shown] == list(values)
     assert len(embed(figure, "draws").panels) in (1, count)
+    figure.draw_without_rendering()
+    assert max(len(axes.get_xticks()) for axes in shown) <= 7  # labels of a third of the page; one beyond each end
 
 
 @pytest.mark.slow

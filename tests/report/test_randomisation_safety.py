@@ -65,7 +65,7 @@ def test_without_grounds_against_it_is_safe(run, summary):
         (lambda s: s["cautions"].extend(said([LEAP, LAST])), "10 rollouts ran out"),
         (lambda s: s["cautions"].extend(said([LAST | {"correlation": 0.98}])), "0.98 correlated"),
         (lambda s: s["excluded"].update(diverged=9000), "45 % of the rollouts failed"),
-        (lambda s: s["coverage_by_role"]["test"]["tip"].update({"0.9": 0.77}), "only 77 % at the tip (tip)"),
+        (lambda s: s["coverage_by_role"]["test"]["tip"].update({"0.9": 0.77}), "only 77 % at the tip"),
         (lambda s: s["coverage_by_role"]["test"]["middle"].update({"0.9": 0.5}), "only 50 % at middle"),
         (lambda s: s["residuals"].update(CORRELATED), "too narrow by up to 2.4 times"),
     ],
@@ -82,7 +82,7 @@ def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
     ("change", "words"),
     [
         (lambda s: s["noise_floor_mm"].update(tip=0.1), "where repeats differ by 0.1 mm"),
-        (lambda s: s["error_correlation"]["test"].update(tip=0.83), "correlation 0.83 at the tip (tip)"),
+        (lambda s: s["error_correlation"]["test"].update(tip=0.83), "correlation 0.83 at the tip"),
         (lambda s: s["rmse"]["test"].update(middle=0.88), "0.88 against"),
     ],
 )
@@ -101,7 +101,7 @@ def test_without_repeats_an_error_that_lasts_is_held_against_the_best_baseline(r
     changed["error_correlation"]["test"] = {"middle": 0.0, "tip": 0.0}
     assert judge(run.record, changed).verdict == "safe"
     changed["error_correlation"]["test"]["tip"] = 0.4
-    assert "at the tip (tip)" in judge(run.record, changed).sentence
+    assert "at the tip" in judge(run.record, changed).sentence
 
 
 def test_a_prior_that_excludes_the_data_is_said(run, summary):

@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report import RunFacts, build_summary, read_summary, rebuild_report, render_page, write_run
 from rfdropo_bayes.report.page import SECTIONS, duration, interval, number
+from rfdropo_bayes.report.style import PlainLogFormatter
 from rfdropo_bayes.report.trajectory_figures import shown_markers
 from rfdropo_bayes.report.units import display_unit
 
@@ -227,3 +229,24 @@ def test_the_last_marker_is_always_shown() -> None:
     assert shown_markers(1) == [0]
     assert shown_markers(4) == [0, 1, 2, 3]
     assert shown_markers(21) == [5, 10, 15, 20]
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(40787.6, "40\u202f788"), (-5213.25, "\u22125\u202f213"), (12.34, "12.3"), (-0.5, "\u22120.5")]
+)
+def test_a_large_evidence_fits_into_its_tile(value: float, shown: str) -> None:
+    record, facts = bare()
+    summary = build_summary(record, facts)
+    summary["log_evidence"] |= {"value": value, "sd": None}
+    assert f"<b>{shown}<small> nat</small></b>" in render_page(record, summary, "")
+
+
+def test_numbers_of_a_logarithmic_axis_are_written_out() -> None:
+    axes = Figure().subplots()
+    axes.set(yscale="log", ylim=(0.2, 3.0))
+    formatter = PlainLogFormatter(minor_thresholds=(1.5, 0.6))
+    formatter.set_axis(axes.yaxis)
+    formatter.set_locs([0.3, 0.6, 1.0, 2.0])
+    texts = [formatter(value) for value in (0.3, 0.6, 1.0, 2.0)]
+    assert set(texts) <= {"", "0.3", "0.6", "1", "2"}
+    assert "1" in texts

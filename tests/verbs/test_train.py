@@ -36,9 +36,11 @@ QUICK = [
 SINGLE = {"precision": "float32"}
 
 
-def rfdropo(*words: object) -> None:
+def rfdropo(*words: object) -> str:
+    """Run a command that succeeds; return what it wrote on stderr."""
     result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
     assert result.exit_code == 0, result.output
+    return result.stderr
 
 
 @pytest.mark.slow
@@ -60,7 +62,8 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path) -> None:
 @pytest.mark.parametrize("task", ["TrunkReach-v0", pytest.param("TrunkPush-v0", marks=pytest.mark.slow)])
 def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
-    rfdropo("train", REACH, "--out", tmp_path / "policy", *settings)
+    steps = rfdropo("train", REACH, "--out", tmp_path / "policy", *settings).splitlines()[-3:]
+    assert [step.split()[0] for step in steps] == ["the", "playing", "drawing"]
     assert {path.name for path in (tmp_path / "policy").iterdir()} >= {
         "policy.onnx", "card.md", "summary.json", "curve.png", "report.html", "episodes.jsonl", "config.toml",
         "run.json",
