@@ -16,10 +16,11 @@ import numpy as np
 
 from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.deadline import OutOfTime
-from rfdropo_bayes.audit.extension import Added, Rules
-from rfdropo_bayes.audit.fit import Fit, FitTarget, widened
+from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, Rules
+from rfdropo_bayes.audit.fit import Fit, FitTarget, climb, widened
 from rfdropo_bayes.audit.gain import Gain
 from rfdropo_bayes.audit.held_out import HeldOut, JudgedModel, predicted, stages_of
+from rfdropo_bayes.audit.inadequacy import fit_with_noise
 from rfdropo_bayes.audit.law_search import FoundLaw, Refit, law_search
 
 
@@ -29,7 +30,7 @@ class Described:
 
     Attributes:
         found: ports and law.
-        beside: mechanisms that the law stands beside, in the model.
+        steps: of the library's mechanisms that the law stands beside, in the model.
         stand_ins: mechanisms of the library that the law takes the place of.
         gain: of the law on recordings that no fit has seen, against the model without it; None where there is no
             law, or the time was up.
@@ -39,12 +40,17 @@ class Described:
     """
 
     found: FoundLaw
-    beside: tuple[str, ...] = ()
+    steps: tuple[Added, ...] = ()
     stand_ins: tuple[str, ...] = ()
     gain: Gain | None = None
     overall: Gain | None = None
     held_out: HeldOut | None = None
     holds: bool = False
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """Names of the library's mechanisms beside the law."""
+        return tuple(step.name for step in self.steps)
 
     @property
     def last(self) -> Refit | None:
@@ -105,8 +111,64 @@ def describe(
             report(f"the law takes the place of {' and '.join(names)}")
             return replace(answer, stand_ins=names)
         further = _beside(problem, model, report)
-        answer = replace(further, beside=names) if further.holds else replace(answer, holds=False)
+        if not further.holds:
+            return replace(answer, holds=False)
+        alone, answer = answer, further
+        answer = _without_stand_ins(problem, model, alone, further, report)
     return answer
+
+
+def _without_stand_ins(
+    problem: AuditProblem, model: NamedModel, alone: Described, described: Described, report: Callable[[str], None]
+) -> Described:
+    """The law beside those mechanisms only that unseen recordings ask for once it is in the model.
+
+    What acts beside a named cause has stood-ins among the later ones. The law is looked for anew without these, and
+    kept if unseen recordings are not clearly likelier with them.
+
+    Args:
+        alone: the law beside the base model.
+        described: the law beside all of the model's mechanisms.
+    """
+    needed = _needed(problem, described)
+    gone = tuple(step.name for step in model.steps if step.name not in needed)
+    if not gone or described.held_out is None:
+        return described
+    report(f"with the law, unseen recordings do not ask for {' and '.join(gone)}: the law without them")
+    again = alone
+    if needed:
+        search, steps = ExtensionSearch(model.judge, problem.candidates, problem.rules, problem.seed), model.steps
+        for name in gone:
+            index = [step.name for step in steps].index(name)
+            steps = tuple(search.without(steps, index, model.base))
+        judge, fit = fit_with_noise(steps[-1].judge.measured, steps[-1].fit.x, steps[-1].fit.free)
+        again = _beside(problem, replace(model, steps=(*steps[:-1], replace(steps[-1], judge=judge, fit=fit))), report)
+    if not again.holds or again.held_out is None or described.held_out.beside(again.held_out).clear:
+        return described
+    return replace(again, stand_ins=gone)
+
+
+def _needed(problem: AuditProblem, described: Described) -> list[str]:
+    """Mechanisms beside a law without which unseen recordings are clearly less likely; the last one is asked first."""
+    assert described.last is not None
+    judge, fit, coordinates = described.last.target, described.last.fit, described.last.target.forward.coordinates
+    finer = DISCRETISATION in described.beside
+    needed: list[str] = []
+    for step in reversed(described.steps):
+        candidate = problem.candidate(step.name)
+        own = np.intersect1d(candidate.indices, fit.free) if candidate is not None else np.zeros(0, dtype=int)
+        if not own.size:  # the finer mesh, whose parameters are none
+            needed.append(step.name)
+            continue
+        start = fit.x.copy()
+        start[own] = coordinates.null[own]
+        less = climb(judge, start, np.setdiff1d(fit.free, own))
+        seen = predicted(problem, judge.measured, [JudgedModel(judge, each, finer) for each in (less, fit)])
+        if seen.count < 2 or seen.gain(0, 1).clear:
+            needed.append(step.name)
+        else:
+            fit = less
+    return needed
 
 
 def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], None]) -> Described:
@@ -118,18 +180,21 @@ def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], No
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report)
     found = law_search(target, *options).find(target, fit)
     if not found.terms:
-        return Described(found)
+        return Described(found, model.steps)
     stages = stages_of(model.judge, model.base, model.steps)
     named = len(stages) - 1
     stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
     held_out = predicted(problem, model.judge.measured, stages)
+    found = found.cut(max(held_out.count - len(stages) + len(found.terms), 0))
+    if not found.terms:
+        return Described(found, model.steps)
     # As with what the library names, a law is cut to what unseen recordings support.
     kept = held_out.supported_from(named) - named or len(found.terms)
     if kept < len(found.terms):
         report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")
     found, held_out = found.cut(kept), held_out.after(named + kept)
     gain, overall = held_out.gain(named, named + kept), held_out.gain(0, named + kept)
-    return Described(found, (), (), gain, overall, held_out, holds_on(problem.rules, gain))
+    return Described(found, model.steps, (), gain, overall, held_out, holds_on(problem.rules, gain))
 
 
 def holds_on(rules: Rules, gain: Gain) -> bool:

@@ -20,6 +20,7 @@ from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.port_rollouts import with_laws_of
 from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.errors import InputError
 
 DRAWS = 60
 HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
@@ -59,6 +60,11 @@ class HeldOut:
     judges: list[Stacked]
     spreads: list[np.ndarray]
     seed: int
+
+    @property
+    def count(self) -> int:
+        """Models that predict; fewer than were asked where the motion of one of them ended."""
+        return len(self.predictions)
 
     def gain(self, before: int, after: int) -> Gain:
         """What the model after some steps is worth beside that after fewer."""
@@ -106,7 +112,7 @@ def _without_carried(
             search.report(f"is {steps[index].name} needed? The model without it")
             fewer = search.without(steps, index, base)
             other = _predicted(problem, judge, search, base, fewer)
-            if held_out.beside(other).clear:
+            if other.count <= len(fewer) or held_out.beside(other).clear:
                 index += 1
             else:
                 steps, held_out, index = fewer, other, 0
@@ -155,19 +161,32 @@ def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[Judge
 
 
 def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedModel]) -> HeldOut:
-    """Predictions of models; ``target`` has the measurement's noise."""
+    """Predictions of models; ``target`` has the measurement's noise.
+
+    A model whose rollout of an unseen recording does not end well predicts nothing, and none after it is asked.
+
+    Raises:
+        InputError: the first model's rollout does not end well.
+    """
     count, every = len(problem.trajectories), len(problem.model.recordings.names)
     fits, judges = [stage.fit for stage in stages], [stage.judge for stage in stages]
     if every > count:
         which = "test recordings"
         tested = measurements_of(problem, range(count, every))
         unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
-        predictions = []
+        predictions = list[UnseenErrors]()
         for judge, fit, finer in stages:
             forward = with_laws_of(judge.forward, simulated(problem, finer, tested, range(count, every)))
-            predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [problem.seed, 3]))
+            try:
+                found = _predict(replace(target, forward=forward, measurements=tested), fit, [problem.seed, 3])
+            except InputError:
+                if not predictions:
+                    raise
+                break
+            predictions.append(found)
     else:
         which, unseen, predictions = _left_out(problem, judges, target, fits)
+    stages, judges = stages[: len(predictions)], judges[: len(predictions)]
     patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit, _ in stages]
     spreads, noises = [spread(judge, fit) for judge, fit, _ in stages], [judge.noise for judge in judges]
     return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
@@ -224,6 +243,10 @@ def supported_steps(
     """The steps that recordings which no fit has seen support, all of them where these support none; the screen
     of the model with them; and the predictions of these recordings."""
     held_out = _held_out(problem, judge, search, base, steps)
+    if held_out is not None and held_out.count <= len(steps):
+        steps, last = steps[: held_out.count - 1], steps[held_out.count - 1].before
+        if not steps:
+            return steps, last, None
     if held_out is None or not (kept := held_out.supported()):
         return steps, last, held_out
     last = steps[kept].before if kept < len(steps) else last

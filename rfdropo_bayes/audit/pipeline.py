@@ -200,10 +200,12 @@ def _weighed_up(
 
 
 def _described_validation(described: Described) -> Validation:
-    """What unseen recordings say of the base model with a law alone."""
+    """What unseen recordings say of the base model with a law, alone or beside mechanisms."""
     held = described.held_out
     if held is None:
         return Validation()
+    if described.steps:
+        return _validation(held, len(described.steps))
     return Validation(described.overall, [], held.which, (held.predictions[0], held.predictions[-1]), held.unseen)
 
 
@@ -255,8 +257,10 @@ def audit(
     described = describe(problem, under, held_out, report) if asks else None
     if described is not None and described.holds:
         verdict, suspected = DESCRIBED, None
-        if not described.beside:
-            steps, screens, extended, validation = [], screens[:1], base, _described_validation(described)
+        if len(described.steps) < len(steps):
+            steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in described.steps]
+            screens = [*(step.before for step in steps), last] if steps else screens[:1]
+            extended, validation = steps[-1].fit if steps else base, _described_validation(described)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
     sizes = widened(extended, problem.coordinates)

@@ -15,6 +15,9 @@ from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.described import Described, NamedModel, coefficients, describe
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
+from rfdropo_bayes.audit.extension import Added, ExtensionSearch
+from rfdropo_bayes.audit.fit import climb
+from rfdropo_bayes.audit.held_out import predicted, stages_of
 from rfdropo_bayes.audit.inadequacy import POOR, as_measured, noise_share
 from rfdropo_bayes.audit.law_search import TIED, law_search
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
@@ -284,3 +287,31 @@ def test_the_shape_of_a_feature_is_inferred_and_leaves_no_further_term():
     ((term,),) = [table["terms"] for table in law_tables(answer)]
     assert term["shape_parameter"] == f"{term['coefficient']}_shape"
     assert abs(term["shape"] - row["shape"]) < row["shape_sd"]
+
+
+class PushedPlaying(Pushed):
+    """The push by both commands, beside a play that the library has; for recordings."""
+
+    def rollout(self, parameters, commands, steps=None):
+        return super().rollout({**parameters, "play": parameters.get("play", 0.0) + 1.0}, commands, steps)
+
+
+def named_with(question, names):
+    """The base model of a problem with candidates, one after the other, and what it predicts."""
+    target, base = base_model(question, question.seed)
+    steps, fit = [], base
+    before = ExtensionSearch(target, question.candidates, question.rules, question.seed).tested(base, 0)
+    for name in names:
+        free = np.union1d(fit.free, question.candidate(name).indices)
+        fit = climb(target, fit.x, free)
+        steps.append(Added(name, (name,), before, fit, 0.0, {}, target))
+    return NamedModel(target, base, tuple(steps)), predicted(question, target.measured, stages_of(target, base, steps))
+
+
+@pytest.mark.slow
+def test_mechanisms_beside_a_law_that_unseen_recordings_do_not_ask_for_stood_in_for_it():
+    question = asked(6, PushedPlaying())
+    found = describe(question, *named_with(question, ["play", "creep", "wall"]))
+    assert (found.beside, set(found.stand_ins)) == (("play",), {"creep", "wall"})
+    assert [refit.term.feature.kind for refit in found.found.terms] == ["product"]
+    assert found.holds

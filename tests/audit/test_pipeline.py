@@ -388,6 +388,24 @@ def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it():
     assert "of the base model alone has not converged" in content["sentence"]
 
 
+def test_a_model_that_cannot_simulate_unseen_recordings_is_not_supported(monkeypatch):
+    """Its motion ends there; the audit goes on without it."""
+    asked, predict = problem({**TRUTH, "play": 1.0}, 1), held_out_module._predict
+    play = asked.candidate("play").indices[0]
+
+    def stops(target, fit, seed):
+        if play in fit.free:
+            raise InputError("a rollout at the optimum did not end well", where="audit", remedy="none")
+        return predict(target, fit, seed)
+
+    monkeypatch.setattr(held_out_module, "_predict", stops)
+    answer = audit(asked)
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert (answer.causes.unsupported, answer.causes.steps) == (["play"], [])
+    assert content["verdict"] in ("unexplained", "described")
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+
+
 def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
     class Without(Toy):
         parameters = tuple(s for s in Toy.parameters if s.name != "play")
