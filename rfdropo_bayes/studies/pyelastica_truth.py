@@ -110,7 +110,7 @@ def _pull(
             place[g] = (1.0 - share) * position[:, k] + share * position[:, k + 1] + lever[g]
         length = 0.0
         for g in range(guides - 1):
-            length += np.linalg.norm(place[g + 1] - place[g])
+            length += float(np.linalg.norm(place[g + 1] - place[g]))
         rate = (length - before[c]) / STEP if before[c] > 0.0 else 0.0
         before[c] = length
         tension = max(CABLE * (length - wanted[c]) + CABLE_DAMPING * rate, 0.0)
