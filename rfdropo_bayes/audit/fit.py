@@ -286,6 +286,11 @@ class Posterior(ProblemDefaults):
         """Hard bounds."""
         return {p.name: (p.spec.low, p.spec.high) for p in self._parameters}
 
+    @cached_property
+    def prior_ends(self) -> dict[str, tuple[float, float]]:
+        """Where each prior ends: on the hard bounds or between them."""
+        return {p.name: p.ends for p in self._parameters}
+
     @property
     def n_rows(self) -> int:
         """Rows of the longest recording."""

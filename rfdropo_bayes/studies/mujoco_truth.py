@@ -1,8 +1,9 @@
 """A robot made anew in MuJoCo, a truth that this package's engine did not make: springs and links, tendons for cables.
 
-Links are rigid. Between their middles lie joints that stretch along the axis and bend in two planes, with the section's
-stiffness over a link's length. Cables are tendons through the guides' places, each drawn in by a stiff servo that can
-only pull. What is hidden is hidden by means of that engine: masses, gravity, dry friction, tendons, gains, sites.
+Links are rigid. Between their middles lie joints that stretch along the axis, bend in two planes and twist, with the
+section's stiffness over a link's length. A rigid section does not swell where the arm is compressed, as if Poisson's
+ratio were zero. Cables are tendons through the guides' places, each drawn in by a stiff servo that can only pull. What
+is hidden is hidden by means of that engine: masses, gravity, dry friction, tendons, gains, sites.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from rfdropo_bayes.simulators.commands import commands_on_grid
 
 LINKS = 20  # 40 move the tip of smooth_arm by 0.07 mm, root mean square, where it moves by 56 mm
 STEP = 1e-4  # [s]: springs along the axis are explicit, and the stiffest turns a link's mass within 6 of them
+POISSON = 0.0  # of the arm: its sections are rigid, and twist with E / 2
 CONTROL = 1e-3  # [s] for which a command is held
 CABLE = 5e4  # [N/m] of a servo
 CABLE_DAMPING = 5.0  # [N s/m]
@@ -60,7 +62,7 @@ def _tilt(model: Any, size: float) -> None:
 
 
 def _friction(model: Any, size: float) -> None:
-    bends = np.flatnonzero(model.jnt_type == 3)  # hinges
+    bends = np.flatnonzero((model.jnt_type == 3) & (model.jnt_axis[:, 2] == 0.0))  # hinges across the axis
     model.dof_frictionloss[model.jnt_dofadr[bends]] = size * model.jnt_stiffness[bends]
     # As it comes, friction is so soft a constraint that it creeps within 20 ms and moves nothing here by 0.05 mm.
     model.dof_solref[:], model.dof_solimp[:, :2] = [5.0 * STEP, 1.0], [0.99, 0.999]
@@ -117,6 +119,7 @@ class _Section(NamedTuple):
     at: float
     stretch: float
     bend: tuple[float, float]
+    twist: float
     mass: float
 
 
@@ -175,6 +178,7 @@ def _sections(robot: Robot, values: Mapping[str, float], links: int) -> list[_Se
     length = station[-1] / links
     middle = 0.5 * (station[1:] + station[:-1])
     area, moment = np.asarray(shape.axial_area_m2), np.asarray(shape.bending_moment_area_m4)
+    torsion, shear = np.asarray(shape.torsion_constant_m4), modulus / (2.0 * (1.0 + POISSON))
     mass = np.asarray(shape.mass_area_m2)
     density = values["trunk_mass"] / float(np.sum(mass * np.diff(station)))
     found = []
@@ -185,9 +189,9 @@ def _sections(robot: Robot, values: Mapping[str, float], links: int) -> list[_Se
         # The layer's plane x bends by forces along x, that is about y.
         bends = [modulus * float(np.interp(at, middle, moment[:, axis])) / length for axis in (1, 0)]
         stretch = modulus * float(np.interp(at, middle, area)) / length
-        found.append(
-            _Section(at, stretch, (bends[0], bends[1]), density * float(np.interp(centre, middle, mass)) * extent)
-        )
+        twist = shear * float(np.interp(at, middle, torsion)) / length
+        weight = density * float(np.interp(centre, middle, mass)) * extent
+        found.append(_Section(at, stretch, (bends[0], bends[1]), twist, weight))
     return found
 
 
@@ -197,6 +201,7 @@ def _link(body: Any, section: _Section, damping: float, length: float) -> None:
         ("slide", "0 0 1", section.stretch),
         ("hinge", "1 0 0", section.bend[0]),
         ("hinge", "0 1 0", section.bend[1]),
+        ("hinge", "0 0 1", section.twist),
     )
     for kind, axis, stiffness in kinds:
         given = {"type": kind, "axis": axis, "stiffness": f"{stiffness:.9g}", "damping": f"{damping * stiffness:.9g}"}
@@ -262,30 +267,51 @@ class MuJoCoArm:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         rest = data.ten_length.copy()
-        late = 0.0 if effect is None or effect.seen is None else effect.seen(size)
-        clock = np.arange(0.0, recording.time[-1] + 0.5 * CONTROL, CONTROL)
-        grid = commands_on_grid(
-            recording.command_time,
-            recording.command,
-            recording.initial_command,
-            clock,
-            time_step=CONTROL,
-            ramp=self.robot.command.ramp_s,
-            dead_time=self.robot.command.dead_time_s,
-        )
-        levels = np.concatenate([grid.initial[None], grid.step])[: len(clock)]
-        if effect is not None and effect.command is not None:
-            levels = effect.command(levels, size)
+        clock, held = commanded(self.robot, recording, effect, size)
         markers = [model.site(name).id for name in self.robot.marker_names]
         path = np.empty((len(clock), len(markers), 3))
-        for row, level in enumerate(levels):
+        for row, level in enumerate(held):
             mujoco.mj_kinematics(model, data)
             path[row] = data.site_xpos[markers]
             data.ctrl[:] = rest - level
             mujoco.mj_step(model, data, nstep=round(CONTROL / STEP))
         if any(warning.number for warning in data.warning) or not np.isfinite(path).all():
             raise InputError("MuJoCo warns of the motion", where=recording.name, remedy="make the effect smaller")
-        flat = path.reshape(len(clock), -1)
-        at = np.clip(recording.time - recording.time[0] - late, 0.0, None)
-        seen = np.stack([np.interp(at, clock, column) for column in flat.T], axis=1)
-        return seen.reshape(len(at), len(markers), 3)
+        return seen_at(recording, clock, path, effect, size)
+
+
+def commanded(
+    robot: Robot, recording: Trajectory, effect: EngineEffect | None, size: float
+) -> tuple[Float[np.ndarray, " period"], Float[np.ndarray, "period channel"]]:
+    """When control periods begin, from the first row on [s], and the cable displacements [m] that are held for them.
+
+    A command held at the value of its period's start would come half a period late; the value of its middle is held.
+    """
+    clock = np.arange(0.0, recording.time[-1] - recording.time[0] + 0.5 * CONTROL, CONTROL)
+    grid = commands_on_grid(
+        recording.command_time,
+        recording.command,
+        recording.initial_command,
+        recording.time[0] + clock,
+        time_step=CONTROL,
+        ramp=robot.command.ramp_s,
+        dead_time=robot.command.dead_time_s,
+    )
+    levels = np.concatenate([grid.initial[None], grid.step])[-len(clock) :]
+    if effect is not None and effect.command is not None:
+        levels = effect.command(levels, size)
+    return clock, 0.5 * (levels + np.concatenate([levels[1:], levels[-1:]]))
+
+
+def seen_at(
+    recording: Trajectory,
+    clock: Float[np.ndarray, " period"],
+    path: Float[np.ndarray, "period marker 3"],
+    effect: EngineEffect | None,
+    size: float,
+) -> Float[np.ndarray, "time marker 3"]:
+    """Markers [m] at the rows of a recording."""
+    late = 0.0 if effect is None or effect.seen is None else effect.seen(size)
+    at = np.clip(recording.time - recording.time[0] - late, 0.0, None)
+    seen = np.stack([np.interp(at, clock, column) for column in path.reshape(len(clock), -1).T], axis=1)
+    return seen.reshape(len(at), *path.shape[1:])

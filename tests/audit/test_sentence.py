@@ -18,7 +18,7 @@ from rfdropo_bayes.report.audit_page import shown
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import specs_of
 
-from .toys import NOISE, problem
+from .toys import BASE, NOISE, problem, with_prior
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +97,16 @@ def test_a_misfit_of_the_first_block_alone_is_asked_about(answer):
     residual[place[:, :BLOCK]] = 5.0
     alone = replace(answer, base=replace(answer.base, residual=residual, jacobian=0.0 * answer.base.jacobian))
     assert "Only the first block fails: was another command in force before the first row" in said(alone)
+
+
+@pytest.mark.parametrize(("high", "decides"), [(0.2, True), (3.0, False)])
+def test_a_prior_that_leaves_the_truth_out_is_said_beside_what_is_found(high, decides):
+    """The truth bends by 0.4, where the prior ends at 0.2: a size that goes with it is no measurement."""
+    narrow = {"distribution": "Uniform", "low": -high, "high": high}
+    found = audit(with_prior(problem({"gain": 1.3, "bend": -0.4, "play": 1.0}, 4), BASE[1].name, narrow))
+    assert found.causes.steps
+    content = record(found, versions={}, data_sha256="", next_experiment=None)
+    about = [row for row in content["cautions"] if row["code"] == "at_bound"]
+    assert bool(about) == decides
+    assert ("bend sits on the lower end -0.2 of its prior" in content["sentence"]) == decides
+    assert all(row["sentence"] in content["sentence"] for row in about)

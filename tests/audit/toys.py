@@ -216,6 +216,13 @@ def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProbl
     return AuditProblem(LANES, None, coordinates, model, trajectories[:4], candidates, None, None, rules, seed)
 
 
+def with_prior(asked: AuditProblem, name: str, prior: dict) -> AuditProblem:
+    """The same data set and library under another prior of one parameter."""
+    tables = {spec.name: prior if spec.name == name else {} for spec in Toy.parameters}
+    space = build_space(Toy.parameters, tables, {}, asked.model.recordings.names)
+    return replace(asked, coordinates=replace(asked.coordinates, space=space), model=replace(asked.model, space=space))
+
+
 def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weighed, ...] = ()) -> AuditProblem:
     """A data set of the toy with cables, whose tensions are data or not."""
     toy = Pulling()

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.experiment import CommandsTable
-from rfdropo_bayes.studies.engine_study import CENTRE, CLOSE, as_table, run_engine_study, size_of
+from rfdropo_bayes.studies.engine_study import CLOSE, TRUTHS, as_table, run_engine_study, size_of
 from rfdropo_bayes.studies.hidden_effects import Setting, blank_recordings
-from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, MuJoCoArm
+from rfdropo_bayes.studies.mujoco_truth import CABLE, ENGINE_EFFECTS, MuJoCoArm
 
 pytest.importorskip("mujoco")
 
+CENTRE = TRUTHS["mujoco"].centre
 WALK = CommandsTable(duration=1.0, interval=0.2, step=0.005, low=0.0, high=0.01, sample_time=0.05, recordings=["any"])
 
 
@@ -28,15 +30,46 @@ def arm():
     return MuJoCoArm(rb.Robot.load("smooth_arm"), CENTRE)
 
 
-def test_two_engines_that_know_nothing_of_each_other_agree(arm, blank):
-    """Rigid links and springs against a layered body of finite elements, under the same cables, gravity and damping."""
+def apart(arm, blank, **parameters):
+    """Distance of the tips, and way of ours, root mean square [m]; ours has the servos' compliance."""
     (chain,) = arm.positions(blank, 0.0)
-    fine = rb.Model("smooth_arm", simulator={"refine": 3, "time_step": 0.005})
-    (body,) = rb.simulate(fine, blank, parameters={**CENTRE, "rayleigh_mass": 0.0})
-    way = np.linalg.norm(body.position[:, -1] - body.position[0, -1], axis=1)
-    apart = np.linalg.norm(chain[:, -1] - body.position[:, -1], axis=1)
-    assert np.sqrt(np.mean(way**2)) > 0.01
-    assert np.sqrt(np.mean(apart**2)) < 0.03 * np.sqrt(np.mean(way**2))
+    fine = rb.Model("smooth_arm", simulator={"refine": 3, "time_step": 0.005}, mechanisms=["cable_compliance"])
+    given = {**CENTRE, "rayleigh_mass": 0.0, "cable_compliance": 1.0 / CABLE, **parameters}
+    (body,) = rb.simulate(fine, blank, parameters=given)
+    tips = body.position[:, -1]
+    return (np.sqrt(np.mean(np.sum(off**2, axis=1))) for off in (chain[:, -1] - tips, tips - tips[0]))
+
+
+def test_two_engines_that_know_nothing_of_each_other_agree(arm, blank):
+    """Rigid links and springs against a layered body of finite elements, under the same cables, gravity and damping;
+    where the sections of one swell and those of the other do not, they agree less."""
+    away, way = apart(arm, blank, poisson_ratio=0.1)
+    swollen, _ = apart(arm, blank, poisson_ratio=0.45)
+    assert way > 0.01
+    assert away < 0.01 * way
+    assert away < 0.7 * swollen
+
+
+def test_a_payload_hangs_where_ours_does(arm, blank):
+    """With slack cables the arm is a cantilever, and the tip sinks by as much in both engines."""
+    slack = [recording_of(blank[0], -0.03)]
+    heavy = replace(arm, effect=ENGINE_EFFECTS["payload at the tip"], _seen={})
+    (light,), (chain,) = arm.positions(slack, 0.0), heavy.positions(slack, 0.01)
+    ours = rb.Model("smooth_arm", simulator={"refine": 3, "time_step": 0.005}, mechanisms=["payload"])
+    sunk = [
+        rb.simulate(ours, slack, parameters={**CENTRE, "rayleigh_mass": 0.0, "payload_mass": mass})[0].position[-1, -1]
+        for mass in (0.0, 0.01)
+    ]
+    assert chain[-1, -1, 1] - light[-1, -1, 1] < -4e-3
+    np.testing.assert_allclose(chain[-1, -1] - light[-1, -1], sunk[1] - sunk[0], rtol=0.01, atol=3e-5)
+
+
+def recording_of(blank, level):
+    """A recording of the same rows whose cables all stand at one displacement [m]."""
+    dataset = blank.dataset.copy(deep=True)
+    dataset["command"] = dataset["command"].copy(data=np.full(dataset["command"].shape, level))
+    dataset["initial_command"] = dataset["initial_command"].copy(data=np.full(dataset["initial_command"].shape, level))
+    return Trajectory(dataset)
 
 
 def test_more_links_change_little(arm, blank):
