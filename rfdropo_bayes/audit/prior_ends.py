@@ -28,7 +28,7 @@ def decided_by_priors(target: FitTarget, draws: Float[np.ndarray, "draw d"]) -> 
     own = target.forward.coordinates
     base = np.arange(own.base)
     values = own.values(draws)[:, base]
-    low, high = (np.array([own.quantiles(i, [share])[0] for i in base]) for share in (OUTER, 1.0 - OUTER))
+    low, high = (np.array([own.quantiles(int(i), [share])[0] for i in base]) for share in (OUTER, 1.0 - OUTER))
     middle = np.median(draws[:, base], axis=0)
     outer = (middle < low) | (middle > high)
     shown = {own.names[i]: values[None, :, i] for i in base[outer]}
