@@ -30,7 +30,7 @@ SIZES = {
     "push": Table2Size(seeds=1, steps=600_000, episodes=200, budget=2_000, minutes=15.0, exact_oracle=True),
 }
 LEADING, RIVALS = (ORACLE, OURS, "ours", "no randomisation"), ("UDR", "BayesSim", "NPDR", "RF-DROPO as published")
-STAGES = ((LEADING, 1), (LEADING, 2), (RIVALS, 2), (ROWS, 3))  # rows, trainings of each
+STAGES = ((LEADING, 1), (LEADING, 2), (RIVALS, 2), (tuple(ROWS), 3))  # rows, trainings of each
 WITHIN = (5.0, 10.0, 15.25)  # mm
 NEEDS_SBI = ("BayesSim", "NPDR")
 
