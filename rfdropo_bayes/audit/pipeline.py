@@ -232,9 +232,7 @@ def audit(
     fitted = not deadline.reached
     problem = _with_differences_of(problem, target)
     if fitted:
-        noise = target.measured.noise.first
-        shared = "" if noise.correlation is None else ", shared between coordinates"
-        report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
+        report(f"base model fitted; {_noise(target.measured.noise.first)}{_far_off(target, base)}")
     finer = _forward(problem, True, target.measurements, deadline) if fitted and problem.finer else None
     judge, search = target, ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
     search, base, steps, last = _searched(search, base)
@@ -291,6 +289,12 @@ def _validation(held_out: HeldOut | None, steps: int) -> Validation:
     explained, predictions = [gain.explained for gain in gains], held_out.predictions
     last = gains[-1] if gains else None
     return Validation(last, explained, held_out.which, (predictions[0], predictions[steps]), held_out.unseen)
+
+
+def _noise(noise: Autoregression) -> str:
+    """What a line of words says of a noise."""
+    shared = "" if noise.correlation is None else ", shared between coordinates"
+    return f"noise from {noise.source}, AR({noise.order}){shared}"
 
 
 def _far_off(target: FitTarget, fit: Fit) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from rfdropo_bayes.robots.robot import Robot
 
-ASIDE = 5.0
+ASIDE = 20.0
 """Lengths of the body that its anchors, half widths and spools stay within. Those of the robots at hand reach 0.08 of
 it; millimetres given as metres are fifty times the length or more."""
 LONGEST, SHORTEST = 20.0, 1e-3  # [m], of a body
