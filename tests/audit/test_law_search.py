@@ -238,6 +238,7 @@ def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
     assert under(near, known, known) is near
 
 
+@pytest.mark.slow
 def test_signals_are_timed_from_the_first_row_on():
     """Of recordings whose commands are known for four steps before it."""
     question = asked(101)
@@ -276,6 +277,7 @@ def test_commands_tell_laws_apart_that_recordings_do_not():
     assert then.pairs[pair] > 100.0
 
 
+@pytest.mark.slow
 def test_the_shape_of_a_feature_is_inferred_and_leaves_no_further_term():
     """Of one between those of the dictionary the next one would be asked for what is left."""
     question, _, _, found = searched(Lagging())

@@ -376,6 +376,7 @@ class RoughAlone(Toy):
         return observed._replace(position=observed.position + 5.0 * NOISE * jump)
 
 
+@pytest.mark.slow
 def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it():
     """What a base model lacks may drive it to where motion is rough; the library was not asked then."""
     asked = replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(RoughAlone(), np.arange(4)))

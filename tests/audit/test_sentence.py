@@ -99,6 +99,7 @@ def test_a_misfit_of_the_first_block_alone_is_asked_about(answer):
     assert "Only the first block fails: was another command in force before the first row" in said(alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("high", "decides"), [(0.2, True), (3.0, False)])
 def test_a_prior_that_leaves_the_truth_out_is_said_beside_what_is_found(high, decides):
     """The truth bends by 0.4, where the prior ends at 0.2: a size that goes with it is no measurement."""

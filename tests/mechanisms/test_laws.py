@@ -111,6 +111,7 @@ def test_a_law_at_a_cable_is_a_change_of_its_command_in_rollouts_and_in_sessions
     assert np.abs(np.stack(seen) - whole.position[1:]).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_a_shape_that_is_a_parameter_moves_the_arm_as_a_stated_one_does():
     term = {"feature": "lag", "commands": ["left"], "scale": 1.0}
     free = build_robot_simulator(spec(law("cable left", shape=0.1, shape_parameter="slow", **term)))

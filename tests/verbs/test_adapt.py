@@ -168,6 +168,7 @@ def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
     assert (adapted.folder / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_folder_of_a_day_predicts_the_other_days_too(known, zeros):
     """A day that was fitted keeps its values, row by row with the draws of the body that the new day has left."""
     size = 0.03 + 1e-3 * np.arange(60.0)[None]
@@ -247,6 +248,7 @@ def test_a_first_row_that_nothing_explains_has_a_caution(known, zeros):
     assert times == pytest.approx(25.0 / np.sqrt(3.0), rel=0.1)  # a row's noise is 4 % of it
 
 
+@pytest.mark.slow
 def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros, capsys):
     """A bump of 10 mm that is over after the seconds that are shown moves the zero; the first row knows nothing of
     it."""
