@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.gain import Gain
 
-NO_VERDICT = "no_verdict"  # the base fit has not converged, or the time was up before anything was found
+NO_VERDICT = "no_verdict"  # no fit has converged, or the time was up before anything was found
 DESCRIBED = "described"  # a law at a port, for which the library has no name, holds on unseen recordings
 NEGLIGIBLE = "negligible"  # a discrepancy is sure, and far too small to matter
 NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
