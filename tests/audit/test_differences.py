@@ -81,6 +81,7 @@ def test_a_mechanism_of_one_day_and_a_parameter_that_changed_are_named_with_thei
     assert "shared by january and april" in content["sentence"]
 
 
+@pytest.mark.slow
 def test_a_mechanism_of_one_day_is_named_for_it_in_an_audit_that_compares_nothing():
     answer = audit(compared({}, {"play": 0.5}, 1, replace(GROUPS, compared=False)))
     content = content_of(answer)
@@ -101,6 +102,7 @@ def test_a_mechanism_of_one_day_is_named_for_it_in_an_audit_that_compares_nothin
     assert table["only_in"] == {"bend": "january", "play": ["april"]}
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_one_day_of_three_lacks_is_named_for_the_others():
     months = {"january": ["r0", "r1", "r3"], "march": "r[57]", "april": MONTHS["april"]}
     runs = recordings(TRUTH, 1)[:9]

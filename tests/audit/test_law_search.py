@@ -200,6 +200,7 @@ def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidat
     assert 10.0 * pair < other
 
 
+@pytest.mark.slow
 def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
     """Under the noise of the measurement a law of three terms was, with scores of 138 to 198 nats."""
     question, target, _, found = searched(Elsewhere())
@@ -208,6 +209,7 @@ def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
     assert found.significant(question.rules.family) == []
 
 
+@pytest.mark.slow
 def test_terms_are_told_apart_under_the_noise_that_the_model_with_the_best_one_leaves():
     """With the law the model is no longer far off, and the noise is that of the measurement."""
     _, target, _, found = searched(PushedFar(), alike=True)

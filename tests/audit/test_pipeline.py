@@ -356,6 +356,7 @@ class Rough(Toy):
         return observed._replace(position=observed.position + 200.0 * NOISE * jump)
 
 
+@pytest.mark.slow
 def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
     answer = audit(replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
     assert answer.verdict == "no_verdict"
@@ -521,6 +522,7 @@ def asked_of(asked, trajectories, fitted: int):
     return replace(asked, model=model, trajectories=trajectories[:fitted])
 
 
+@pytest.mark.slow
 def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
     """The noise is within 10 % (160 rows, 12 channels, half of them for memory: five standard errors), where the base
     model leaves several times as much."""
@@ -568,6 +570,7 @@ def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     assert "extended.toml keeps the base model" in content["sentence"]
 
 
+@pytest.mark.slow
 def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_have():
     """Play is in every recording, a delay in the fitted ones alone."""
     fitted = unrepeated({"play": 3.0, "delay": 0.3}, 7)

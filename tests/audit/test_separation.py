@@ -34,6 +34,7 @@ def asked():
     return target, base, candidates, whole
 
 
+@pytest.mark.slow
 def test_what_looks_the_same_can_go_one_at_a_time_and_not_together(asked):
     target, base, candidates, whole = asked
     found = separate(target, candidates, GROUPS, base.x)
@@ -61,6 +62,7 @@ def test_what_looks_the_same_can_go_one_at_a_time_and_not_together(asked):
     assert len(separation_figure(content).axes) == 2
 
 
+@pytest.mark.slow
 def test_noise_that_was_not_measured_is_what_the_model_with_all_of_them_leaves(asked):
     target, base, candidates, _ = asked
     wide = replace(target.noise.first, scale=np.full(12, 1e-2), source=RESIDUALS)
@@ -76,6 +78,7 @@ def test_noise_that_was_not_measured_is_what_the_model_with_all_of_them_leaves(a
     assert 0.5 * NOISE < np.sqrt(np.mean(kept.scale**2)) < 1.1 * NOISE
 
 
+@pytest.mark.slow
 def test_the_share_of_an_effect_that_nothing_else_imitates_is_its_sine(asked):
     _, base, _, _ = asked
     rng = np.random.default_rng(0)

@@ -24,6 +24,7 @@ def opposed():
     return problem_of(Opposed(), {**TRUTH, "stretch": 25.0, "slack": -25.0}, 3)
 
 
+@pytest.mark.slow
 def test_two_effects_that_pay_only_together_are_named_together(opposed):
     lines: list[str] = []
     answer = audit(opposed, lines.append)

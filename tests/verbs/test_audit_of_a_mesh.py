@@ -63,6 +63,7 @@ def recording(rows: int = 12) -> Trajectory:
     )
 
 
+@pytest.mark.slow
 def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     own = ["own.py:Glue", "own.py:Fur"]

@@ -55,6 +55,7 @@ def off(found, run):
     return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
 
 
+@pytest.mark.slow
 def test_a_group_has_one_value_and_others_have_none(fit):
     names = [info.name for info in fit.record.free if info.name.startswith("command_delay")]
     assert names == ["command_delay@april"]
@@ -64,6 +65,7 @@ def test_a_group_has_one_value_and_others_have_none(fit):
         assert error.max() < 6.0 * SIGMA, prediction.name
 
 
+@pytest.mark.slow
 def test_it_acts_in_a_new_recording_of_its_group_and_in_none_of_another(fit):
     april, june = recorded({"april_new": DELAY, "june_new": 0.0}, 30)
     for run in (april, june):
@@ -72,6 +74,7 @@ def test_it_acts_in_a_new_recording_of_its_group_and_in_none_of_another(fit):
     assert off(rb.predict(fit, april, group="june"), april) > 3.0 * off(rb.predict(fit, april), april)
 
 
+@pytest.mark.slow
 def test_a_group_that_no_fit_has_seen_is_without_and_a_caution_says_so(fit):
     (may,) = recorded({"may_new": 0.0}, 40)
     found = rb.predict(fit, may)
