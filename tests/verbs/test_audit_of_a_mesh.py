@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.mechanisms import REGISTRY
