@@ -139,7 +139,7 @@ def _stand_ins(described: Described) -> str:
     names = " and ".join(name.replace("_", " ") for name in described.stand_ins)
     verb = "is a stand-in" if len(described.stand_ins) == 1 else "are stand-ins"
     return (
-        f" {names} of the library {verb} for it, and not adopted: unseen recordings are clearly likelier with the law."
+        f" {names[0].upper()}{names[1:]} of the library {verb} for it, and not adopted: unseen recordings are clearly likelier with the law."
     )
 
 
