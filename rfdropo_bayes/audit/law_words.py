@@ -138,9 +138,8 @@ def _stand_ins(described: Described) -> str:
         return ""
     names = " and ".join(name.replace("_", " ") for name in described.stand_ins)
     verb = "is a stand-in" if len(described.stand_ins) == 1 else "are stand-ins"
-    return (
-        f" {names[0].upper()}{names[1:]} of the library {verb} for it, and not adopted: unseen recordings are clearly likelier with the law."
-    )
+    why = "do not ask for more than the law" if described.steps else "are clearly likelier with the law"
+    return f" {names[0].upper()}{names[1:]} of the library {verb} for it, and not adopted: unseen recordings {why}."
 
 
 def _beside(described: Described) -> str:
