@@ -13,7 +13,6 @@ from rfdropo_bayes.audit.gain import LEVELS, noise_distance
 from rfdropo_bayes.audit.law_words import unknown_record
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
-from rfdropo_bayes.audit.prior_ends import decided_by_priors
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Screen, ScreenRow
 from rfdropo_bayes.audit.sentence import sentence
@@ -76,7 +75,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "residual_in_noise_deviations": base_rms,
         "remainder": _remainder(answer),
         "where": _where(answer),
-        "cautions": [caution.as_dict() for caution in decided_by_priors(answer.target, answer.draws)],
+        "cautions": [caution.as_dict() for caution in answer.doubts.priors],
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
         **unknown_record(answer),
         "next_experiment": next_experiment,

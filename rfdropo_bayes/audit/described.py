@@ -123,7 +123,7 @@ def _without_stand_ins(
 ) -> Described:
     """The law beside those mechanisms only that unseen recordings ask for once it is in the model.
 
-    What acts beside a named cause has stood-ins among the later ones. The law is looked for anew without these, and
+    What acts beside a named cause has stand-ins among the later ones. The law is looked for anew without these, and
     kept if unseen recordings are not clearly likelier with them.
 
     Args:
@@ -185,9 +185,11 @@ def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], No
     named = len(stages) - 1
     stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
     held_out = predicted(problem, model.judge.measured, stages)
-    found = found.cut(max(held_out.count - len(stages) + len(found.terms), 0))
-    if not found.terms:
-        return Described(found, model.steps)
+    if held_out.count < len(stages):
+        report(f"with {len(found.terms)} terms, an unseen recording cannot be simulated")
+        found = found.cut(max(held_out.count - 1 - named, 0))
+        if not found.terms:
+            return Described(found, model.steps)
     # As with what the library names, a law is cut to what unseen recordings support.
     kept = held_out.supported_from(named) - named or len(found.terms)
     if kept < len(found.terms):

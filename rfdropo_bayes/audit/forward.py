@@ -19,7 +19,7 @@ from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.journal import digest
 from rfdropo_bayes.bayes.batches import in_chunks
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS, Placing
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
@@ -309,11 +309,12 @@ class Forward:
         """What every recording shows at one point.
 
         Raises:
-            InputError: a rollout there did not end well.
+            NoLikelihoodError: a rollout there did not end well.
         """
         found, fine = self.observe(point[None])
         if not fine[0]:
-            raise InputError("a rollout at the optimum did not end well", where="audit", remedy=Result.DIVERGED.remedy)
+            words = "a rollout at the optimum did not end well"
+            raise NoLikelihoodError(words, where="audit", remedy=Result.DIVERGED.remedy)
         return {name: part[0] for name, part in found.items()}
 
     def tangents(self, points: Points, directions: Points) -> Fields:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -20,7 +20,7 @@ from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.port_rollouts import with_laws_of
 from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import NoLikelihoodError
 
 DRAWS = 60
 HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
@@ -166,7 +166,7 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
     A model whose rollout of an unseen recording does not end well predicts nothing, and none after it is asked.
 
     Raises:
-        InputError: the first model's rollout does not end well.
+        NoLikelihoodError: the first model's rollout does not end well.
     """
     count, every = len(problem.trajectories), len(problem.model.recordings.names)
     fits, judges = [stage.fit for stage in stages], [stage.judge for stage in stages]
@@ -175,21 +175,27 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
         tested = measurements_of(problem, range(count, every))
         unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
         predictions = list[UnseenErrors]()
-        for judge, fit, finer in stages:
-            forward = with_laws_of(judge.forward, simulated(problem, finer, tested, range(count, every)))
-            try:
-                found = _predict(replace(target, forward=forward, measurements=tested), fit, [problem.seed, 3])
-            except InputError:
-                if not predictions:
-                    raise
-                break
-            predictions.append(found)
+        with _up_to_the_last(predictions):
+            for judge, fit, finer in stages:
+                forward = with_laws_of(judge.forward, simulated(problem, finer, tested, range(count, every)))
+                own = replace(target, forward=forward, measurements=tested)
+                predictions.append(_predict(own, fit, [problem.seed, 3]))
     else:
         which, unseen, predictions = _left_out(problem, judges, target, fits)
     stages, judges = stages[: len(predictions)], judges[: len(predictions)]
     patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit, _ in stages]
     spreads, noises = [spread(judge, fit) for judge, fit, _ in stages], [judge.noise for judge in judges]
     return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
+
+
+@contextmanager
+def _up_to_the_last(predicted: Sequence[Any]) -> Iterator[None]:
+    """End where a model's rollout does not end well, with the models before it; an error where there are none."""
+    try:
+        yield
+    except NoLikelihoodError:
+        if not predicted:
+            raise
 
 
 def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:
@@ -212,13 +218,16 @@ def _left_out(
     else:
         held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"
         masks = [later_rows(measured.valid)[:, :, None]]
-    parts: list[list[np.ndarray]] = [[] for _ in fits]
-    for mask in masks:
-        mask = np.broadcast_to(mask, measured.count.shape)
-        for i, (judge, fit) in enumerate(zip(judges, fits, strict=True)):
-            kept = replace(judge.measurements, count=np.where(mask, 0.0, judge.measurements.count))
-            refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
-            parts[i].append(_predict(target.on(judge.forward), refitted, [problem.seed, 3]).errors)
+    parts = list[list[np.ndarray]]()
+    with _up_to_the_last(parts):
+        for judge, fit in zip(judges, fits, strict=True):
+            row = list[np.ndarray]()
+            for mask in masks:
+                count = np.where(mask, 0.0, judge.measurements.count)
+                kept = replace(judge.measurements, count=count)
+                refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
+                row.append(_predict(target.on(judge.forward), refitted, [problem.seed, 3]).errors)
+            parts.append(row)
     draws = min(len(part) for row in parts for part in row)
     predictions = []
     for row in parts:
@@ -244,6 +253,8 @@ def supported_steps(
     of the model with them; and the predictions of these recordings."""
     held_out = _held_out(problem, judge, search, base, steps)
     if held_out is not None and held_out.count <= len(steps):
+        name = steps[held_out.count - 1].name
+        search.report(f"with {name}, an unseen recording cannot be simulated: it is not supported")
         steps, last = steps[: held_out.count - 1], steps[held_out.count - 1].before
         if not steps:
             return steps, last, None

@@ -34,12 +34,14 @@ from rfdropo_bayes.audit.held_out import HeldOut, supported_steps
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements
+from rfdropo_bayes.audit.prior_ends import decided_by_priors
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Screen, p_in_words
 from rfdropo_bayes.audit.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.errors import InputError
 
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
@@ -93,11 +95,13 @@ class Doubts:
         shift: distance by which constants tell repeats apart [m]; None without repeats.
         numerical: how far half the time step and a finer mesh move the markers of the last model [m]; None where that
             is not known, or the finer one is the model.
+        priors: parameters of the base model that their prior decides.
     """
 
     suspected: Stacked | None
     shift: float | None
     numerical: float | None
+    priors: list[Caution]
 
 
 @dataclass(frozen=True)
@@ -266,6 +270,7 @@ def audit(
     remainder = _remainder(target, extended, described)
     if verdict in (PARTLY, UNEXPLAINED) and not steps:
         verdict = _weighed_up(problem, verdict, target, remainder, shown)
+    draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
     return Answer(
         verdict,
         problem,
@@ -275,8 +280,8 @@ def audit(
         validation,
         remainder,
         sizes,
-        sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds),
-        Doubts(suspected, target.measurements.shift, shown),
+        draws,
+        Doubts(suspected, target.measurements.shift, shown, decided_by_priors(target, draws)),
         Cost(stopped, judge.forward.rollouts + (finer.rollouts if finer else 0), deadline.profile),
     )
 

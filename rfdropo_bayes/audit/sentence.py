@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.law_words import law_sentence, ports_sentence
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import BEGINNING, begins_wrong, prequential
-from rfdropo_bayes.audit.prior_ends import decided_by_priors, in_words
+from rfdropo_bayes.audit.prior_ends import in_words
 from rfdropo_bayes.audit.screen import p_in_words
 from rfdropo_bayes.audit.verdict import EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
@@ -105,7 +105,7 @@ def _shifted(answer: Answer) -> str:
 
 def _decided(answer: Answer) -> str:
     """What is said of findings beside which a prior decides a parameter of the base model."""
-    return in_words(decided_by_priors(answer.target, answer.draws)) if answer.causes.steps else ""
+    return in_words(answer.doubts.priors) if answer.causes.steps else ""
 
 
 def _numerical(answer: Answer) -> str:

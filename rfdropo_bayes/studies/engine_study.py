@@ -30,7 +30,7 @@ from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.studies.fits import Job, run_fits
 from rfdropo_bayes.studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
-from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, EngineEffect, MuJoCoArm
+from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, EngineArm, EngineEffect, MuJoCoArm
 from rfdropo_bayes.studies.pyelastica_truth import ELASTICA_EFFECTS, ElasticaArm
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.audit import Workshop, audit, build_problem
@@ -44,9 +44,8 @@ CLOSE = 0.1  # of rho, within which a size is the one that was looked for
 # Sections of these arms do not swell: a prior from 0.4 to 0.499 would leave the truth out, and sizes make up for it.
 SWELLING = {"poisson_ratio": {"distribution": "Uniform", "low": 0.1, "high": 0.499}}
 AUDITED = {"refine": 2, "time_step": 0.005}
-MINUTES = (
-    300.0  # of an audit, by the clock on the wall: a study shares its machine, and one audit takes 9 of a processor
-)
+MINUTES = 300.0
+"""Of an audit by the clock on the wall: a study shares its machine, and an audit takes 9 minutes of a processor."""
 CENTRE = {"young_modulus": 2e6, "trunk_mass": 0.0911}
 
 
@@ -60,7 +59,7 @@ class Truth(NamedTuple):
         setting: of data sets, see `Setting`.
     """
 
-    arm: Callable[..., Any]
+    arm: type[EngineArm]
     effects: Mapping[str, EngineEffect]
     centre: Mapping[str, float]
     setting: Setting
@@ -205,7 +204,7 @@ def _recorded(
 
 
 def _sized(
-    base: Mapping[str, Any], arm: Any, effect: EngineEffect, rho: float, blank: Sequence[Any], out: Path
+    base: Mapping[str, Any], arm: EngineArm, effect: EngineEffect, rho: float, blank: Sequence[Any], out: Path
 ) -> tuple[float, float] | None:
     """The size of an effect that a refit of the base model cannot absorb, ``rho`` deviations of the noise of it."""
     fitted = list(blank[:FITTED])

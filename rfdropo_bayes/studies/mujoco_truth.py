@@ -8,6 +8,7 @@ is hidden is hidden by means of that engine: masses, gravity, dry friction, tend
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -224,27 +225,25 @@ def _guides(robot: Robot) -> list[tuple[str, tuple[float, float, float]]]:
 
 
 @dataclass(frozen=True)
-class MuJoCoArm:
-    """The robot in MuJoCo with an effect, as it is recorded.
+class EngineArm(ABC):
+    """The robot in another engine with an effect, as it is recorded.
 
     Attributes:
         robot: its file.
-        values: see `arm_xml`.
+        values: of its parameters, by name.
         effect: None for nothing.
-        links: see `arm_xml`.
     """
 
     robot: Robot
     values: Mapping[str, float]
     effect: EngineEffect | None = None
-    links: int = LINKS
-    _seen: dict[Any, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+    _seen: dict[Any, np.ndarray] = field(default_factory=dict, repr=False, compare=False, kw_only=True)
 
     def positions(self, recordings: Sequence[Trajectory], size: float) -> Float[np.ndarray, "recording time marker 3"]:
         """Noise-free positions [m] of recordings of one length under their commands, for a size of the effect.
 
         Raises:
-            InputError: MuJoCo is not installed, or warns of the motion.
+            InputError: the engine is not installed, or does not hold the motion.
         """
         found = []
         for recording in recordings:
@@ -253,6 +252,17 @@ class MuJoCoArm:
                 self._seen[key] = self._recorded(recording, size)
             found.append(self._seen[key])
         return np.stack(found)
+
+    @abstractmethod
+    def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
+        """Positions of one recording."""
+
+
+@dataclass(frozen=True)
+class MuJoCoArm(EngineArm):
+    """The robot in MuJoCo; its values and links are those of `arm_xml`."""
+
+    links: int = LINKS
 
     def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
         try:

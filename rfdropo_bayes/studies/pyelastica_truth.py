@@ -9,8 +9,8 @@ would need steps of 0.5 us.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from rfdropo_bayes.studies.mujoco_truth import (
     CONTROL,
     ENGINE_EFFECTS,
     POISSON,
+    EngineArm,
     EngineEffect,
     commanded,
     seen_at,
@@ -177,35 +178,11 @@ ELASTICA_EFFECTS: dict[str, EngineEffect] = {
 
 
 @dataclass(frozen=True)
-class ElasticaArm:
-    """The robot in PyElastica with an effect, as it is recorded.
+class ElasticaArm(EngineArm):
+    """The robot in PyElastica, of so many pieces; its values are ``young_modulus`` [Pa], ``trunk_mass`` [kg] and
+    ``rayleigh_mass`` [1/s]."""
 
-    Attributes:
-        robot: its file.
-        values: ``young_modulus`` [Pa], ``trunk_mass`` [kg] and ``rayleigh_mass`` [1/s].
-        effect: None for nothing.
-        elements: pieces of the body.
-    """
-
-    robot: Robot
-    values: Mapping[str, float]
-    effect: EngineEffect | None = None
     elements: int = ELEMENTS
-    _seen: dict[Any, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
-
-    def positions(self, recordings: Sequence[Trajectory], size: float) -> Float[np.ndarray, "recording time marker 3"]:
-        """Noise-free positions [m] of recordings of one length under their commands, for a size of the effect.
-
-        Raises:
-            InputError: PyElastica is not installed, or the motion is not finite.
-        """
-        found = []
-        for recording in recordings:
-            key = (recording.command.tobytes(), recording.time.tobytes(), size)
-            if key not in self._seen:
-                self._seen[key] = self._recorded(recording, size)
-            found.append(self._seen[key])
-        return np.stack(found)
 
     def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
         clock, held = commanded(self.robot, recording, self.effect, size)
@@ -273,6 +250,7 @@ class ElasticaArm:
         centre, between = 0.5 * (nodes[1:] + nodes[:-1]), nodes[1:-1]
         weighed = np.asarray(shape.mass_area_m2)
         density = self.values["trunk_mass"] / float(np.sum(weighed * np.diff(station)))
+        shear = modulus / (2.0 * (1.0 + POISSON))
         rod = elastica.CosseratRod.straight_rod(
             self.elements + 1,
             start=np.array([0.0, 0.0, nodes[0]]),
@@ -283,9 +261,8 @@ class ElasticaArm:
             base_radius=np.sqrt(along(centre, shape.axial_area_m2) / np.pi),
             density=density,
             youngs_modulus=modulus,
-            shear_modulus=modulus / (2.0 * (1.0 + POISSON)),
+            shear_modulus=shear,
         )
-        shear = modulus / (2.0 * (1.0 + POISSON))
         moment = np.asarray(shape.bending_moment_area_m4)
         rod.shear_matrix[:] = 0.0
         rod.shear_matrix[0, 0] = rod.shear_matrix[1, 1] = RIGID * shear * along(centre, shape.axial_area_m2)

@@ -260,6 +260,7 @@ def test_nothing_is_described_where_nothing_is_hidden():
     assert answer.causes.described is None
 
 
+@pytest.mark.slow
 def test_commands_tell_laws_apart_that_recordings_do_not():
     """Both channels have moved alike, so that the product of both is the square of either."""
     given = asked(5, Pushed(), alike=True)

@@ -183,6 +183,7 @@ def test_beside_an_error_of_the_mesh_below_the_noise_causes_are_named():
     assert [step.name for step in answer.causes.steps] == ["play"]
 
 
+@pytest.mark.slow
 def test_the_next_step_about_the_mesh_is_at_the_simulation():
     answer = audit(on_a_coarse_mesh(problem(TRUTH, 102)))
     words = next_experiment(answer)["sentence"]
@@ -195,6 +196,7 @@ def test_the_same_seed_gives_the_same_audit():
     assert untimed(first) == untimed(second)
 
 
+@pytest.mark.slow
 def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeypatch):
     asked = problem({**TRUTH, "play": 1.0}, 1)
 
@@ -320,7 +322,9 @@ def test_a_base_model_without_the_time_for_its_fit_is_refused():
         base_model(asked, asked.seed, deadline=Deadline(1e-6))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, pytest.param(0.95, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "share", [pytest.param(0.0, marks=pytest.mark.slow), 0.5, pytest.param(0.95, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("stated", [True, False])
 def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
     """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""
@@ -344,68 +348,6 @@ def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp
     if stated and share > 0.5:
         resumed = audit(asked, journal=Journal(tmp_path, resume=True))
         assert resumed.verdict == "explained"
-
-
-class Rough(Toy):
-    """Motion whose slope promises, everywhere, what a jump takes back: markers are 100 to 300 deviations of the noise
-    away, however far the gain goes down its saw teeth."""
-
-    def rollout(self, parameters, commands, steps=None):
-        observed = super().rollout(parameters, commands, steps)
-        jump = 0.5 + (1e5 * parameters["gain"]) % 1.0
-        return observed._replace(position=observed.position + 200.0 * NOISE * jump)
-
-
-@pytest.mark.slow
-def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
-    answer = audit(replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
-    assert answer.verdict == "no_verdict"
-    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
-    assert not content["base_fit_converged"]
-    assert content["findings"] == []
-    assert "the fit of the base model has not converged" in content["sentence"]
-    assert "--base" in content["next_experiment"]["sentence"]
-    assert "has not converged" in render_audit(shown(answer), content, "rough", "")
-
-
-class RoughAlone(Toy):
-    """Smaller saw teeth, that vanish with all the play of the truth."""
-
-    def rollout(self, parameters, commands, steps=None):
-        observed = super().rollout(parameters, commands, steps)
-        jump = (0.5 + (1e5 * parameters["gain"]) % 1.0) * jnp.abs(1.0 - parameters["play"])
-        return observed._replace(position=observed.position + 5.0 * NOISE * jump)
-
-
-@pytest.mark.slow
-def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it():
-    """What a base model lacks may drive it to where motion is rough; the library was not asked then."""
-    asked = replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(RoughAlone(), np.arange(4)))
-    answer = audit(asked)
-    assert not answer.base.converged
-    assert answer.converged
-    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
-    assert content["findings"][0]["mechanism"] == "play"
-    assert content["verdict"] in ("explained", "equivalent", "partly_explained")
-    assert "of the base model alone has not converged" in content["sentence"]
-
-
-def test_a_model_that_cannot_simulate_unseen_recordings_is_not_supported(monkeypatch):
-    """Its motion ends there; the audit goes on without it."""
-    asked, predict = problem({**TRUTH, "play": 1.0}, 1), held_out_module._predict
-    play = asked.candidate("play").indices[0]
-
-    def stops(target, fit, seed):
-        if play in fit.free:
-            raise InputError("a rollout at the optimum did not end well", where="audit", remedy="none")
-        return predict(target, fit, seed)
-
-    monkeypatch.setattr(held_out_module, "_predict", stops)
-    answer = audit(asked)
-    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
-    assert (answer.causes.unsupported, answer.causes.steps) == (["play"], [])
-    assert content["verdict"] in ("unexplained", "described")
-    assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
 def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
@@ -474,6 +416,7 @@ def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
     assert abs(start[asked.coordinates.space.names.index("lag")]) == pytest.approx(1.0, abs=0.35)
 
 
+@pytest.mark.slow
 def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it():
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
@@ -556,6 +499,7 @@ def test_where_nothing_is_wrong_a_stated_noise_is_not_suspected_however_low_the_
     assert answer.doubts.suspected is None
 
 
+@pytest.mark.slow
 def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     """The test recordings have the effect with the other sign."""
     fitted = unrepeated({"delay": 1.0}, 7)

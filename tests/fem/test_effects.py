@@ -98,6 +98,7 @@ def bent(law: fem.BendingLaw, force):
     return tip(NULL._replace(bending=law), force=force)
 
 
+@pytest.mark.slow
 def test_anisotropy_divides_the_planes():
     """Deflections P L^3 / 3 EI in the two planes, EI exp(a / 2) and EI exp(-a / 2)."""
     load = 1e-4

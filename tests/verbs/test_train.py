@@ -59,7 +59,8 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("task", ["TrunkReach-v0", pytest.param("TrunkPush-v0", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["TrunkReach-v0", "TrunkPush-v0"])
 def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
     steps = rfdropo("train", REACH, "--out", tmp_path / "policy", *settings).splitlines()[-3:]
