@@ -38,6 +38,7 @@ from rfdropo_bayes.verbs.audit import Workshop, build_problem
 
 ALL, NONE, FORCED = "all", "none", "forced"
 WITHIN = 1.15  # of the noise, an unseen error counts as explained
+MINUTES = 300.0  # no limit: what else the machine does must not decide a verdict
 
 
 def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: Workshop) -> dict[str, Any]:
@@ -55,7 +56,7 @@ def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: 
         problem = build_problem(model.spec, AuditTable(), model.runs(None, ())[0], [], seed, workshop=workshop)
         left_out = [candidate.name for candidate in problem.candidates]
     began, used = time.monotonic(), time.process_time()
-    found = rb.audit(model, test=unseen, seed=seed, workshop=workshop, exclude=left_out)
+    found = rb.audit(model, test=unseen, seed=seed, workshop=workshop, exclude=left_out, minutes=MINUTES)
     line |= {"size": hidden.size, "verdict": found.verdict, "sentence": found.sentence}
     line |= {"law": found.content["law"], "findings": [row["mechanism"] for row in found.content["findings"]]}
     line |= {"seconds": round(time.monotonic() - began, 1), "cpu_seconds": round(time.process_time() - used, 1)}
