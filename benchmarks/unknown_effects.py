@@ -33,7 +33,7 @@ from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line
 from rfdropo_bayes.model.experiment import AuditTable
-from rfdropo_bayes.studies.unknown_effects import EFFECTS, conceal
+from rfdropo_bayes.studies.unknown_effects import EFFECTS, FOREIGN, conceal
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 
 ALL, NONE, FORCED = "all", "none", "forced"
@@ -98,7 +98,7 @@ def judged(line: dict[str, Any], name: str, noise: float) -> dict[str, Any]:
     A port is right if the law acts there, or at a port that the law's ties list. A law is right if its first term has
     a kind of feature that says the effect.
     """
-    effect, law = EFFECTS.get(name), line["law"]
+    effect, law = (EFFECTS | FOREIGN).get(name), line["law"]
     if effect is None or law is None or line["verdict"] != DESCRIBED:
         return {"port_right": False, "law_right": False} if effect else {}
     ports = [law["port"], *(tie["port"] for tie in law["ties"])]

@@ -114,6 +114,33 @@ def _magnet(size: float, scene: Scene) -> dict[str, Any]:
     return {"force": _at_tip(0.1 * size * way / jnp.sqrt(square) * 0.03**2 / (0.03**2 + square))}
 
 
+def _rate_limited(u: Any, most: Any) -> Any:
+    """A command that a drive follows by at most so much a step [m]."""
+
+    def one(reached: Any, wanted: Any) -> tuple[Any, Any]:
+        reached = reached + jnp.clip(wanted - reached, -most, most)
+        return reached, reached
+
+    return jax.lax.scan(one, u[0], u)[1]
+
+
+def _lens(size: float, position: Any, time: Any, command: Any) -> Any:
+    """Barrel distortion about the axis of a camera that looks along z: lengths shrink with the square of the radius."""
+    square = jnp.sum(position[..., :2] ** 2, axis=-1, keepdims=True)
+    return position.at[..., :2].multiply(1.0 - 5.0 * size * square)
+
+
+def _filtered_marker(size: float, position: Any, time: Any, command: Any) -> Any:
+    """A tracker smooths marker m2 alone, by a first-order filter of 40 ms times the size."""
+    kept = jnp.exp(-(time[1] - time[0]) / (0.04 * size))
+
+    def one(slow: Any, seen: Any) -> tuple[Any, Any]:
+        slow = seen + kept * (slow - seen)
+        return slow, slow
+
+    return position.at[:, 1].set(jax.lax.scan(one, position[0, 1], position[:, 1])[1])
+
+
 EFFECTS: dict[str, Effect] = {
     "crosstalk": Effect(
         ("cable left",), ("product",), lambda a, s: {"command": _channel(1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])}
@@ -159,6 +186,50 @@ EFFECTS: dict[str, Effect] = {
     "zooming_camera": Effect(("camera scale",), ("time",), sees=_zoom),
 }
 """Of drives, body, surroundings, sensing and clocks."""
+
+FOREIGN: dict[str, Effect] = {
+    "rate_limited_drive": Effect(
+        ("cable left",),
+        ("lag", "rate", "low_pass"),
+        lambda a, s: {"command": _channel(1, _rate_limited(s.levels[:, 1], 2e-4 / a) - s.levels[:, 1])},
+    ),
+    "giving_pulley": Effect(
+        ("cable up",),
+        ("excess", "magnitude", "product", "command"),
+        lambda a, s: {"command": _channel(0, -0.3 * a * jnp.maximum(s.levels[:, 0] - 3e-3, 0.0))},
+    ),
+    "warming_cable": Effect(
+        ("cable right",), ("time",), lambda a, s: {"command": _channel(3, 1e-3 * a * -jnp.expm1(-s.time / 2.0))}
+    ),
+    "cable_that_jumps": Effect(
+        ("cable down",), ("time",), lambda a, s: {"command": _channel(2, 1e-3 * a * (s.time > 2.0))}
+    ),
+    "fan": Effect(
+        ("force x at the tip", "force x at the middle"),
+        (),
+        lambda a, s: {
+            "force": _at_tip(jnp.outer(0.02 * a * jnp.sin(4.4 * s.time), jnp.array([1.0, 0.0, 0.0])))
+        },
+    ),
+    "stiffening_body": Effect(
+        ("stiffness",),
+        ("position", "magnitude", "largest"),
+        lambda a, s: {"stiffness": 5.0 * a * jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1)},
+        moves=True,
+    ),
+    "lens": Effect(("camera scale", "camera x", "camera y"), ("product", "magnitude", "command"), sees=_lens),
+    "filtered_marker": Effect(("marker m2 x", "marker m2 y", "marker m2 z"), ("rate", "lag"), sees=_filtered_marker),
+    "crosstalk_and_slide": Effect(
+        ("cable left", "marker m3 along the body", "marker m3 z"),
+        ("product", "time"),
+        lambda a, s: {"command": _channel(1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])},
+        _slide,
+    ),
+    "clock_and_weak_cable": Effect(
+        ("observation delay",), ("time",), lambda a, s: {"command": _channel(0, -0.1 * a * s.levels[:, 0])}, _clock
+    ),
+}
+"""Effects that were written after the features, and that no feature was made for; of the last two each is two effects."""
 
 
 class Concealed(NamedTuple):
@@ -238,7 +309,7 @@ def conceal(
         what is hidden; None where no size of the effect reaches rho.
     """
     setting, rng, out = setting or Setting(), np.random.default_rng([seed, 42]), output_folder(out)
-    effect = EFFECTS[name] if name else None
+    effect = (EFFECTS | FOREIGN)[name] if name else None
     tables = experiment_tables(setting, fit=["fit_*.nc"])
     names = [f"fit_{k + 1}" for k in range(REPEATS + OTHERS)] + [f"test_{k + 1}" for k in range(UNTOUCHED)]
     blank = blank_recordings(setting, rng, names, [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)])
