@@ -207,9 +207,7 @@ FOREIGN: dict[str, Effect] = {
     "fan": Effect(
         ("force x at the tip", "force x at the middle"),
         (),
-        lambda a, s: {
-            "force": _at_tip(jnp.outer(0.02 * a * jnp.sin(4.4 * s.time), jnp.array([1.0, 0.0, 0.0])))
-        },
+        lambda a, s: {"force": _at_tip(jnp.outer(0.02 * a * jnp.sin(4.4 * s.time), jnp.array([1.0, 0.0, 0.0])))},
     ),
     "stiffening_body": Effect(
         ("stiffness",),
