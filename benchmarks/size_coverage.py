@@ -1,13 +1,13 @@
 """How often 90 % intervals of an effect's size hold the truth, if the right mechanism is in the model; resumable.
 
-    python benchmarks/size_coverage.py [--datasets 100] [--rho 0.5] [--seed 0] [--made finer|same] [--noise repeats|known]
-                                       [--out reports/size_coverage]
+    python benchmarks/size_coverage.py [--datasets 100] [--rho 0.5] [--seed 0] [--made finer|same]
+                                       [--noise repeats|known] [--out reports/size_coverage]
 
-Every data set has one effect of the library in it, as in the study of audits (`rfdropo_bayes/studies/hidden_effects.py`).
-Nothing is looked for: base parameters and the effect's own are climbed together from the truth, so that what is left to
-go wrong is the interval itself. ``--made same`` takes the mesh and time step of the fit for the data, too, and ``--noise
-known`` the noise that made them: each takes one reason for misses away. Deviations are those that an audit reports, with
-forces and masses over Young's modulus.
+Every data set has one effect of the library in it, as in the study of audits (`studies/hidden_effects.py`). Nothing is
+looked for: base parameters and the effect's own are climbed together from the truth, so that what is left to go wrong
+is the interval itself. ``--made same`` takes the mesh and time step of the fit for the data, too, and ``--noise known``
+the noise that made them: each takes one reason for misses away. Deviations are those that an audit reports, with forces
+and masses over Young's modulus.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import first_target
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.space import force_power
 from rfdropo_bayes.files import append_line
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable
-from rfdropo_bayes.bayes.space import force_power
 from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, Hidden, Setting, hide
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 

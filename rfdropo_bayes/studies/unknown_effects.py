@@ -227,7 +227,7 @@ FOREIGN: dict[str, Effect] = {
         ("observation delay",), ("time",), lambda a, s: {"command": _channel(0, -0.1 * a * s.levels[:, 0])}, _clock
     ),
 }
-"""Effects that were written after the features, and that no feature was made for; of the last two each is two effects."""
+"""Effects that were written after the features, for which no feature was made; the last two are two effects each."""
 
 
 class Concealed(NamedTuple):
