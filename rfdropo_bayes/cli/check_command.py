@@ -37,8 +37,9 @@ def check(
         typer.echo(f"\nnote: {note}")
     for doubt in found.doubts:
         typer.echo(f"\nDOUBTFUL: {doubt}")
-    for file in found.files:
-        typer.echo(f"\npicture: {file}")
+    if found.files:
+        count = len(found.files)
+        typer.echo(f"\npictures: {found.files[0]}" + (f" and {count - 1} more beside it" if count > 1 else ""))
     for problem in found.problems:
         typer.echo(f"\nPROBLEM: {problem}")
     if found.problems:

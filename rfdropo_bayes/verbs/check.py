@@ -104,9 +104,12 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
     _say_robot(found, robot)
     recordings = {role: _read(found, experiment, folder, role) for role in ("fit", "test")}
+    first: list[tuple[str, str]] = []
     for role, trajectories in recordings.items():
         for trajectory in trajectories:
-            _say_recording(found, trajectory, role, robot)
+            own = _of_recording(found, trajectory, role, robot)
+            found.lines += _unlike(own, first)
+            first = first or own
     named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
     if isinstance(robot, Robot):
         _say_placement(found, experiment, robot, [*recordings["fit"], *recordings["test"]])
@@ -194,16 +197,25 @@ def _read(found: Check, experiment: Experiment, folder: Path, role: Literal["fit
     return list(readable.values())
 
 
-def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> None:
-    """Rows, markers, masks and commands of one recording, beside those of the robot."""
+def _unlike(lines: list[tuple[str, str]], first: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """The lines of a recording that are not those of the first one."""
+    if not first:
+        return lines
+    known = {text for _, text in first}
+    own = [lines[0], *(line for line in lines[1:] if line[1] not in known)]
+    return own if len(own) == len(lines) else [*own, ("", f"all else as {first[0][0].partition(': ')[2]}")]
+
+
+def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> list[tuple[str, str]]:
+    """Lines of one recording: rows, markers, masks and commands, beside those of the robot."""
     gaps = np.diff(trajectory.time)
     step = sample_time(trajectory.time)
     rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
     found.doubts += [f"{trajectory.name}: {note}" for note in trajectory.notes]
     if gaps.max() > IRREGULAR * step:
         rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
-    found.lines.append((f"{role}: {trajectory.name}", rows))
-    found.lines += [("", text) for text in (*_markers(found, trajectory, robot), *_commands(found, trajectory, robot))]
+    lines = [(f"{role}: {trajectory.name}", rows)]
+    lines += [("", text) for text in (*_markers(found, trajectory, robot), *_commands(found, trajectory, robot))]
     further = [
         word
         for word, values in (
@@ -214,9 +226,10 @@ def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Workp
         if values is not None
     ]
     if further:
-        found.lines.append(("", f"also {' and '.join(further)}"))
+        lines.append(("", f"also {' and '.join(further)}"))
     if trajectory.missing:
-        found.lines.append(("", f"left out: {trajectory.missing}"))
+        lines.append(("", f"left out: {trajectory.missing}"))
+    return lines
 
 
 def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:

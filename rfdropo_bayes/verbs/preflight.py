@@ -40,6 +40,8 @@ PRIOR_DRAWS = 2000
 KNOWN = 0.01  # relative error with which a part is weighed, or a parameter measured by itself
 TENSION_ERROR = 0.05  # relative error of tensions that are not measured yet
 TURNS, STILL = 200, 1e-10  # of the rotation to readable directions
+NAMES, REMEDIES = 6, 3  # most that a sentence names: of parameters, the largest parts, and of remedies, the best
+BY_ITSELF = "measured by itself"
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,11 @@ class Direction:
     kept: float
     ended_by: dict[str, float]
     sentence: str
+
+    @property
+    def needs_own_measurement(self) -> bool:
+        """Whether it is a single parameter that nothing but a measurement of its own would determine."""
+        return len(self.together) == 1 and bool(self.ended_by) and all(BY_ITSELF in what for what in self.ended_by)
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,7 @@ class Preflight:
 
     def lines(self) -> list[tuple[str, str]]:
         """Pairs of a label and a text, an empty label going on with the one before."""
-        found = [direction.sentence for direction in self.directions] or ["every combination, more or less"]
+        found = self._undetermined() or ["every combination, more or less"]
         rows = [("undetermined" if self.directions else "determined", found[0]), *(("", text) for text in found[1:])]
         rows += [("" if index else "excited", text) for index, text in enumerate(self._excitation())]
         cost = (
@@ -101,14 +108,20 @@ class Preflight:
         rows += [("cost", cost), ("assumed", self.noise)]
         return rows
 
+    def _undetermined(self) -> list[str]:
+        """Sentences; parameters that nothing but a measurement of their own would determine share one."""
+        lonely = [each for each in self.directions if each.needs_own_measurement]
+        if len(lonely) < 2:
+            return [direction.sentence for direction in self.directions]
+        names = ", ".join(name for direction in lonely for name in direction.together)
+        least = min(direction.kept for direction in lonely)
+        words = f"{names} (each keeps at least {100 * least:.0f} % of its prior spread; {_OWN})"
+        return [words, *(direction.sentence for direction in self.directions if direction not in lonely)]
+
     def _excitation(self) -> list[str]:
         blind = [name for name, row in self.parameters.iterrows() if row["alone"] > FREE]
-        words = (
-            [f"{', '.join(map(str, blind))}: the motion hardly depends on it, even were all else known"]
-            if blind
-            else []
-        )
-        words += [f"{run}: {', '.join(names)} never changes" for run, names in self.channels.items() if names]
+        words = [f"{', '.join(map(str, blind))}: hardly changes the motion, even were all else known"] if blind else []
+        words += [f"{run}: {', '.join(names)} never moved" for run, names in self.channels.items() if names]
         return words or ["all parameters change the motion by more than the noise, and all channels move"]
 
     def as_dict(self) -> dict[str, Any]:
@@ -410,7 +423,7 @@ def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> di
         weight = np.zeros((1, *(len(coordinates.names),) * 2))
         size = 1.0 if coordinates.logarithmic[k] else max(abs(coordinates.mean[k]), coordinates.sd[k])
         weight[0, k, k] = (coordinates.sd[k] / (KNOWN * size)) ** 2
-        word = "weighed" if units.get(name.partition("@")[0]) == "kg" else "measured by itself"
+        word = "weighed" if units.get(name.partition("@")[0]) == "kg" else BY_ITSELF
         found[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
     return found
 
@@ -430,7 +443,9 @@ def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mappin
         sign = 1.0 if vector[names[0]] > 0.0 else -1.0
         together = {coordinates.names[k]: float(sign * vector[k] * coordinates.sd[k]) for k in names}
         logs = all(coordinates.logarithmic[k] for k in names)
-        found.append(Direction(together, kept, ended, _sentence(together, logs, kept, ended)))
+        leading = sorted(sorted(names, key=lambda k: -abs(vector[k]))[:NAMES])
+        told = {coordinates.names[k]: together[coordinates.names[k]] for k in leading}
+        found.append(Direction(together, kept, ended, _sentence(told, len(names) - len(told), logs, kept, ended)))
     return sorted(found, key=lambda direction: -direction.kept)
 
 
@@ -466,20 +481,27 @@ def _readable(vectors: Float[np.ndarray, "parameter direction"]) -> Float[np.nda
     return vectors @ rotation
 
 
-def _sentence(together: Mapping[str, float], logs: bool, kept: float, ended: Mapping[str, float]) -> str:
-    names = list(together)
+_OWN = f"nothing but the parameter {BY_ITSELF} would end it"
+
+
+def _sentence(told: Mapping[str, float], smaller: int, logs: bool, kept: float, ended: Mapping[str, float]) -> str:
+    """A direction in words: its largest parts, and how many smaller ones there are."""
+    names = list(told)
     if len(names) == 1:
         subject = names[0]
-    elif logs and all(value > 0.0 for value in together.values()):
+    elif logs and all(value > 0.0 for value in told.values()):
         subject = f"the common scale of {', '.join(names[:-1])} and {names[-1]}"
     else:
-        up = [name for name, value in together.items() if value > 0.0]
-        down = [name for name, value in together.items() if value < 0.0]
+        up = [name for name, value in told.items() if value > 0.0]
+        down = [name for name, value in told.items() if value < 0.0]
         subject = f"{' and '.join(up)} up" + (f" with {' and '.join(down)} down" if down else " together")
-    remedy = "; nothing that was tried here would end it"
-    if ended:
-        remedy = f"; ended by {', or '.join(f'{what}: {100 * share:.0f} %' for what, share in ended.items())}"
-    return f"{subject} (keeps {100 * kept:.0f} % of its prior spread{remedy})"
+    if smaller:
+        subject += f", and {smaller} smaller part{'s' if smaller > 1 else ''}"
+    best = [f"{what}: {100 * share:.0f} %" for what, share in list(ended.items())[:REMEDIES]]
+    remedy = f"ended by {', or '.join(best)}" if best else "nothing that was tried here would end it"
+    if len(names) == 1 and ended and all(BY_ITSELF in what for what in ended):
+        remedy = _OWN
+    return f"{subject} (keeps {100 * kept:.0f} % of its prior spread; {remedy})"
 
 
 def _shares(coordinates: _Coordinates, information: np.ndarray) -> pd.DataFrame:

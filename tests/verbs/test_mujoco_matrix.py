@@ -88,7 +88,7 @@ def test_a_model_of_others_is_calibrated_drawn_predicted_and_written_back(place)
     experiment = Path("reacher") / "experiment.toml"
     rfdropo("init", "reacher.xml", "--recording", "run_*.csv")
     told = rfdropo("check", experiment)
-    assert "body_mass: the motion hardly depends on it" in told  # armatures of 1 kg m2 move bodies of 36 g
+    assert "body_mass: hardly changes the motion" in told  # armatures of 1 kg m2 move bodies of 36 g
     rfdropo("view", experiment, "--out", "run.png")
     rfdropo("simulate", experiment, "--out", "simulation")
     rfdropo("calibrate", experiment, "--out", "fit", overrides=QUICK)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
-from rfdropo_bayes.verbs.preflight import _covariance, _Noise, innovations, preflight
+from rfdropo_bayes.verbs.preflight import _Coordinates, _covariance, _directions, _Noise, innovations, preflight
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -132,7 +133,27 @@ def test_commands_that_do_not_move_excite_nothing():
     assert len(found.directions) == 3
     assert (found.parameters["alone"] > 0.99).all()
     assert found.channels == {"run": ["end"]}
-    assert "run: end never changes" in str(found)
+    assert "run: end never moved" in str(found)
+
+
+def test_a_direction_of_many_parameters_names_the_largest_parts():
+    names = [f"gain_{k}" for k in range(9)]
+    vector = np.linspace(1.0, 0.6, 9)
+    information = 1e4 * (np.eye(9) - np.outer(vector, vector) / (vector @ vector))
+    coordinates = _Coordinates(tuple(names), np.zeros(9, dtype=bool), np.zeros(9), np.ones(9))
+    (direction,) = _directions(coordinates, information[None], {})
+    assert list(direction.together) == names
+    assert direction.sentence.startswith(f"{' and '.join(names[:6])} up together, and 3 smaller parts (keeps 100 %")
+
+
+def test_parameters_that_need_a_measurement_of_their_own_share_a_sentence():
+    coordinates = _Coordinates(("stiffness", "offset", "zero"), np.zeros(3, dtype=bool), np.zeros(3), np.ones(3))
+    own = {f"{name} measured by itself (to 1 %)": 1e4 * np.diag(row)[None] for name, row in zip(
+        coordinates.names, np.eye(3), strict=True)}  # fmt: skip
+    found = _directions(coordinates, np.diag([1e4, 0.0, 0.0])[None], own)
+    assert [direction.needs_own_measurement for direction in found] == [True, True]
+    told = replace(preflight(model(), [recording()]), directions=found)
+    assert "undetermined  offset, zero (each keeps at least 100 % of its prior spread; nothing but" in str(told)
 
 
 def test_the_cost_is_that_of_the_budget():
@@ -174,6 +195,6 @@ def test_check_says_it_of_the_demo(tmp_path):
     assert told.exit_code == 0, told.output
     assert "the common scale of young_modulus and trunk_mass" in told.output
     content = json.loads((out / "check.json").read_text())
-    (direction,) = content["preflight"]["directions"]
+    direction = next(d for d in content["preflight"]["directions"] if "young_modulus" in d["together"])
     assert any("tensions" in what for what in direction["ended_by"])
     assert any("trunk_mass weighed" in what for what in direction["ended_by"])
