@@ -159,7 +159,8 @@ def predict_new(
     markers = model.markers.like(recordings)
     if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
         step = sample_time(*(t.time for t in trajectories))
-        markers = replace(markers, known=noise_of_markers(left.every(step), left.markers, recordings))
+        noise = noise_of_markers(left.every(step), left.markers, recordings)
+        markers = replace(markers, known=noise.at(recordings.steps))
     fresh = replace(model, space=space, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = _known_recordings(model.space, fitted)

@@ -269,6 +269,7 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
     fixed, space = fitted_parts(asked.fit)
     recordings = gather_recordings(asked.model.simulator, rest)
     noise = noise_of_markers(asked.left.every(sample_time(rest[0].time)), asked.left.markers, recordings)
+    noise = noise.at(recordings.steps)
     channel = Markers.gather(recordings, STATED, noise)
     slow = recorded_day_error(record)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
