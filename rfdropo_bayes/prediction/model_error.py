@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.noise.autoregression import ONE_RATE, RESIDUALS, estimate_noise
-from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
+from rfdropo_bayes.data.sample_times import ONE_RATE, sample_time
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 
 MODEL_ERROR = "model_error"  # among the attributes of a posterior

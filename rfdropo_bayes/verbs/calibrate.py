@@ -356,7 +356,7 @@ def gather_facts(
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
-        baselines=baseline_errors(list(fitted), list(tested)),
+        baselines=baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
         fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,

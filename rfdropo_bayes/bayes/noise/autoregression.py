@@ -22,6 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 from scipy.stats import chi2
 
+from rfdropo_bayes.data.sample_times import ONE_RATE
+
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
@@ -29,7 +31,6 @@ MISFIT = "misfit"  # white, of the size of what a model that is far off leaves
 SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
 LEAST_ROWS = 3  # for each column, to estimate correlations at all
-ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
 
 
 @dataclass(frozen=True)
