@@ -13,6 +13,8 @@ class Code(StrEnum):
 
     AT_BOUND = "at_bound"
     """A parameter's posterior is cut off by a bound, or by an end of its prior."""
+    IMPLAUSIBLE = "implausible"
+    """The mass or stiffness that was fitted or fixed is that of no soft robot."""
     AGAINST_PRIOR = "against_prior"
     """The data put parameters where their prior hardly is."""
     BUDGET_SPENT = "budget_spent"

@@ -82,9 +82,9 @@ def outlooks(
     for k in range(len(sequences)):
 
         def whiten(series: np.ndarray, k: int = k) -> np.ndarray:
-            own = series[..., k, :, :]
-            white = target.noise.whiten(own, valid[k])
-            return white.reshape(*own.shape[:-2], -1)
+            own = series[..., [k], :, :]
+            white = target.noise.at(target.measurements.steps[:1]).whiten(own, valid[[k]])
+            return white.reshape(*own.shape[:-3], -1)
 
         news = [whiten(series) for series in predicted]
         jacobians = [whiten(slope).T for slope in slopes]

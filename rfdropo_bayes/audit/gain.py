@@ -46,16 +46,22 @@ class Unseen(NamedTuple):
         position: coordinates of the markers [m], which are the first columns.
         valid: where a value may be used, in all columns.
         names: of the trajectories.
+        steps: time between their rows [s]; all of one rate by default.
     """
 
     position: Float[np.ndarray, "trajectory time coordinate"]
     valid: Bool[np.ndarray, "trajectory time column"]
     names: tuple[str, ...]
+    steps: Float[np.ndarray, " trajectory"] | None = None
 
     @property
     def markers(self) -> int:
         """Number of columns that are coordinates of markers."""
         return self.position.shape[-1]
+
+    def under(self, noise: Stacked) -> Stacked:
+        """A noise in the rows of these trajectories."""
+        return noise if self.steps is None else noise.at(self.steps)
 
     def predicted(self, prediction: UnseenErrors) -> Float[np.ndarray, "trajectory time coordinate"]:
         """Where a model has the markers, in the mean over its draws [m]."""
@@ -210,7 +216,7 @@ def noise_distance(noise: Autoregression) -> float:
 def _elpd(unseen: Unseen, prediction: UnseenErrors, noise: Stacked) -> Float[np.ndarray, " trajectory"]:
     """Log predictive density of each trajectory, up to the noise's normaliser."""
     residual = np.where(unseen.valid, prediction.errors, 0.0)
-    white = noise.whiten(residual, unseen.valid)
+    white = unseen.under(noise).whiten(residual, unseen.valid)
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 
@@ -241,7 +247,7 @@ def explained_fraction(
     """
     count = len(unseen.valid)
     sums, floors, drawn, expected = np.zeros((2, count)), np.zeros(count), np.zeros((RESAMPLES, 2)), np.zeros(RESAMPLES)
-    for part, own in zip(noise.parts, noise.columns, strict=True):
+    for part, own in zip(unseen.under(noise).parts, noise.columns, strict=True):
         valid = unseen.valid[..., own]
         axes = _components(pattern[..., own], valid.shape[-1])
         spectrum = _noise_power(part, base.shape[1])

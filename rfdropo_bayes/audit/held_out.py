@@ -201,7 +201,7 @@ def _up_to_the_last(predicted: Sequence[Any]) -> Iterator[None]:
 def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:
     position = np.asarray(tested.channels[0].measured)
     names = tuple(" and ".join(recordings[i] for i in group) for group in tested.members)
-    return Unseen(position.reshape(*position.shape[:2], -1), valid, names)
+    return Unseen(position.reshape(*position.shape[:2], -1), valid, names, tested.steps)
 
 
 def _left_out(

@@ -117,8 +117,10 @@ def _shares(judge: FitTarget, fit: Fit) -> list[float]:
     errors = _errors(judge, fit.residual)
     series = np.where(measured.valid, errors / _sizes(judge, errors), 0.0)
     reach = measured.series((fit.jacobian @ np.linalg.cholesky(fit.covariance)).T)
+    steps = measured.steps
     return [
-        lasting_series(series[..., own], measured.valid[..., own], reach[..., own]).share for own in measured.columns
+        lasting_series(series[..., own], measured.valid[..., own], reach[..., own], steps).share
+        for own in measured.columns
     ]
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.channels import Channel, Series, WeighedParts
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, estimate_noise
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, estimate_noise, steps_of
 from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.repeat_noise import (
@@ -20,6 +21,7 @@ from rfdropo_bayes.bayes.repeat_noise import (
     mean_error,
     mean_of,
     repeat_shift,
+    repeated,
     repeats_apart,
     spread,
 )
@@ -59,6 +61,19 @@ class Measurements:
         return self.count > 0
 
     @property
+    def steps(self) -> Float[np.ndarray, " group"]:
+        """Time between rows of each group [s]."""
+        return steps_of(self.time)
+
+    @property
+    def single_steps(self) -> Float[np.ndarray, " recording"]:
+        """Time between rows of each recording [s]."""
+        found = np.empty(len(self.single_valid))
+        for group, step in zip(self.members, self.steps, strict=True):
+            found[list(group)] = step
+        return found
+
+    @property
     def single_valid(self) -> Bool[np.ndarray, "recording time column"]:
         """What may be used of each recording."""
         return np.concatenate([channel.valid for channel in self.single], axis=-1)
@@ -92,7 +107,7 @@ class Measurements:
         self, errors: Float[np.ndarray, "*batch group time column"], noise: Stacked
     ) -> Float[np.ndarray, "*batch n"]:
         """Errors of the means as independent unit normals, flattened."""
-        return noise.whiten(errors, self.valid, self.count).reshape(*errors.shape[:-3], self.count.size)
+        return noise.at(self.steps).whiten(errors, self.valid, self.count).reshape(*errors.shape[:-3], self.count.size)
 
     def mean_of(
         self, single: Float[np.ndarray, "*batch recording time column"]
@@ -110,7 +125,8 @@ class Measurements:
         if not self.has_repeats:
             return None
         deviations, valid, share = self.deviations(self.spread)
-        return repeat_shift(deviations[..., : self.markers], valid[..., : self.markers], share)
+        steps = self.single_steps[repeated(self.members)]
+        return repeat_shift(deviations[..., : self.markers], valid[..., : self.markers], share, steps)
 
     def noise(
         self, errors: Float[np.ndarray, "recording time column"], parameters: int, like: Stacked | None = None
@@ -123,14 +139,16 @@ class Measurements:
             parameters: fitted by that model.
             like: an earlier estimate, whose order, pooling and sharing are kept.
         """
-        left, valid = errors, self.single_valid
+        left, valid, steps = errors, self.single_valid, self.single_steps
         share, source = max(1.0 - parameters / max(valid.sum(), 1), 0.1), RESIDUALS
         if self.has_repeats:
             (left, valid, share), source = self.deviations(errors), REPEATS
+            steps = steps[repeated(self.members)]
         found = []
         for index, own in enumerate(self.columns):
             model = None if like is None else like.parts[index]
-            found.append(_estimated(left[..., own], valid[..., own], share, source, model))
+            options = {"source": source, "steps": steps, **_like(model, source)}
+            found.append(estimate_noise(left[..., own], valid[..., own], share, **options))
         return Stacked(tuple(found))
 
     @property
@@ -139,12 +157,11 @@ class Measurements:
         return side_by_side([channel.valid.shape[-1] for channel in self.channels])
 
 
-def _estimated(
-    deviations: np.ndarray, valid: np.ndarray, share: float, source: str, like: Autoregression | None
-) -> Autoregression:
+def _like(like: Autoregression | None, source: str) -> dict[str, Any]:
+    """Order, pooling and sharing of an estimate: as those of an earlier one where there is any."""
     shared = False if source == RESIDUALS else (None if like is None else like.correlation is not None)
     order, pooled = (None, None) if like is None else (like.order, bool(np.ptp(like.scale) == 0.0))
-    return estimate_noise(deviations, valid, share, source=source, order=order, pooled=pooled, shared=shared)
+    return {"order": order, "pooled": pooled, "shared": shared}
 
 
 def gather_measurements(

@@ -169,7 +169,7 @@ def null_residuals(
         count: data sets.
     """
     found = np.empty((count, len(base)))
-    drawn = noise.draw(rng, (count, *measurements.spread.shape))
+    drawn = noise.at(measurements.single_steps).draw(rng, (count, *measurements.spread.shape))
     if noise.source == RESIDUALS:
         drawn = _fitted(measurements, noise, base, drawn)
     for row, single in enumerate(drawn):
@@ -190,7 +190,7 @@ def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn:
     rows = base[: measurements.count.size]
     left = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
     fitted = np.empty_like(drawn)
-    fitted[:, order] = noise.colour(left, measurements.valid)
+    fitted[:, order] = noise.at(measurements.steps).colour(left, measurements.valid)
     return fitted
 
 

@@ -20,7 +20,6 @@ from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 
 MOST_EXCLUDED = 3
 MOST_SIZES = 4
-ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
 
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -34,7 +33,6 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         + _shifted(answer)
         + _decided(answer)
         + _numerical(answer)
-        + _rates(answer)
         + _beginning(answer)
         + _left_out(answer)
         + _stopped(answer)
@@ -116,18 +114,6 @@ def _numerical(answer: Answer) -> str:
     return (
         f" Half the time step and a finer mesh move the last model's markers by {1e3 * error:.2g} mm, the noise by "
         f"{1e3 * noise:.2g} mm: what is found may stand for an error of the simulation; shorten [simulator] time_step."
-    )
-
-
-def _rates(answer: Answer) -> str:
-    """What is said of recordings whose rows come at several rates, under a noise that lasts."""
-    steps = np.median(np.diff(answer.target.measurements.time, axis=1), axis=1)
-    if not answer.target.noise.first.order or steps.max() <= ONE_RATE * steps.min():
-        return ""
-    apart = f"{1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms"
-    return (
-        f" Rows come every {apart}, by recording, and the memory of the noise is counted in rows, as if all had one "
-        "rate: bring the recordings onto one clock with [data] resample."
     )
 
 

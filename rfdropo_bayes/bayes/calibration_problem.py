@@ -275,6 +275,11 @@ class CalibrationProblem:
         other.__dict__.pop("fingerprint", None)
         return other
 
+    @property
+    def row_steps(self) -> Float[np.ndarray, " recording"]:
+        """Time between rows of each recording [s]."""
+        return self.model.recordings.steps
+
     def independent_series(
         self, residuals: Float[np.ndarray, "*batch m"]
     ) -> dict[str, tuple[Float[np.ndarray, "*batch recording time column"], Bool[np.ndarray, "recording time column"]]]:

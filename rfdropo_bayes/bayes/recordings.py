@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.bayes.noise import Timeline, timeline
+from rfdropo_bayes.bayes.noise.autoregression import steps_of
 from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
@@ -38,6 +39,11 @@ class RecordingSet:
     position: Float[np.ndarray, "recording time marker 3"]
     line: Timeline
     commands: Commands
+
+    @property
+    def steps(self) -> Float[np.ndarray, " recording"]:
+        """Time between rows of each recording [s]."""
+        return steps_of(self.time)
 
     def of(self, index: Sequence[int], rows: int | None = None) -> RecordingSet:
         """Some recordings only, and of each the first rows."""

@@ -99,16 +99,21 @@ def deviations(
     return np.concatenate(parts), np.concatenate(counted), freedom / max(values, 1)
 
 
-def with_noise_of_repeats(channel: Series, groups: Groups) -> Series:
-    """The channel under the noise that its repeats differ by.
+def repeated(groups: Groups) -> list[int]:
+    """Indices of the recordings that were repeated, in the order in which `deviations` has them."""
+    return [index for group in groups if len(group) > 1 for index in group]
+
+
+def with_noise_of_repeats(channel: Series, groups: Groups, steps: Float[np.ndarray, " recording"]) -> Series:
+    """The channel under the noise that its repeats differ by, in recordings whose rows are ``steps`` seconds apart.
 
     Raises:
         InputError: nothing was repeated.
     """
-    return replace(channel, known=noise_of_repeats(channel, groups))
+    return replace(channel, known=noise_of_repeats(channel, groups, steps).at(steps))
 
 
-def noise_of_repeats(channel: Series, groups: Groups) -> Autoregression:
+def noise_of_repeats(channel: Series, groups: Groups, steps: Float[np.ndarray, " recording"]) -> Autoregression:
     """The noise that the repeats of a channel differ by.
 
     Raises:
@@ -121,11 +126,14 @@ def noise_of_repeats(channel: Series, groups: Groups) -> Autoregression:
             remedy="repeat one, or let the noise be inferred",
         )
     found = deviations(spread(channel, groups), channel.valid, groups)
-    return estimate_noise(*found, source=REPEATS, shared=None)
+    return estimate_noise(*found, source=REPEATS, steps=steps[repeated(groups)], shared=None)
 
 
 def repeat_shift(
-    deviations: Float[np.ndarray, "series time column"], valid: Bool[np.ndarray, "series time column"], share: float
+    deviations: Float[np.ndarray, "series time column"],
+    valid: Bool[np.ndarray, "series time column"],
+    share: float,
+    steps: Float[np.ndarray, " series"],
 ) -> float | None:
     """Root mean square distance of a marker that constants, one for each repeat and column, make [m].
 
@@ -137,6 +145,7 @@ def repeat_shift(
         deviations: of repeats from their mean.
         valid: which may be used.
         share: degrees of freedom per value.
+        steps: time between rows of each repeat [s].
 
     Returns:
         None where the noise within the recordings accounts for all that they differ by, or nearly all.
@@ -146,14 +155,16 @@ def repeat_shift(
         return None
     mean = np.where(valid, deviations, 0.0).sum(axis=1, keepdims=True) / np.maximum(rows, 1)
     within = np.where(valid, deviations - mean, 0.0)
-    noise = estimate_noise(within, valid, share, source=REPEATS, shared=None)
-    predicted = _variance_of_mean(noise, int(rows.max()))
+    noise = estimate_noise(within, valid, share, source=REPEATS, steps=steps, shared=None)
     known = rows[:, 0] > 0
+    predicted = np.stack(
+        [_variance_of_mean(noise.resampled(step), int(own.max())) for step, own in zip(steps, rows[:, 0], strict=True)]
+    )
     white = noise.separate(mean[:, 0] / np.sqrt(predicted), known)
     freedom = known.sum() * share
     if chi2.sf(np.sum(white[known] ** 2), freedom) > SURE:
         return None
-    excess = float(np.sum(mean[:, 0] ** 2 * known)) / freedom - float(np.mean(predicted))
+    excess = float(np.sum(mean[:, 0] ** 2 * known)) / freedom - float(np.mean(predicted[known]))
     return float(np.sqrt(3.0 * excess)) if excess > LEAST**2 * float(np.mean(noise.scale**2)) else None
 
 

@@ -61,6 +61,11 @@ class InferredParameter:
         """Name of the simulator's parameter that it sets or adds to."""
         return self.added_to or self.spec.name
 
+    @property
+    def of_recordings_alone(self) -> bool:
+        """Whether it is that of one recording, and neither a deviation nor the property of a group."""
+        return bool(self.recording) and not self.added_to and not self.scoped
+
     def holds_for(self, recording: str) -> bool:
         """Whether it is one of a recording's parameters."""
         return not self.recording or recording == self.recording or recording in self.members

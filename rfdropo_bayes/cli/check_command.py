@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rfdropo_bayes.cli.options import ExperimentFile, Overrides
+from rfdropo_bayes.cli.options import ExperimentFile, Overrides, experiment_name
 
 if TYPE_CHECKING:
     from rfdropo_bayes.verbs.check import Check
@@ -29,7 +29,8 @@ def check(
     and says what a fit could determine and how long it takes."""
     from rfdropo_bayes.verbs.check import run_check
 
-    found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [], ahead=not quick)
+    folder = out or Path("reports") / f"{experiment_name(experiment)}-check"
+    found = run_check(experiment, folder, overrides or [], ahead=not quick)
     width = max(len(label) for label, _ in found.lines)
     for label, text in found.lines:
         typer.echo(f"{label:<{width}}  {text}")

@@ -19,7 +19,8 @@ OutFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="folder to write to  [default: reports/EXPERIMENT_COMMAND; of calibrate reports/EXPERIMENT]",
+        help="folder to write to  [default: reports/EXPERIMENT_COMMAND; of calibrate reports/EXPERIMENT; "
+        "of DIR/experiment.toml the name of DIR]",
     ),
 ]
 Overrides = Annotated[
@@ -33,6 +34,7 @@ Overrides = Annotated[
 Seed = Annotated[int | None, typer.Option(help="seed; that of the experiment file by default")]
 Resume = Annotated[bool, typer.Option("--resume", help="go on from the checkpoint of an interrupted run")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="start anew, whatever the folder holds")]
+WRITTEN = ("experiment", "config", "extended")  # names of the experiment files that init, runs and audits write
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as JSON, and nothing else")]
 
@@ -54,10 +56,19 @@ def folder_for(
         InputError: a file is missing, or the folder holds a run that is not to be replaced.
     """
     look_through(experiment, overrides or [])
-    name = experiment.stem if command == "calibrate" else f"{experiment.stem}_{command.split()[0]}"
+    title = experiment_name(experiment)
+    name = title if command == "calibrate" else f"{title}_{command.split()[0]}"
     folder = out or Path("reports") / name
     check_folder(folder, command, resume=resume, overwrite=overwrite)
     return folder
+
+
+def experiment_name(experiment: Path) -> str:
+    """The name that default folders have: that of the file, or of its folder for the names that commands give files."""
+    folder = experiment.resolve().parent.name
+    if not folder or experiment.stem not in WRITTEN:
+        return experiment.stem
+    return folder if experiment.stem == "experiment" else f"{folder}_{experiment.stem}"
 
 
 def see_calibration(folder: Path | None, option: str) -> None:

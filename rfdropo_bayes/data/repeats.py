@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rfdropo_bayes.data.sample_times import ONE_RATE, sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
 
 
@@ -74,13 +75,34 @@ def _variances(repeats: Sequence[Trajectory]) -> dict[str, float]:
 def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
     """Unbiased noise per marker [m], pooled over every group of repeats; None if nothing was repeated.
 
-    The first row of a group counts like any other: rest poses that differ from repeat to repeat are part of the floor.
+    Recordings of the same commands at another speed, or in rows of another rate, are not compared. The first row of a
+    group counts like any other: rest poses that differ from repeat to repeat are part of the floor.
     """
     total: dict[str, float] = {}
     freedom: dict[str, int] = {}
-    for group in group_repeats(trajectories):
-        if len(group) > 1:
-            for marker, variance in _variances([trajectories[index] for index in group]).items():
+    for found in group_repeats(trajectories):
+        for group in _of_one_pace([trajectories[index] for index in found]):
+            for marker, variance in (_variances(group) if len(group) > 1 else {}).items():
                 total[marker] = total.get(marker, 0.0) + (len(group) - 1) * variance
                 freedom[marker] = freedom.get(marker, 0) + len(group) - 1
     return {marker: float(np.sqrt(total[marker] / freedom[marker])) for marker in total} or None
+
+
+def _of_one_pace(repeats: Sequence[Trajectory]) -> list[list[Trajectory]]:
+    """Recordings of the same commands, divided where commands or rows follow one another faster than in others."""
+    groups: list[list[Trajectory]] = []
+    for repeat in repeats:
+        own = _pace(repeat)
+        alike = (group for group in groups if np.all(np.abs(np.log(own / _pace(group[0]))) < np.log(ONE_RATE)))
+        group = next(alike, None)
+        if group is None:
+            groups.append([repeat])
+        else:
+            group.append(repeat)
+    return groups
+
+
+def _pace(repeat: Trajectory) -> np.ndarray:
+    """Time between rows, and from the first command to the last [s]; one where there is no second command."""
+    span = float(np.ptp(repeat.command_time))
+    return np.array([sample_time(repeat.time), span if span > 0.0 else 1.0])

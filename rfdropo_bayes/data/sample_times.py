@@ -24,6 +24,7 @@ BUNCHED = 0.1  # share of such rows from which on stamps are those of deliveries
 LONGEST_WINDOW, SHORTEST_WINDOW = 100, 8  # rows that a local interval is a mean of: several deliveries
 JUMP = 10.0  # intervals: a longer one is a jump of the clock, or lost rows
 COARSE = 0.1  # share of repeated stamps from which on the clock is coarser than the rows
+ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
 SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: what follows a moving robot lies between
 SET_BACK = 0.01  # share of rows out of order up to which the clock was set back; else rows are not sorted
 

@@ -7,8 +7,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-
 from rfdropo_bayes.bayes.calibration_problem import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.channels import (
     Channel,
@@ -58,7 +56,6 @@ from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assem
 Entry = TypeVar("Entry")
 AnySimulator = RobotSimulator | BlackBoxSimulator
 
-ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
 KNOWN = (REPEATS, STATED)  # noise of the positions that is not inferred
 
 SWITCHED = {  # channels beside the markers, by the key of [model] that makes their readings data
@@ -345,7 +342,8 @@ def gather_channels(
         channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=spec.noise != "white"))
     if spec.noise == REPEATS:
         groups = group_recordings(recordings, trajectories)
-        channels = [with_noise_of_repeats(channel, groups) for channel in channels if isinstance(channel, Series)]
+        rates = recordings.steps
+        channels = [with_noise_of_repeats(each, groups, rates) for each in channels if isinstance(each, Series)]
     if spec.weighed:
         channels.append(WeighedParts(spec.weighed).named(inferred))
     return tuple(channels)
@@ -355,23 +353,16 @@ def stated_noise(spec: ModelSpec, recordings: RecordingSet, first: Trajectory) -
     """The noise of the positions that is stated.
 
     Raises:
-        InputError: none is stated; or one that lasts, and recordings whose rows come at several rates.
+        InputError: none is stated.
     """
     noise = spec.stated
     if noise is None or noise.standard_deviation == 0.0:
         raise InputError("no noise is stated", where='[model] noise = "stated"', remedy="give [noise]")
     values = {OBSERVATION_NOISE.name: noise.standard_deviation}
     if noise.correlation_time is not None:
-        steps = np.median(np.diff(recordings.time, axis=1), axis=1)
-        if steps.max() > ONE_RATE * steps.min():
-            raise InputError(
-                f"rows come every {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms, by recording, and a noise "
-                "that lasts is told from row to row",
-                where="[noise] correlation_time",
-                remedy="bring the recordings onto one clock with [data] resample, or leave it out",
-            )
         values[NOISE_CORRELATION_TIME.name] = noise.correlation_time
-    return Markers.gather(recordings, STATED).stated(values, float(first.dataset.attrs["sample_time"]))
+    step = float(first.dataset.attrs["sample_time"])
+    return Markers.gather(recordings, STATED).stated(values, step).at(recordings.steps)
 
 
 def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
-from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.data.sample_times import ONE_RATE, sample_time
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 
 MODEL_ERROR = "model_error"  # among the attributes of a posterior
@@ -50,7 +50,7 @@ class ModelError(NamedTuple):
     def every(self, step: float) -> Autoregression:
         """The same as noise of rows that are ``step`` seconds apart."""
         memory = np.array([1.0, np.exp(-step / self.correlation_time)])
-        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
+        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf, step=step)
 
     def lasting(self, step: float, rows: int) -> Autoregression:
         """The same as noise of ``rows`` rows, with the part of it that lasts for all of them.
@@ -64,7 +64,7 @@ class ModelError(NamedTuple):
         fast = _fast(np.exp(-step / self.correlation_time), constant)
         lags = np.arange(min(rows, MOST_LAGS))
         memory = constant + (1.0 - constant) * fast**lags
-        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
+        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf, step=step)
 
     def constant(self, seconds: float) -> float:
         """Share of the variance that lasts for so many seconds: with it, the mean error over as many varies as it did
@@ -105,18 +105,21 @@ def model_error(
     for i, p in enumerate(fitted):
         error[i, : len(p.time)] = (p.observed - p.central).reshape(len(p.time), -1)
         valid[i, : len(p.time)] = np.repeat(p.mask, 3, axis=1)
-    noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, order=1, pooled=False, shared=None)
+    steps = np.array([sample_time(p.time) for p in fitted])
+    noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, steps=steps, order=1, pooled=False, shared=None)
     across = noise.correlation
     share = 1.0 if across is None else len(across) / float(np.sum(across**2))
-    step = sample_time(*(p.time for p in fitted))
+    step = float(noise.step or steps[0])
     memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
     scale, lasts = tuple((widened * noise.scale).tolist()), float(-step / np.log(memory))
-    return ModelError(tuple(markers), scale, lasts, share, step, error_memory(fitted))
+    return ModelError(tuple(markers), scale, lasts, share, step, error_memory(fitted, step))
 
 
-def error_memory(fitted: Sequence[RecordingPrediction]) -> tuple[float, ...]:
+def error_memory(predictions: Sequence[RecordingPrediction], step: float) -> tuple[float, ...]:
     """Correlation of the error of mean predictions with that of 0, 1, 2 ... rows before, about zero; of half a
-    recording at most, beyond which there are few pairs."""
+    recording at most, beyond which there are few pairs. Recordings whose rows are not ``step`` seconds apart have no
+    part in it."""
+    fitted = [p for p in predictions if 1.0 / ONE_RATE < sample_time(p.time) / step < ONE_RATE]
     count = min(MOST_LAGS, max(len(p.time) for p in fitted) // 2)
     products, pairs = np.zeros(count), np.zeros(count)
     for p in fitted:
@@ -151,4 +154,5 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     if found.memory or not fitted or record.attrs.get(ADAPTED_TO):
         return found
     # An earlier version did not say how long errors last.
-    return found._replace(step=sample_time(*(p.time for p in fitted)), memory=error_memory(fitted))
+    step = sample_time(*(p.time for p in fitted))
+    return found._replace(step=step, memory=error_memory(fitted, step))

@@ -159,10 +159,11 @@ def predict_new(
     markers = model.markers.like(recordings)
     if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
         step = sample_time(*(t.time for t in trajectories))
-        markers = replace(markers, known=noise_of_markers(left.every(step), left.markers, recordings))
+        noise = noise_of_markers(left.every(step), left.markers, recordings)
+        markers = replace(markers, known=noise.at(recordings.steps))
     fresh = replace(model, space=space, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)
-    own = {whole(name) for name in fitted}
+    own = _known_recordings(model.space, fitted)
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]
     new = [n for n in names if whole(n) not in own]
     extended, unmatched = match_first_row(problem, extended, new, drawn, left, row_key)
@@ -224,11 +225,11 @@ def _for_new_recordings(
     groups: Patterns,
 ) -> tuple[ParameterSpace, Batch]:
     """The space with its per-recording parameters renamed to the new recordings, and values for them."""
-    own = {whole(recording) for recording in fitted}
+    own = _known_recordings(space, fitted)
     shared = [p for p in space.parameters if not p.recording]
     families: dict[str, list[InferredParameter]] = {}
     for parameter in space.parameters:
-        if parameter.recording and not parameter.added_to and not parameter.scoped:
+        if parameter.of_recordings_alone:
             families.setdefault(parameter.spec.name, []).append(parameter)
     extended = {p.name: values[p.name] for p in shared}
     count = len(next(iter(values.values())))
@@ -238,8 +239,9 @@ def _for_new_recordings(
         chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
         for name, family in families.items():
             members = [p for p in family if whole(p.recording) == whole(recording)]
-            if not members and len(family) == len(fitted) and whole(recording) not in own:
-                members = family
+            of_fit = [p for p in family if p.recording in fitted]
+            if not members and len(of_fit) == len(fitted) and whole(recording) not in own:
+                members = of_fit
             if not members:
                 continue
             pool = np.stack([values[member.name] for member in members])
@@ -259,6 +261,11 @@ def _for_new_recordings(
         extended[parameter.name] = drawn
         parameters.append(parameter)
     return ParameterSpace(tuple(parameters)), extended
+
+
+def _known_recordings(space: ParameterSpace, fitted: Sequence[str]) -> set[str]:
+    """Recordings that were fitted, or that an adapted posterior has values of from the fit before."""
+    return {whole(name) for name in (*fitted, *(p.recording for p in space.parameters if p.of_recordings_alone))}
 
 
 def _deviations(fitted: Sequence[InferredParameter], groups: Mapping[str, tuple[str, ...]]) -> list[InferredParameter]:

@@ -127,15 +127,27 @@ def _tolerance(recording: Trajectory) -> float:
 
 
 def baseline_errors(
-    fit: Sequence[Trajectory], test: Sequence[Trajectory], *, trained_on: str = ""
+    fit: Sequence[Trajectory],
+    test: Sequence[Trajectory],
+    *,
+    markers: Sequence[str] | None = None,
+    trained_on: str = "",
 ) -> dict[str, BaselineErrors]:
-    """Train every predictor on the fit recordings and score it on both roles.
+    """Train every predictor on the fit recordings and score it on both roles, by the markers that all of them have.
 
     Args:
         fit: recordings a fit may see.
         test: recordings no fit sees; may be empty.
+        markers: of the robot, in its order; others do not count. Those of the first recording by default.
         trained_on: words for the fit recordings; by default their number and length.
+
+    Returns:
+        By name; empty where no marker is in all recordings.
     """
+    shared = [name for name in markers or fit[0].marker_names if all(name in t.marker_names for t in (*fit, *test))]
+    if not shared:
+        return {}
+    fit, test = ([_with_markers(t, shared) for t in recordings] for recordings in (fit, test))
     seconds = sum(float(t.time[-1]) for t in fit)
     trained_on = trained_on or f"{seconds:.4g} s in {len(fit)} recording{'s' if len(fit) != 1 else ''}"
     groups = [list(group) for group in group_repeats(fit)]
@@ -160,6 +172,13 @@ def baseline_errors(
         name: _scored(name, title, description, predict, fit, test)
         for name, (title, description, predict) in predictors.items()
     }
+
+
+def _with_markers(recording: Trajectory, markers: Sequence[str]) -> Trajectory:
+    """A recording with these of its markers, in this order."""
+    if recording.marker_names == tuple(markers):
+        return recording
+    return Trajectory(recording.dataset.sel(marker=list(markers)))
 
 
 def _describe(fir: FirRegression, trained_on: str) -> str:

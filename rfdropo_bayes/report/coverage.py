@@ -38,13 +38,13 @@ class Coverage(NamedTuple):
 
 
 def coverage(recordings: Sequence[RecordingPrediction], *, nominal: Sequence[float] = NOMINAL) -> Coverage:
-    """Observed against nominal coverage over all usable coordinates of all rows."""
+    """Observed against nominal coverage over all usable coordinates of all rows; recordings may have other markers."""
     transformed = [probability_transform(recording) for recording in recordings]
-    markers = recordings[0].marker_names if recordings else ()
-    by_marker = {
-        name: _shares(np.concatenate([t[:, m].reshape(-1) for t in transformed]), nominal)
-        for m, name in enumerate(markers)
-    }
+    parts: dict[str, list[np.ndarray]] = {}
+    for recording, values in zip(recordings, transformed, strict=True):
+        for index, name in enumerate(recording.marker_names):
+            parts.setdefault(name, []).append(values[:, index].reshape(-1))
+    by_marker = {name: _shares(np.concatenate(own), nominal) for name, own in parts.items()}
     everything = np.concatenate([t.reshape(-1) for t in transformed]) if transformed else np.zeros(0)
     return Coverage(_shares(everything, nominal), by_marker)
 

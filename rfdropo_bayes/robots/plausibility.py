@@ -5,6 +5,7 @@ Bounds are far beyond what is built: they catch factors of a thousand, not bad g
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,14 +43,36 @@ def implausible(robot: Robot) -> str | None:
         return f"gravity_m_s2 is {gravity:.4g} m/s2: is it in metres?"
     if robot.time_step_s > SLOWEST:
         return f"time_step_s is {robot.time_step_s:.4g} s: is it in seconds?"
-    density = float(robot.density(robot.parameters["trunk_mass"].nominal))
-    if not DENSITIES[0] <= density <= DENSITIES[1]:
-        mass = robot.parameters["trunk_mass"].nominal
-        volume = f"a volume of {robot.body.volume_m3:.4g} m3"
-        return (
-            f"trunk_mass is {mass:.4g} kg in {volume}, or {density:.3g} kg/m3: are they in kilograms and cubic metres?"
-        )
-    modulus = robot.parameters["young_modulus"].nominal
-    if not MODULI[0] <= modulus <= MODULI[1]:
-        return f"young_modulus is {modulus:.4g} Pa: is it in pascals?"
+    nominal = {name: (parameter.nominal, parameter.nominal) for name, parameter in robot.parameters.items()}
+    return implausible_values(robot, nominal)
+
+
+def implausible_values(robot: Robot, ranges: Mapping[str, tuple[float, float]]) -> str | None:
+    """A mass or stiffness of the body that no soft robot has; None where all may be.
+
+    Args:
+        robot: whose body has them.
+        ranges: least and largest likely value of each parameter [SI], by name; only a range that lies beyond the
+            plausible values as a whole is one.
+    """
+    for name, (low, high) in ranges.items():
+        if name == "trunk_mass" and (found := _beyond(robot.density(low), robot.density(high), DENSITIES)):
+            volume = f"a volume of {robot.body.volume_m3:.4g} m3"
+            return (
+                f"trunk_mass is {_words(low, high)} kg in {volume}, or {found:.3g} kg/m3: are they in kilograms and "
+                "cubic metres?"
+            )
+        if name == "young_modulus" and _beyond(low, high, MODULI):
+            return f"young_modulus is {_words(low, high)} Pa: is it in pascals?"
     return None
+
+
+def _beyond(low: float, high: float, ends: tuple[float, float]) -> float | None:
+    """The end of a range that is nearest to the plausible values, where none of the range is among them."""
+    if high < ends[0]:
+        return float(high)
+    return float(low) if low > ends[1] else None
+
+
+def _words(low: float, high: float) -> str:
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"

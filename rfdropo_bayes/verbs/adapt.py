@@ -269,6 +269,7 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
     fixed, space = fitted_parts(asked.fit)
     recordings = gather_recordings(asked.model.simulator, rest)
     noise = noise_of_markers(asked.left.every(sample_time(rest[0].time)), asked.left.markers, recordings)
+    noise = noise.at(recordings.steps)
     channel = Markers.gather(recordings, STATED, noise)
     slow = recorded_day_error(record)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
@@ -454,7 +455,7 @@ def day_space(
     added += [replace(p, members=tuple(recordings)) for p in space.parameters if p.scoped and p.recording == day]
     families: dict[str, list[InferredParameter]] = {}
     for p in space.parameters:
-        if p.recording and not p.added_to and not p.scoped:
+        if p.of_recordings_alone and p.recording in fitted:
             families.setdefault(p.spec.name, []).append(p)
     # A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
     every = [ps[0] for ps in families.values() if len(ps) == len(fitted)]
@@ -531,11 +532,10 @@ def _record(
 
 
 def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:
-    """What the groups that were fitted have of their own, and its values under each draw of the body before: the
-    folder of a day predicts recordings of the other days, too."""
+    """Parameters that other groups and recordings have of their own, and their values under each draw of the body
+    before: the folder of a day predicts recordings of the other days, too."""
     known = asked.space.names
-    others = [p for p in fitted_parts(asked.fit)[1].parameters if p.added_to or p.scoped]
-    others = [p for p in others if p.name not in known]
+    others = [p for p in fitted_parts(asked.fit)[1].parameters if p.recording and p.name not in known]
     return others, thin({p.name: asked.fit.record.posterior[p.name] for p in others}, draws) if others else {}
 
 

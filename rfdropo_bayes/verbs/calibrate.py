@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.space import SEPARATOR
-from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
@@ -27,7 +27,13 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
+from rfdropo_bayes.posteriors import (
+    ParameterInfo,
+    PosteriorRecord,
+    ProductOfPowers,
+    RecordingPrediction,
+    central_interval,
+)
 from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, left_out_sentence, recorded_day_error
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_error
 from rfdropo_bayes.prediction.predictive import (
@@ -50,7 +56,8 @@ from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, resid
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.results.calibrated import Calibration
-from rfdropo_bayes.robots import robot_shape
+from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
 
@@ -323,6 +330,7 @@ def gather_facts(
     floor = noise_floor([*fitted, *tested])
     slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
     undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
+    strange = [] if robot is None else implausible_fit(robot, problem.model.fixed, record)
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -335,7 +343,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        cautions=[*result.cautions, *unmatched, *undriven, *residual_cautions(checks, problem.model.noise)],
+        cautions=[*result.cautions, *unmatched, *undriven, *strange, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),
@@ -348,7 +356,7 @@ def gather_facts(
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
-        baselines=baseline_errors(list(fitted), list(tested)),
+        baselines=baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
         fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,
@@ -359,6 +367,13 @@ def gather_facts(
         details=result.details,
         outline=None if robot is None else robot_shape(robot),
     )
+
+
+def implausible_fit(robot: Robot, fixed: Mapping[str, float], record: PosteriorRecord) -> list[Caution]:
+    """A caution where nine tenths of the draws, or a fixed value, are a mass or stiffness that no soft robot has."""
+    drawn = {info.name.partition(SEPARATOR)[0]: central_interval(record.flat(info.name)) for info in record.free}
+    found = implausible_values(robot, {**{name: (value, value) for name, value in fixed.items()}, **drawn})
+    return [] if found is None else [Caution(Code.IMPLAUSIBLE, found)]
 
 
 def known_noise(problem: CalibrationProblem) -> dict[str, Any]:

@@ -8,8 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import jax
 import numpy as np
 
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import (
     Trajectory,
     check_channels,
@@ -30,15 +32,17 @@ from rfdropo_bayes.model.experiment import AuditTable, Experiment, load_experime
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
+from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
+from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
-from rfdropo_bayes.verbs.preflight import Preflight, preflight
+from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 
 MILLIMETRES = 1e3
 IRREGULAR = 1.5
@@ -365,6 +369,8 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
             words = ", ".join(f"{k} {v:g}" for k, v in table.items() if k != "distribution")
             text = f"{parameter.name} [{parameter.spec.unit}] ~ {table.get('distribution')}({words})"
             found.lines.append(("inferred" if index == 0 else "", text))
+        doubt = implausible_values(spec.robot, _ranges(model)) if isinstance(spec.robot, Robot) else None
+        found.doubts += [] if doubt is None else [doubt]
     recorded = {
         "tension": any(t.tension is not None for t in fitted),
         "motor_angle": any(t.motor_angle is not None for t in fitted),
@@ -374,6 +380,13 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         if there and not asdict(spec.channels)[key]:
             words = key.replace("_", " ")
             found.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
+
+
+def _ranges(model: TrajectoryModel) -> dict[str, tuple[float, float]]:
+    """Where the prior has nine tenths of every parameter, and values that are fixed."""
+    drawn = model.space.sample(jax.random.key(0), PRIOR_DRAWS)
+    known = {name: (value, value) for name, value in model.fixed.items()}
+    return known | {p.spec.name: central_interval(np.asarray(drawn[p.name])) for p in model.space.parameters}
 
 
 def _see_candidates(spec: ModelSpec, table: AuditTable) -> None:

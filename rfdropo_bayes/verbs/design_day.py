@@ -166,6 +166,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(model.simulator, runs)
     noise = noise_of_markers(left.every(sample_time(runs[0].time)), left.markers, recordings)
+    noise = noise.at(recordings.steps)
     space = day_space(space, model, recordings.names, DAY, fit.record.attrs[FITTED])
     drawn = fit.record.posterior
     body = {name: value for name, value in space.typical_scales.items() if name not in drawn}

@@ -292,8 +292,8 @@ def _markers(
         )
     recalled = Autoregression.from_dict(known)
     if memory is not None:
-        recalled = replace(recalled, autocorrelation=memory)
-    own = noise_of_markers(recalled, known["markers"], recordings)
+        recalled = replace(recalled, autocorrelation=memory, step=None)
+    own = noise_of_markers(recalled, known["markers"], recordings).at(recordings.steps)
     return Markers.gather(recordings, noise, own)
 
 

@@ -64,14 +64,6 @@ def test_the_page_shows_the_markers_that_all_recordings_have(answer):
         np.testing.assert_array_equal(track.series["measured"], other.series["measured"])
 
 
-def test_rows_of_several_rates_under_a_noise_that_lasts_are_said(answer):
-    assert "onto one clock" not in said(answer)
-    measured = answer.target.measurements
-    time = measured.time * np.where(np.arange(len(measured.time)) == 1, 5.0, 1.0)[:, None]
-    target = replace(answer.target, measurements=replace(measured, time=time))
-    assert "Rows come every 50 to 250 ms, by recording" in said(replace(answer, target=target))
-
-
 def test_the_next_step_is_about_the_largest_share(answer):
     first, second = (step.name for step in answer.causes.steps)
     following = next_experiment(answer)

@@ -124,4 +124,4 @@ def test_constants_between_repeats_are_found_and_noise_is_not_taken_for_them(sha
         sizes.append(found)
     assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(1.5e-3 * np.sqrt(3), rel=0.4)
     short = np.zeros((3, 5, 6))
-    assert repeat_shift(short, np.ones(short.shape, dtype=bool), 2 / 3) is None
+    assert repeat_shift(short, np.ones(short.shape, dtype=bool), 2 / 3, np.full(3, 0.01)) is None

@@ -185,7 +185,7 @@ def measurements(single: np.ndarray, members: tuple[tuple[int, ...], ...]) -> Me
     firsts = [group[0] for group in members]
     count = np.stack([np.full(single.shape[1:], float(len(group))) for group in members])
     joined = replace(channel.of_recordings(firsts), readings=mean_of(channel, members))
-    time = np.zeros((len(members), single.shape[1]))
+    time = np.tile(0.05 * np.arange(single.shape[1]), (len(members), 1))
     names = tuple("abcdefgh"[index] for index in firsts)
     return Measurements(names, members, time, (joined,), (channel,), None, count, spread(channel, members))
 

@@ -199,14 +199,14 @@ def test_noise_of_repeats_is_that_which_they_differ_by():
     gathered = gather_recordings(Puller(), reads)
     groups = group_recordings(gathered, reads)
     assert groups == (tuple(range(10)),)
-    markers = with_noise_of_repeats(Markers.gather(gathered, "repeats"), groups)
+    markers = with_noise_of_repeats(Markers.gather(gathered, "repeats"), groups, gathered.steps)
     assert markers.specs == ()
     assert markers.known.source == "repeats"
     np.testing.assert_allclose(markers.known.scale, 3e-3, rtol=0.2)
     tension = Tension.gather(Puller(), reads, ROWS)
-    np.testing.assert_allclose(with_noise_of_repeats(tension, groups).known.scale, 0.05, rtol=0.3)
+    np.testing.assert_allclose(with_noise_of_repeats(tension, groups, gathered.steps).known.scale, 0.05, rtol=0.3)
     with pytest.raises(InputError, match="carried out twice"):
-        with_noise_of_repeats(markers, ((0,), (1,)))
+        with_noise_of_repeats(markers, ((0,), (1,)), gathered.steps)
 
 
 @pytest.mark.slow
@@ -222,7 +222,8 @@ def test_a_calibration_under_the_noise_of_repeats_has_the_width_of_generalised_l
             noise[row] = 0.6 * noise[row - 1] + 0.8 * noise[row]
         reads.append(recording(seed, noise))
     gathered = gather_recordings(Puller(), reads)
-    known = with_noise_of_repeats(Markers.gather(gathered, "repeats"), group_recordings(gathered, reads)).known
+    groups = group_recordings(gathered, reads)
+    known = with_noise_of_repeats(Markers.gather(gathered, "repeats"), groups, gathered.steps).known
     assert known.order >= 1
     options = {"starts": 1, "blocks": 1, "draws": 4000}
     result = methods.run(problem(*reads, known=known), "laplace", options, jax.random.key(3))

@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.cli.options import experiment_name
 
 ROOT = Path(__file__).resolve().parents[2]
 # A line of its own, in a block or a comment; or a command in running words.
@@ -72,6 +73,7 @@ def test_no_two_documented_runs_share_a_folder():
         if name not in ("calibrate", "audit"):
             continue
         stem = Path(options["experiment"]).stem
-        folder = options["out"] or Path("reports") / (stem if name == "calibrate" else f"{stem}_{name}")
+        title = experiment_name(Path(options["experiment"]))
+        folder = options["out"] or Path("reports") / (title if name == "calibrate" else f"{title}_{name}")
         runs.setdefault(str(folder), set()).add((name, stem, tuple(options.get("between") or ())))
     assert {folder: found for folder, found in runs.items() if len(found) > 1 and folder.startswith("reports/")} == {}

@@ -40,6 +40,19 @@ def test_pure_error_recovers_the_noise(build):
         assert floor[marker] == pytest.approx(np.sqrt(3.0) * 1e-3, rel=3 * standard_error)
 
 
+@pytest.mark.parametrize("stretched", ["time", "command_time"])
+def test_recordings_at_another_speed_or_rate_are_no_noise(build, stretched):
+    """The same commands, twice as slow, or in rows twice as far apart: row k is no repeat of row k."""
+    sent = {"command": build(rows=20).command, "command_time": 0.1 * np.arange(19), "time": 0.1 * np.arange(20)}
+    first = build(rows=20, **sent)
+    other = build(rows=20, position=first.position + 0.02, **sent | {stretched: 2.0 * sent[stretched]})
+    assert group_repeats([first, other]) == [[0, 1]]
+    assert noise_floor([first, other]) is None
+    floor = noise_floor([first, other, build(rows=20, **sent)])
+    assert floor is not None
+    assert max(floor.values()) < 1e-12
+
+
 def test_masked_rows_do_not_count(build):
     first = build()
     position, mask = first.position.copy(), np.ones((11, 2), dtype=bool)

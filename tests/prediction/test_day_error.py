@@ -127,7 +127,7 @@ def test_the_lasting_part_of_an_error_is_told_from_one_that_is_forgotten():
             error = np.sqrt(1.0 - constant) * np.stack(fast) + np.sqrt(constant) * rng.normal(size=3)
             found.append(RecordingPrediction("a", "fit", TIME, ("tip",), error[:, None], MASK, none[None], none))
         lasts = -0.1 / np.log(constant + (1.0 - constant) * memory)
-        left = ModelError(("tip",), (1.0, 1.0, 1.0), lasts, step=0.1, memory=error_memory(found))
+        left = ModelError(("tip",), (1.0, 1.0, 1.0), lasts, step=0.1, memory=error_memory(found, 0.1))
         assert left.constant(5.0) == pytest.approx(constant, abs=0.06)
         correlation = left.lasting(0.1, 50).autocorrelation
         assert correlation[-1] == pytest.approx(constant, abs=0.06)

@@ -143,3 +143,16 @@ def test_known_figures_of_the_hanging_trunk(datasets: Path) -> None:
     assert "as long as this one" in short["copied_mean"].reason
     long = baseline_errors([whole.slice_rows(0, 9999).resample(0.05)], test)
     assert headline(long["fir_cubic"]) < 18.8
+
+
+def test_recordings_without_some_markers_are_scored_by_those_that_all_have(run: Any) -> None:
+    """Whatever the order of the markers: a calibration must not end when its baselines are counted."""
+    names = run.fit[0].marker_names
+    plain = baseline_errors(run.fit, run.test, markers=names[:1])
+    turned = [Trajectory(t.dataset.sel(marker=list(names[::-1]))) for t in run.fit]
+    fewer = [Trajectory(t.dataset.sel(marker=[names[0]])) for t in run.test]
+    found = baseline_errors([turned[0], *run.fit[1:]], fewer, markers=names)
+    assert plain["mean_pose"].test is not None
+    for name, errors in plain.items():
+        assert errors.test == found[name].test, name
+    assert baseline_errors(run.fit, fewer, markers=names[1:]) == {}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -52,6 +54,22 @@ def test_masked_values_are_left_out() -> None:
     assert coverage([none]).over_all == {0.5: None, 0.9: None}
     assert coverage([]).over_all == {0.5: None, 0.9: None}
     assert transform_curve([none]) is None
+
+
+def test_coverage_is_that_of_each_marker_by_name() -> None:
+    """Recordings that lack a marker, in either order: no marker has the share of another one."""
+    wide, narrow = gaussian(3.0, rows=200), gaussian(0.3, rows=200)
+    both = replace(
+        wide,
+        marker_names=("mid", "tip"),
+        observed=np.concatenate([wide.observed, narrow.observed], axis=1),
+        mask=np.concatenate([wide.mask, narrow.mask], axis=1),
+        predicted=np.concatenate([wide.predicted, narrow.predicted], axis=2),
+    )
+    for recordings in ([both, narrow], [narrow, both]):
+        shares = coverage(recordings).markers
+        assert shares["tip"] == coverage([narrow]).over_all
+        assert shares["mid"] == coverage([wide]).over_all
 
 
 def test_the_transform_tells_honest_bands_from_narrow_ones() -> None:

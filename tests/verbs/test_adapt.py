@@ -186,6 +186,33 @@ def test_the_folder_of_a_day_predicts_the_other_days_too(known, zeros):
     assert off[0] < 3.0 * SIGMA < 10.0 * SIGMA < off[1]
 
 
+def test_the_folder_of_a_day_keeps_the_values_of_the_recordings_that_were_fitted(known):
+    """Free in each recording: the new one gets its own, the others keep theirs, and further ones of the day take it."""
+    rng, posterior, infos = np.random.default_rng(3), dict(known.record.posterior), list(known.record.free)
+    gone = [info for info in infos if info.name.startswith("zero")]
+    zeros = {"zero@a": -0.02, "zero@b": 0.03}
+    infos = [info for info in infos if info not in gone]
+    infos += [ParameterInfo(name, "m", -1.0, 1.0, PRIORS["zero"]) for name in zeros]
+    posterior = {info.name: posterior[info.name] for info in infos if info.name in posterior}
+    posterior |= {name: value + 1e-4 * rng.normal(size=(1, 60)) for name, value in zeros.items()}
+    attributes = {**known.record.attrs, FITTED: list("ab")}
+    record = PosteriorRecord(tuple(infos), posterior, attrs=attributes)
+    model = rb.Model(BOX, noise="white", priors=PRIORS, per_recording={"zero": ["*"]})
+    fit = rb.Calibration(record, {"title": "lag"}, "", model)
+    morning, noon = recorded(["morning", "noon"], [0.05, -0.04], 30)
+    found = rb.adapt(fit, morning, seed=1, show=False)
+    assert found.record.flat("zero@b").mean() == pytest.approx(zeros["zero@b"], abs=1e-4)
+    assert found.record.flat("zero@morning").mean() == pytest.approx(0.05, abs=1e-3)
+    for name, zero in (*zeros.items(), ("zero@later", 0.05)):
+        run = recorded([name.partition("@")[2]], [zero], 40)[0]
+        error = rb.predict(found, run).bands["mean"].values - run.position
+        assert np.sqrt(np.mean(error**2)) < 5.0 * SIGMA
+    again = rb.adapt(found, noon, seed=1, show=False)  # a folder of a day is adapted to another one
+    assert again.record.flat("zero@noon").mean() == pytest.approx(-0.04, abs=1e-3)
+    for name in ("zero@a", "zero@b", "zero@morning"):
+        assert again.record.flat(name).mean() == pytest.approx(found.record.flat(name).mean(), abs=1e-3)
+
+
 def test_errors_last_as_long_in_rows_of_another_rate(adapted):
     """The model's error forgets its sign over one row of the fit; nothing moves along y. Standard error: 0.02."""
     for step in (STEP, 2.0 * STEP):

@@ -20,7 +20,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, load_posterior
 from rfdropo_bayes.results.calibrated import Calibration
-from rfdropo_bayes.verbs.calibrate import calibrate, earlier_draws
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.calibrate import calibrate, earlier_draws, implausible_fit
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEMO = REPOSITORY / "experiments" / "demo.toml"
@@ -32,6 +33,17 @@ SHORT = [
     "inference.rollouts=400",
     "inference.blocks=3",
 ]
+
+
+def test_a_fitted_stiffness_that_nothing_has_is_a_caution():
+    """Whatever the bounds of the robot's file allow; a wide posterior that reaches plausible values is none."""
+    arm, info = Robot.load("smooth_arm"), ParameterInfo("young_modulus@run", "Pa", 0.1, 1e9, {}, "")
+    for draws, cautions in ((np.linspace(1.0, 5.0, 99), 1), (np.geomspace(1.0, 1e6, 99), 0)):
+        record = PosteriorRecord((info,), {info.name: draws[None]}, {})
+        found = implausible_fit(arm, {"trunk_mass": 0.1}, record)
+        assert [caution.code for caution in found] == [Code.IMPLAUSIBLE] * cautions
+    (found,) = implausible_fit(arm, {"trunk_mass": 9.0}, record)
+    assert found.sentence.startswith("trunk_mass is 9 kg")
 
 
 @pytest.mark.slow

@@ -282,6 +282,25 @@ def test_a_group_that_names_no_recording_is_doubtful(tmp_path):
     assert [doubt for doubt in found.doubts if "monday: 'runn_*' is the name of none" in doubt] == found.doubts
 
 
+@pytest.mark.parametrize(
+    ("table", "doubtful"),
+    [
+        ("[model.fixed]\ntrunk_mass = 0.09\n", False),
+        ("[model.fixed]\ntrunk_mass = 6.0\n", True),
+        ('trunk_mass = { distribution = "LogNormal", median = 6.0, sigma = 0.1 }\n', True),
+        ('trunk_mass = { distribution = "LogNormal", median = 6.0, sigma = 3.0 }\n', False),
+    ],
+)
+def test_a_mass_that_no_soft_robot_has_is_doubtful_wherever_it_is_given(tmp_path, table, doubtful):
+    """Within the bounds of the robot's file, and heavier than any metal."""
+    checked(tmp_path)
+    path = tmp_path / "own.toml"
+    path.write_text(path.read_text() + table)
+    found = run_check(path, tmp_path / "pictures")
+    assert not found.problems
+    assert [doubt.startswith("trunk_mass is") and "kg/m3" in doubt for doubt in found.doubts] == [True] * doubtful
+
+
 @pytest.mark.parametrize("key", ["candidates", "exclude"])
 def test_a_mechanism_that_an_audit_would_not_find_is_a_problem(tmp_path, key):
     checked(tmp_path)

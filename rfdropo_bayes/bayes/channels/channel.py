@@ -74,7 +74,7 @@ class Series(Channel):
         readings: what was read, zero where there is nothing.
         valid: which columns of an error (`deviation`) count.
         linear: whether errors are readings less what a rollout shows, and nothing else.
-        known: its noise where that is stated or estimated; None where its parameters are inferred.
+        known: its noise in these recordings where that is stated or estimated; None where its parameters are inferred.
     """
 
     linear: ClassVar[bool]
@@ -135,7 +135,12 @@ class Series(Channel):
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Series:
         """The same channel of some recordings, and of their first rows, only."""
-        return replace(self, readings=self.readings[index, :rows], valid=self.valid[index, :rows])
+        own = {"readings": self.readings[index, :rows], "valid": self.valid[index, :rows]}
+        return replace(self, **own, known=self.known_of(index))
+
+    def known_of(self, index: list[int]) -> Autoregression | None:
+        """Its noise in some recordings, where it is known."""
+        return None if self.known is None else self.known.of_recordings(index)
 
     def mean(
         self, readings: Float[np.ndarray, "repeat time *reading"], valid: Bool[np.ndarray, "repeat time column"]

@@ -60,13 +60,14 @@ class Markers(Series):
         """
         known = self.known
         if known is not None:
-            known = noise_of_markers(known, self.recordings.markers, recordings)
+            known = noise_of_markers(known, self.recordings.markers, recordings).at(recordings.steps)
         return self.gather(recordings, self.model, known)
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Markers:
         """See `Series.of_recordings`."""
         readings, valid = self.readings[index, :rows], self.valid[index, :rows]
-        return replace(self, readings=readings, valid=valid, recordings=self.recordings.of(index, rows))
+        recordings = self.recordings.of(index, rows)
+        return replace(self, readings=readings, valid=valid, recordings=recordings, known=self.known_of(index))
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
@@ -102,7 +103,7 @@ class Markers(Series):
         tau = values.get(NOISE_CORRELATION_TIME.name)
         memory = [] if tau is None else [float(np.exp(-step / tau))]
         scale = np.full(self.valid.shape[-1], values[OBSERVATION_NOISE.name])
-        return Autoregression(scale, np.array([1.0, *memory]), STATED, np.inf)
+        return Autoregression(scale, np.array([1.0, *memory]), STATED, np.inf, step=step)
 
     def draw_noise(
         self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
@@ -110,7 +111,7 @@ class Markers(Series):
         """A realisation of the noise in one recording [m]."""
         markers = self.readings.shape[2]
         if self.known is not None:
-            return self.known.draw_rows(key, len(time)).reshape(len(time), markers, 3)
+            return self.known.draw_rows(key, len(time), time).reshape(len(time), markers, 3)
         return draw_noise(key, time, markers, noise_values(self.model, values))
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time marker 3"]:
@@ -124,7 +125,8 @@ class Markers(Series):
         rows = int(self.recordings.rows[index])
         line = Timeline(*(part[index, :rows] for part in self.recordings.line))
         time = jnp.asarray(self.recordings.time[index, :rows])
-        noise = self.known if self.known is not None else noise_values(self.model, seen.values)
+        known = self.known_of([index])
+        noise = known if known is not None else noise_values(self.model, seen.values)
         return PositionNoise(seen.observation.position[index, :rows], noise, time, line)
 
     @property
@@ -186,7 +188,7 @@ class PositionNoise(dist.Distribution):
         """Simulated positions plus one realisation of the noise."""
         keys = jax.random.split(key, int(np.prod(sample_shape)))
         if isinstance(self.noise, Autoregression):
-            noise = jax.vmap(partial(self.noise.draw_rows, rows=len(self.time)))(keys)
+            noise = jax.vmap(partial(self.noise.draw_rows, rows=len(self.time), time=self.time))(keys)
         else:
             draw = partial(draw_noise, time=self.time, markers=self.position.shape[1], noise=self.noise)
             noise = jax.vmap(draw)(keys)
@@ -196,7 +198,7 @@ class PositionNoise(dist.Distribution):
         """Log density of all valid rows."""
         if isinstance(self.noise, Autoregression):
             valid = np.repeat(np.asarray(self.line.valid), 3, axis=-1)
-            return jnp.sum(self.noise.row_log_density((value - self.position).reshape(len(value), -1), valid))
+            return jnp.sum(self.noise.row_log_density((value - self.position).reshape(1, len(value), -1), valid[None]))
         return jnp.sum(row_log_density(value - self.position, self.noise, self.line))
 
 

@@ -145,7 +145,8 @@ class ObjectPose(Series):
         """See `Series.of_recordings`."""
         line = Timeline(*(part[index, :rows] for part in self.line))
         readings, valid = self.readings[index, :rows], self.valid[index, :rows]
-        return replace(self, readings=readings, valid=valid, line=line, time=self.time[index, :rows])
+        time, known = self.time[index, :rows], self.known_of(index)
+        return replace(self, readings=readings, valid=valid, known=known, line=line, time=time)
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
@@ -201,7 +202,7 @@ class ObjectPose(Series):
         sizes = np.repeat([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]], 3)
         tau = values.get(OBJECT_CORRELATION_TIME.name)
         memory = [] if tau is None else [float(np.exp(-step / tau))]
-        return Autoregression(sizes, np.array([1.0, *memory]), STATED, np.inf)
+        return Autoregression(sizes, np.array([1.0, *memory]), STATED, np.inf, step=step)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time 7"]:
         """See `Channel.draw`."""
@@ -262,7 +263,7 @@ def _error(
     An Ornstein-Uhlenbeck process less its decaying start is the same process conditioned on starting at zero.
     """
     if known is not None:
-        return known.draw_rows(key, len(time)).at[0].set(0.0).reshape(-1, 2, 3)
+        return known.draw_rows(key, len(time), time).at[0].set(0.0).reshape(-1, 2, 3)
     tau = values.get(OBJECT_CORRELATION_TIME.name)
     sizes = jnp.stack([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]])
     error = sizes[:, None] * draw_noise(key, time, 2, Noise(jnp.ones(()), tau))

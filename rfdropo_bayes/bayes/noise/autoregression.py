@@ -4,6 +4,9 @@ Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of 
 predicted from the min(k, p) rows before it (Levinson-Durbin). Noise that columns share, such as that of a shaking
 mount, has the same memory as the rest (a separable covariance); across a gap in some of the columns alone its whitening
 is approximate.
+
+Memory lasts for seconds, not for rows: in recordings of another rate each row is predicted under the autocorrelation at
+its own lags (`Autoregression.at`).
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 from scipy.stats import chi2
+
+from rfdropo_bayes.data.sample_times import ONE_RATE
 
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
@@ -39,6 +44,9 @@ class Autoregression:
             model leaves is taken for noise as far as such a process can make it).
         freedom: degrees of freedom of the variance; infinite where stated.
         correlation: of the columns at one time; None where they are independent.
+        step: time between rows [s] that the lags count; None where it is not known, and rows of any rate count alike.
+        paces: time between the rows of each recording, in steps; None where all have the rate of ``step``. Series then
+            have an axis of these recordings before that of time.
     """
 
     scale: Float[np.ndarray, " column"]
@@ -46,6 +54,8 @@ class Autoregression:
     source: str
     freedom: float
     correlation: Float[np.ndarray, "column column"] | None = None
+    step: float | None = None
+    paces: tuple[float, ...] | None = None
 
     @property
     def order(self) -> int:
@@ -63,11 +73,31 @@ class Autoregression:
         across = None if self.correlation is None else self.correlation[np.ix_(index, index)]
         return replace(self, scale=self.scale[index], correlation=across)
 
+    def at(self, steps: Sequence[float] | Float[np.ndarray, " recording"]) -> Autoregression:
+        """The same noise in recordings whose rows are so many seconds apart."""
+        if self.step is None or not self.order:
+            return self
+        found = tuple(_pace(float(step) / self.step, np) for step in steps)
+        paces = None if set(found) <= {1.0} else found
+        return self if paces == self.paces else replace(self, paces=paces)
+
+    def resampled(self, step: float) -> Autoregression:
+        """The same noise in rows that are ``step`` seconds apart, which its lags then count."""
+        if self.step is None:
+            return self
+        pace = _pace(step / self.step, np)
+        return replace(self, autocorrelation=self._autocorrelation_at(np.array(pace)), step=step, paces=None)
+
+    def of_recordings(self, index: Sequence[int]) -> Autoregression:
+        """The noise in some of the recordings."""
+        return self if self.paces is None else replace(self, paces=tuple(self.paces[i] for i in index))
+
     def as_dict(self) -> dict[str, Any]:
-        """As plain values; `from_dict` undoes it."""
+        """As plain values, those of recordings left out; `from_dict` undoes it."""
         arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
         found = {name: None if array is None else array.tolist() for name, array in arrays.items()}
-        return {**found, "source": self.source, "freedom": self.freedom if np.isfinite(self.freedom) else None}
+        freedom = self.freedom if np.isfinite(self.freedom) else None
+        return {**found, "source": self.source, "freedom": freedom, "step": self.step}
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> Autoregression:
@@ -79,12 +109,41 @@ class Autoregression:
             given["source"],
             np.inf if freedom is None else freedom,
             None if across is None else np.array(across),
+            given.get("step"),  # earlier versions do not say
         )
 
     @cached_property
     def predictors(self) -> tuple[Float[np.ndarray, "rows order"], Float[np.ndarray, " rows"]]:
         """Coefficients of the best prediction from 0, 1, ... p rows, and its relative standard deviation."""
         return levinson(self.autocorrelation)
+
+    def _autocorrelation_at(self, pace: Float[Any, "..."]) -> Float[Any, "... lag"]:
+        """Autocorrelation at lags of rows that are ``pace`` steps apart.
+
+        Between the lags of steps it is a straight line, which keeps it that of a stationary process (its spectrum is
+        the periodic one times a squared sinc); of a first-order process whose memory is positive it is exact.
+        """
+        numbers: Any = jnp if isinstance(pace, jax.Array) else np
+        lags = numbers.asarray(pace)[..., None] * np.arange(self.order + 1)
+        if self.order == 1 and self.autocorrelation[1] >= 0.0:
+            return self.autocorrelation[1] ** lags
+        known = list(self.autocorrelation)
+        coefficients = self.predictors[0][-1]
+        while len(known) <= self.order * (max(self.paces or (1.0,)) if isinstance(pace, jax.Array) else np.max(pace)):
+            known.append(float(coefficients @ known[: -self.order - 1 : -1]))
+        return numbers.interp(lags, np.arange(len(known)), np.array(known))
+
+    def _prediction(
+        self, valid: Bool[np.ndarray, "*batch time column"]
+    ) -> tuple[Float[np.ndarray, "*batch time column order"], Float[np.ndarray, "*batch time column"]]:
+        """Coefficients and relative standard deviation of the prediction of each value from the rows before it."""
+        memory = np.minimum(rows_before(valid), self.order)
+        if self.paces is None:
+            coefficients, deviation = self.predictors
+            return coefficients[memory], deviation[memory]
+        coefficients, deviation = levinson(self._autocorrelation_at(np.array(self.paces)))
+        which = np.arange(len(self.paces))[:, None, None]
+        return coefficients[which, memory], deviation[which, memory]
 
     def whiten(
         self,
@@ -102,8 +161,7 @@ class Autoregression:
     def log_scale(self, valid: Bool[np.ndarray, "*rest time column"]) -> Float[np.ndarray, "*rest time column"]:
         """Logarithms that normalise the density of `whiten`: zero where not valid, and their sum is half that of the
         covariance's determinant. A row's columns have equal parts of what their correlation takes away."""
-        _, deviation = self.predictors
-        found = np.log(deviation[np.minimum(rows_before(valid), self.order)] * self.scale)
+        found = np.log(self._prediction(valid)[1] * self.scale)
         if self.correlation is not None:
             shared = half_log_determinant(self.correlation, valid)
             found = found + (shared / np.maximum(valid.sum(axis=-1), 1))[..., None]
@@ -113,15 +171,14 @@ class Autoregression:
         self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[Any, "*batch time column"]:
         """What the rows before do not predict, in unit variance; columns that share noise still do."""
-        coefficients, deviation = self.predictors
+        coefficients, deviation = self._prediction(valid)
         numbers: Any = jnp if isinstance(series, jax.Array) else np
-        memory = np.minimum(rows_before(valid), self.order)
         innovation = numbers.asarray(series, dtype=float)
         for lag in range(1, self.order + 1):
             nothing = numbers.zeros_like(series[..., :lag, :])
             before = numbers.concatenate([nothing, series[..., :-lag, :]], axis=-2)
-            innovation = innovation - coefficients[memory, lag - 1] * before
-        return numbers.where(valid, innovation / (deviation[memory] * self.scale), 0.0)
+            innovation = innovation - coefficients[..., lag - 1] * before
+        return numbers.where(valid, innovation / (deviation * self.scale), 0.0)
 
     def separate(
         self, innovations: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
@@ -139,12 +196,11 @@ class Autoregression:
         self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[np.ndarray, "*batch time column"]:
         """The series that `whiten` makes ``white`` of; zero where not valid."""
-        coefficients, deviation = self.predictors
-        memory = np.minimum(rows_before(valid), self.order)
-        series = np.where(valid, self.gather(white, valid) * deviation[memory] * self.scale, 0.0)
+        coefficients, deviation = self._prediction(valid)
+        series = np.where(valid, self.gather(white, valid) * deviation * self.scale, 0.0)
         for row in range(1, series.shape[-2]):
             for lag in range(1, min(self.order, row) + 1):
-                share = coefficients[memory[..., row, :], lag - 1]
+                share = coefficients[..., row, :, lag - 1]
                 series[..., row, :] += np.where(valid[..., row, :], share * series[..., row - lag, :], 0.0)
         return series
 
@@ -155,9 +211,15 @@ class Autoregression:
         white = self.whiten(series, valid)
         return -(0.5 * white**2 + np.where(valid, self.log_scale(valid) + 0.5 * np.log(2.0 * np.pi), 0.0)).sum(axis=-1)
 
-    def draw_rows(self, key: PRNGKeyArray, rows: int) -> Float[Any, "time column"]:
-        """A realisation in one recording; traceable."""
+    def draw_rows(
+        self, key: PRNGKeyArray, rows: int, time: Float[Any, " time"] | None = None
+    ) -> Float[Any, "time column"]:
+        """A realisation in one recording, whose rows are those of ``time`` [s] where there are several rates;
+        traceable."""
         coefficients, deviation = self.predictors
+        if self.paces is not None and self.step is not None and time is not None:
+            pace = _pace(jnp.median(jnp.diff(jnp.asarray(time))) / self.step, jnp)
+            coefficients, deviation = levinson(self._autocorrelation_at(pace))
         white = jax.random.normal(key, (rows, len(self.scale)))
         if self.correlation is not None:
             white = mixed(white, np.ones(white.shape, dtype=bool), self.correlation, 0.5)
@@ -169,16 +231,21 @@ class Autoregression:
             return jnp.concatenate([now[None], last[:-1]]), now
 
         before = jnp.zeros((coefficients.shape[1], len(self.scale)))
-        rows_of = (jnp.asarray(coefficients[memory]), jnp.asarray(deviation[memory]), white)
+        rows_of = (jnp.asarray(coefficients)[memory], jnp.asarray(deviation)[memory], white)
         return self.scale * jax.lax.scan(advance, before, rows_of)[1]
 
     def draw_recordings(self, key: PRNGKeyArray, count: int, rows: int) -> Float[jax.Array, "recording time column"]:
         """Realisations in several recordings."""
-        return jax.vmap(lambda k: self.draw_rows(k, rows))(jax.random.split(key, count))
+        keys = jax.random.split(key, count)
+        if self.paces is None or self.step is None:
+            return jax.vmap(lambda k: self.draw_rows(k, rows))(keys)
+        times = self.step * np.outer(self.paces, np.arange(rows))
+        return jax.vmap(lambda k, time: self.draw_rows(k, rows, time))(keys, jnp.asarray(times))
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time column"]:
         """A realisation of shape (..., time, column), stationary from its first row on."""
-        return self.colour(rng.standard_normal(shape), np.ones(shape[-2:], dtype=bool))
+        own = shape[-2:] if self.paces is None else shape[-3:]
+        return self.colour(rng.standard_normal(shape), np.ones(own, dtype=bool))
 
 
 def rows_before(valid: Bool[np.ndarray, "*batch time column"]) -> np.ndarray:
@@ -189,20 +256,33 @@ def rows_before(valid: Bool[np.ndarray, "*batch time column"]) -> np.ndarray:
     return rows - shifted - 1
 
 
+def _pace(ratio: Any, numbers: Any) -> Any:
+    """Time between rows in steps: exactly one for rows of one rate."""
+    same = (ratio < ONE_RATE) & (ratio > 1.0 / ONE_RATE)
+    return numbers.where(same, 1.0, ratio) if numbers is jnp else (1.0 if same else ratio)
+
+
+def steps_of(time: Float[np.ndarray, "recording time"]) -> Float[np.ndarray, " recording"]:
+    """Time between rows of each recording [s]."""
+    return np.median(np.diff(time, axis=-1), axis=-1)
+
+
 def levinson(
-    autocorrelation: Float[np.ndarray, " lag"],
-) -> tuple[Float[np.ndarray, "rows order"], Float[np.ndarray, " rows"]]:
-    """Levinson-Durbin recursion: row k holds the coefficients of the best linear prediction from k rows."""
-    order = len(autocorrelation) - 1
-    table, variance = np.zeros((order + 1, max(order, 1))), np.ones(order + 1)
+    autocorrelation: Float[Any, "*batch lag"],
+) -> tuple[Float[Any, "*batch rows order"], Float[Any, "*batch rows"]]:
+    """Levinson-Durbin recursion: row k holds the coefficients of the best linear prediction from k rows, whose relative
+    standard deviation is the k-th; traceable."""
+    numbers: Any = jnp if isinstance(autocorrelation, jax.Array) else np
+    order, batch = autocorrelation.shape[-1] - 1, autocorrelation.shape[:-1]
+    last, variance = numbers.zeros((*batch, 0)), [numbers.ones(batch)]
+    table = [numbers.zeros((*batch, max(order, 1)))]
     for k in range(1, order + 1):
-        last = table[k - 1, : k - 1]
-        partial = (autocorrelation[k] - last @ autocorrelation[k - 1 : 0 : -1]) / variance[k - 1]
-        partial = float(np.clip(partial, -0.999, 0.999))
-        table[k, : k - 1] = last - partial * last[::-1]
-        table[k, k - 1] = partial
-        variance[k] = variance[k - 1] * (1.0 - partial**2)
-    return table, np.sqrt(variance)
+        explained = numbers.sum(last * autocorrelation[..., k - 1 : 0 : -1], axis=-1)
+        partial = numbers.clip((autocorrelation[..., k] - explained) / variance[-1], -0.999, 0.999)
+        last = numbers.concatenate([last - partial[..., None] * last[..., ::-1], partial[..., None]], axis=-1)
+        table.append(numbers.concatenate([last, numbers.zeros((*batch, order - k))], axis=-1))
+        variance.append(variance[-1] * (1.0 - partial**2))
+    return numbers.stack(table, axis=-2), numbers.sqrt(numbers.stack(variance, axis=-1))
 
 
 def estimate_noise(
@@ -211,6 +291,7 @@ def estimate_noise(
     freedom_share: float,
     *,
     source: str,
+    steps: Float[np.ndarray, " series"] | None = None,
     order: int | None = None,
     pooled: bool | None = None,
     shared: bool | None = False,
@@ -222,6 +303,8 @@ def estimate_noise(
         valid: which may be used.
         freedom_share: degrees of freedom per value: (n - 1) / n for deviations from the mean of n repeats.
         source: what the deviations are.
+        steps: time between rows of each series [s]; where there are several rates, memory is estimated from the series
+            of the rate that has the most values. All of one unknown rate by default.
         order: of the process; by default the one of smallest BIC up to `MAX_ORDER`.
         pooled: one standard deviation for all columns; by default as BIC has it.
         shared: whether columns share noise; None to test it.
@@ -235,18 +318,31 @@ def estimate_noise(
         gain = count.sum() * np.log(mean) - np.sum(count * np.log(own))
         pooled = bool(gain < 0.5 * len(own) * np.log(count.sum()) * 3.0)  # memory leaves a third of the rows' worth
     scale = np.full(len(own), mean) if pooled else own
-    correlation = _autocorrelation(np.where(valid, series, 0.0) / scale, valid, MAX_ORDER if order is None else order)
+    step, main = (None, slice(None)) if steps is None else _main_rate(steps, valid.sum(axis=(1, 2)))
+    whitened = np.where(valid, series, 0.0)[main] / scale
+    correlation = _autocorrelation(whitened, valid[main], MAX_ORDER if order is None else order)
     if order is None:
         _, deviation = levinson(correlation)
-        total = count.sum()
+        total = float(np.maximum(valid[main].sum(axis=(0, 1)), 1).sum()) * freedom_share
         order = int(np.argmin([2.0 * total * np.log(deviation[k]) + k * np.log(total) for k in range(len(deviation))]))
-    alone = Autoregression(scale, correlation[: order + 1], source, float(count.sum()))
+    alone = Autoregression(scale, correlation[: order + 1], source, float(count.sum()), step=step)
+    alone = alone if steps is None else alone.at(steps)
     whole = valid.all(axis=-1)
     across = shrunk_correlation(alone.innovations(series, valid)[whole], freedom_share, shared=shared)
     if across is None:
         return alone
     # The mean of correlated squares is known as well as that of fewer independent ones.
     return replace(alone, correlation=across, freedom=alone.freedom * len(across) / float(np.sum(across**2)))
+
+
+def _main_rate(
+    steps: Float[np.ndarray, " series"], values: Float[np.ndarray, " series"]
+) -> tuple[float, Bool[np.ndarray, " series"]]:
+    """Time between rows [s] of the rate that has the most values, and the series of this rate."""
+    ratio = steps[:, None] / steps[None]
+    alike = (ratio < ONE_RATE) & (ratio > 1.0 / ONE_RATE)
+    main = alike[int(np.argmax(alike @ values))]
+    return float(np.median(steps[main])), main
 
 
 def _autocorrelation(series: np.ndarray, valid: np.ndarray, lags: int) -> np.ndarray:

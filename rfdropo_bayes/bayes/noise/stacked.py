@@ -47,6 +47,10 @@ class Stacked:
         """Columns of each channel."""
         return side_by_side([len(part.scale) for part in self.parts])
 
+    def at(self, steps: Sequence[float] | Float[np.ndarray, " recording"]) -> Stacked:
+        """See `Autoregression.at`."""
+        return Stacked(tuple(part.at(steps) for part in self.parts))
+
     def whiten(
         self,
         series: Float[np.ndarray, "*batch time column"],

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression, estimate_noise
 from rfdropo_bayes.bayes.problem import ResidualProblem
@@ -40,6 +40,11 @@ class CountedProblem(ResidualProblem, Protocol):
         str, tuple[Float[np.ndarray, "*batch recording time column"], Bool[np.ndarray, "recording time column"]]
     ]:
         """Whitened residuals of all rows by channel, and which of them are there."""
+        ...
+
+    @property
+    def row_steps(self) -> Float[np.ndarray, " recording"]:
+        """Time between rows of each recording [s]."""
         ...
 
     def counting(self, shares: Mapping[str, float]) -> CountedProblem:
@@ -75,7 +80,7 @@ def lasting_residuals(problem: CountedProblem, target: Target, mode: Laplace) ->
     fitted = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)[:, physical] @ factor
     reach = problem.independent_series(fitted.T)  # outer products of these add to the covariance of the fitted values
     return {
-        name: lasting_series(series, valid, reach[name][0])
+        name: lasting_series(series, valid, reach[name][0], problem.row_steps)
         for name, (series, valid) in problem.independent_series(residual).items()
     }
 
@@ -84,29 +89,35 @@ def lasting_series(
     series: Float[np.ndarray, "recording time column"],
     valid: Bool[np.ndarray, "recording time column"],
     reach: Float[np.ndarray, "d recording time column"],
+    steps: Float[np.ndarray, " recording"],
 ) -> Lasting:
-    """What the residuals of a channel say.
+    """What the residuals of a channel say; they last for as many seconds in recordings of every rate.
 
     Args:
         series: residuals, of unit size by the likelihood that led there.
         valid: which of them were measured.
         reach: by how much fitted values move along orthonormal directions of the posterior, in its deviations; zero
             where not valid.
+        steps: time between rows of each recording [s].
     """
-    noise = estimate_noise(series, valid, 1.0, source=RESIDUALS, order=1, pooled=False, shared=None)
-    memory = float(np.clip(noise.autocorrelation[1], 0.0, 0.999))
+    noise = estimate_noise(series, valid, 1.0, source=RESIDUALS, steps=steps, order=1, pooled=False, shared=None)
+    memory = np.clip([noise.resampled(step).autocorrelation[1] for step in steps], 0.0, 0.999)
     rows = (1.0 + memory) / (1.0 - memory)
-    return Lasting(_share(reach, noise, memory), rows, _widened(series, valid, reach, int(np.ceil(rows))))
+    main = float(np.clip(noise.autocorrelation[1], 0.0, 0.999))
+    widened = _widened(series, valid, reach, np.ceil(rows).astype(int))
+    return Lasting(_share(reach, noise, memory), (1.0 + main) / (1.0 - main), widened)
 
 
-def _share(reach: Float[np.ndarray, "d recording time column"], noise: Autoregression, memory: float) -> float:
+def _share(
+    reach: Float[np.ndarray, "d recording time column"], noise: Autoregression, memory: Float[np.ndarray, " recording"]
+) -> float:
     """Variance of the fitted values under independent residuals of unit size, over that under the residuals' own
     covariance; at most 1."""
-    lags = np.arange(reach.shape[2])
+    lags, real = np.arange(reach.shape[2]), 0.0
     across = np.eye(reach.shape[3]) if noise.correlation is None else noise.correlation
-    sized = reach * noise.scale
-    seen = np.einsum("ts,drsc->drtc", memory ** np.abs(lags[:, None] - lags), sized @ across)
-    real = float(np.sum(seen * sized))
+    for own, kept in zip(np.moveaxis(reach * noise.scale, 1, 0), memory, strict=True):
+        seen = np.einsum("ts,dsc->dtc", kept ** np.abs(lags[:, None] - lags), own @ across)
+        real += float(np.sum(seen * own))
     return min(1.0, float(np.sum(reach**2)) / real) if real > 0.0 else 1.0
 
 
@@ -114,11 +125,11 @@ def _widened(
     series: Float[np.ndarray, "recording time column"],
     valid: Bool[np.ndarray, "recording time column"],
     reach: Float[np.ndarray, "d recording time column"],
-    length: int,
+    lengths: Int[np.ndarray, " recording"],
 ) -> Float[np.ndarray, " column"]:
     """Root mean square error of blocks that are left out of a linear fit, over that of the residuals."""
     left_out = np.zeros_like(series)
-    for recording in range(len(series)):
+    for recording, length in enumerate(lengths):
         for first in range(0, series.shape[1], length):
             block = recording, slice(first, first + length)
             there = valid[block]

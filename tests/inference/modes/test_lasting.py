@@ -13,11 +13,12 @@ from rfdropo_bayes.inference.modes.lasting import Lasting, lasting_cautions, las
 RECORDINGS, ROWS, COLUMNS = 3, 200, 2
 
 
-def looked_at(design, residual, valid):
+def looked_at(design, residual, valid, steps=None):
     """`lasting_series` of a linear model, (recording, time, column, d), at its least squares."""
     flat = design.reshape(-1, design.shape[-1])
     factor = np.linalg.cholesky(np.linalg.inv(flat.T @ flat))
-    return lasting_series(residual, valid, np.moveaxis(design @ factor, -1, 0))
+    steps = np.full(len(residual), 0.1) if steps is None else steps
+    return lasting_series(residual, valid, np.moveaxis(design @ factor, -1, 0), steps)
 
 
 def autoregressive(rng, memory, columns):
@@ -46,6 +47,21 @@ def test_a_constant_counts_as_often_as_its_mean_says(memory):
     # residuals about a mean that was fitted to them last a little less than the noise does
     assert np.mean(shares) == pytest.approx((1.0 - memory) / (1.0 + memory), rel=0.2)
     assert max(shares) <= 1.0
+
+
+def test_residuals_last_for_seconds_in_recordings_of_every_rate():
+    """A parameter of the recording whose rows are ten times as far apart: its rows are nearly independent, whatever
+    those of the others are. One memory for all rows would make a row count half of that."""
+    design = np.zeros((RECORDINGS, ROWS, COLUMNS, COLUMNS))
+    design[2, :, 0, 0] = design[2, :, 1, 1] = 1.0
+    valid, steps, shares = np.ones(design.shape[:3], dtype=bool), np.array([0.1, 0.1, 1.0]), []
+    for seed in range(20):
+        parts = [
+            autoregressive(np.random.default_rng([seed, k]), m, np.eye(COLUMNS)) for k, m in ((0, 0.8), (1, 0.8**10))
+        ]
+        data = np.concatenate([parts[0][:2], parts[1][2:]])
+        shares.append(looked_at(design, fitted(design, data), valid, steps).share)
+    assert np.mean(shares) == pytest.approx((1.0 - 0.8**10) / (1.0 + 0.8**10), rel=0.1)
 
 
 def test_coordinates_that_go_together_count_once():
