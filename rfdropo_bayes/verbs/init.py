@@ -139,14 +139,20 @@ def write_first_files(
 
 
 def _frame(experiment: Experiment, robot: Robot, folder: Path) -> list[str]:
-    """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it."""
+    """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
+
+    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
+    """
     if experiment.data is None or experiment.data.columns is None:
         return []
+    columns = experiment.data.columns
     try:
         first = load_recordings(experiment.data, folder)[0]
     except InputError:  # what is wrong with it is said by check, which the user runs next
         return []
-    return frame_lines(robot, first, experiment.data.columns)
+    found = frame_lines(robot, first, columns)
+    turned = found and found[0] != f"axes = {quoted(columns.axes)}"
+    return [] if turned and experiment.data.format == motive_csv.FORMAT else found
 
 
 def _head(name: str) -> list[str]:
