@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import textwrap
 from collections.abc import Callable, Collection, Container
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+WIDTH = 110
+"""Columns of a docstring."""
 
 Called = TypeVar("Called", bound=Callable[..., Any])
 
@@ -31,6 +38,31 @@ def with_keywords_of(source: Callable[..., Any], *, without: Container[str] = ()
         ]
         function.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
         return function
+
+    return decorate
+
+
+def with_keys_of(schema: type[BaseModel], *, without: Container[str] = ()) -> Callable[[Called], Called]:
+    """Put the keys of a table of an experiment file into a function's signature, in the place of its ``**keys``, and
+    their meaning behind the arguments in its docstring.
+
+    Args:
+        schema: the table that the keywords are handed on to.
+        without: keys that the function does not take, or takes under a name of its own.
+    """
+
+    def decorate(function: Called) -> Called:
+        own = inspect.signature(function).parameters.values()
+        taken = {entry.name for entry in own if entry.kind is not entry.VAR_KEYWORD}
+        told = [
+            textwrap.fill(f"{name}: {field.description}.", WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 8)
+            for name, field in schema.model_fields.items()
+            if name not in taken and name not in without
+        ]
+        head, args, rest = inspect.cleandoc(function.__doc__ or "").partition("Args:\n")
+        documented, gap, tail = rest.partition("\n\n")
+        function.__doc__ = "\n".join([f"{head}{args}{documented}", *told]) + gap + tail
+        return with_keywords_of(schema, without=without)(function)
 
     return decorate
 

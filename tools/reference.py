@@ -9,7 +9,6 @@ from __future__ import annotations
 import collections.abc
 import dataclasses
 import json
-import re
 import sys
 import typing
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from rfdropo_bayes.bayes.priors import FAMILIES, OPTIONAL
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.settings import Deployment
+from rfdropo_bayes.inference.method_options import attributes_of
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.assembly import measurement_specs
@@ -319,21 +319,6 @@ def option_table(config: type) -> str:
         default = "" if field.default is dataclasses.MISSING else literal(field.default)
         rows.append((code(field.name), type_text(hints[field.name]), default, told[field.name].rstrip(".")))
     return table(("Option", "Type", "Default", "Meaning"), rows)
-
-
-def attributes_of(kind: type) -> dict[str, str]:
-    """What the section "Attributes" of a docstring says of each name; ``a, b: text`` speaks of both."""
-    _, _, section = (kind.__doc__ or "").partition("Attributes:\n")
-    found: dict[str, str] = {}
-    names: list[str] = []
-    for line in section.splitlines():
-        entry = re.match(r" {8}([a-z0-9_]+(?:, [a-z0-9_]+)*): (.*)", line)
-        if entry:
-            names = entry[1].split(", ")
-            found |= dict.fromkeys(names, entry[2])
-        elif line.startswith(" " * 12):
-            found |= {name: f"{found[name]} {line.strip()}" for name in names}
-    return found
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -26,6 +26,8 @@ GROUPS = ("reports/**/README.md", "reports/*/details.md", "models/**/README.md",
 LINK = re.compile(r"(?<!\\)(!?\[(?:[^\[\]]|\[[^\]]*\])*\]\()([^)\s#]+)?(#[^)\s]*)?(\))")
 MOVING = "image/gif"
 CODE = re.compile(r"(```.*?```)", re.DOTALL)
+INLINE = re.compile(r"<pre.*?</pre>|<code>[^<]*</code>", re.DOTALL)
+OPTION = re.compile(r"(?<![\w-])--?[a-z][\w.-]*")
 
 
 def site_path(path: str) -> str | None:
@@ -136,3 +138,19 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     parts = CODE.split(markdown)
     return "".join(part if index % 2 else LINK.sub(turned, part) for index, part in enumerate(parts))
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Keep options of commands whole."""
+    return whole_options(html)
+
+
+def whole_options(html: str) -> str:
+    """A page whose options of commands do not break at their hyphens, where code stands in a line of text."""
+
+    def whole(match: re.Match[str]) -> str:
+        if match[0].startswith("<pre"):
+            return match[0]
+        return OPTION.sub(lambda option: f'<span class="option">{option[0]}</span>', match[0])
+
+    return INLINE.sub(whole, html)

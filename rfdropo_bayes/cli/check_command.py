@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,6 +47,8 @@ def check(
     if found.problems:
         raise typer.Exit(PROBLEMS)
     typer.echo(f"\n{ending(found)}")
+    if not found.doubts:
+        typer.echo(f"next: {shlex.join(['rfdropo', 'calibrate', str(experiment), '--out', 'OUT'])}")
 
 
 def ending(found: Check) -> str:

@@ -13,8 +13,10 @@ from rfdropo_bayes.errors import InputError
 
 if TYPE_CHECKING:
     from rfdropo_bayes.robots.outline import RobotOutline
+    from rfdropo_bayes.verbs.column_names import Guess
 
-UNITS = ("mm", "cm", "m", "deg", "rad")
+ANGLES = ("deg", "rad", "counts")
+UNITS = ("mm", "cm", "m", *ANGLES)
 MODELS = (".xml", ".urdf")
 """Suffixes of models of other simulators, see `simulators.adapters`."""
 MILLIMETRES = 1e-3
@@ -37,6 +39,15 @@ class Questions:
         if reply == default:
             self.assumed.add(key)
         return reply
+
+    def counts(self, guess: Any, given: float | None) -> float | None:
+        """Counts in one turn of the spool; None where nothing is in counts. They have no default: gears differ."""
+        if given is not None or not guess.counts:
+            return given
+        if not self.ask:
+            remedy = "give --counts-per-turn: counts in one turn of the spool, gear included"
+            raise InputError("holds commands or angles in counts", where="--recording", remedy=remedy)
+        return typer.prompt("Counts in one turn of the spool, gear included", type=float)
 
 
 Recordings = Annotated[
@@ -74,7 +85,11 @@ CableRadius = Annotated[
 ]
 Pairs = Annotated[bool | None, typer.Option(help="opposite cables share a motor")]
 CommandUnit = Annotated[
-    str | None, typer.Option(help="mm, cm or m of cable, or deg or rad of a motor; guessed from a recording")
+    str | None, typer.Option(help="mm, cm or m of cable, or deg, rad or counts of a motor; guessed from a recording")
+]
+CountsPerTurn = Annotated[
+    float | None,
+    typer.Option(help="counts of an encoder, or steps of a drive, in one turn of the spool, gear included"),
 ]
 PositionUnit = Annotated[str | None, typer.Option(help="mm, cm or m; guessed from a recording")]
 SpoolRadius = Annotated[float | None, typer.Option("--spool-radius-mm", help="radius of the motors' spools [mm]")]
@@ -115,6 +130,7 @@ def init(
     cable_radius: CableRadius = None,
     pairs: Pairs = None,
     command_unit: CommandUnit = None,
+    counts_per_turn: CountsPerTurn = None,
     position_unit: PositionUnit = None,
     spool_radius: SpoolRadius = None,
     gravity: Gravity = None,
@@ -124,18 +140,12 @@ def init(
     defaults: Defaults = False,
 ) -> None:
     """Write a first robot file and experiment file. Asks for what options and recordings do not say."""
-    from rfdropo_bayes.verbs.init import (
-        assumed_of_columns,
-        guess_units,
-        matching_commands,
-        matching_recordings,
-        write_first_files,
-    )
+    from rfdropo_bayes.verbs.init import assumed_of_columns, matching_commands, matching_recordings, write_first_files
 
     ask = Questions(sys.stdin.isatty() and not defaults)
     files = matching_recordings(recording or [])
     sent = matching_commands(commands or [], files)
-    guess = guess_units(files[0], sent[0] if sent else None, command_unit, position_unit) if files else None
+    guess = _guess(ask, files, sent, command_unit, position_unit, counts_per_turn) if files else None
     if folder.suffix in MODELS:
         _init_model(folder, files, sent, guess)
         return
@@ -146,7 +156,7 @@ def init(
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
     answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
-    if unit in ("deg", "rad"):
+    if unit in ANGLES:
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
     answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0: that of silicone", 0.0) or None
@@ -160,6 +170,21 @@ def init(
     for line in assumed_of_columns(guess) if guess else []:
         typer.echo(f"look over in the experiment file: {line}")
     typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(folder / 'experiment.toml')])}")
+
+
+def _guess(
+    ask: Questions,
+    files: list[Path],
+    sent: list[Path],
+    command_unit: str | None,
+    position_unit: str | None,
+    counts: float | None,
+) -> Guess:
+    """What the columns of the first recording are, with the counts of one turn where any are in counts."""
+    from rfdropo_bayes.verbs.init import guess_units, with_counts
+
+    guess = guess_units(files[0], sent[0] if sent else None, command_unit, position_unit)
+    return with_counts(guess, ask.counts(guess, counts), command_unit is not None)
 
 
 def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
@@ -203,7 +228,7 @@ def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed:
         if key in given:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
-    kind: Literal["m", "rad"] = "rad" if unit in ("deg", "rad") else "m"
+    kind: Literal["m", "rad"] = "rad" if unit in ANGLES else "m"
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
 
 

@@ -99,7 +99,7 @@ def calibrate(
     shown = False if quiet else None
     model = Model.read(experiment, overrides)
     found = fit(model, out=folder, start=start, resume=resume, overwrite=overwrite, show=shown)
-    show_calibration(found, quiet=quiet, as_json=as_json)
+    show_calibration(found, experiment, quiet=quiet, as_json=as_json)
 
 
 def simulate(

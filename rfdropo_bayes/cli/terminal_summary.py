@@ -42,8 +42,9 @@ def say(found: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> No
             typer.echo(line)
 
 
-def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
-    """Print the result of a finished calibration: headline, table of parameters, cautions, and where the report is."""
+def show_calibration(found: Calibration, experiment: Path | None = None, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of a finished calibration: headline, table of parameters, cautions, what to type next, and where
+    the report is. An audit of ``experiment`` comes next, if one is given, unless nothing speaks against the fit."""
     summary, folder = found.content, found.folder or Path()
     report = folder / "report.html"
     if as_json or quiet:
@@ -68,7 +69,11 @@ def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
             console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
         for sentence in summary["details"].get("compared", ()):
             console.print(sentence, soft_wrap=True)
-        console.print(f"next: rfdropo predict {shlex.quote(str(folder))} --commands FILE --out OUT", soft_wrap=True)
+    ready = experiment is None or found.verdict == "safe"
+    words = (
+        ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--base", str(folder)]
+    )
+    console.print(f"next: {shlex.join(['rfdropo', *words, '--out', 'OUT'])}", soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 
 
@@ -89,6 +94,9 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     if rows:
         console.print(_parameters(rows[:MOST_ROWS]))
     console.print(f"next: {found['next_experiment']['sentence']}", soft_wrap=True)
+    if found["adopted"]:
+        again = shlex.join(["rfdropo", "calibrate", files["extended"], "--out", "OUT"])
+        console.print(f"then: {again}", soft_wrap=True)
     console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
 
 

@@ -33,7 +33,9 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "N m": ("N m", 1.0),
     "-": ("-", 1.0),
 }
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "N", "N m", "-"]
+COUNTS = "counts"
+"""Of an encoder, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
+CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "-"]
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -78,8 +80,14 @@ class CsvColumns(BaseModel):
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
     )
     command_unit: CommandUnit = Field(
-        description='unit of the commands: a length of cable, an angle of a motor, a force or torque; "-" for what a '
-        "simulator of one's own takes"
+        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force or torque; "
+        '"-" for what a simulator of one\'s own takes'
+    )
+    counts_per_turn: float | None = Field(
+        default=None,
+        gt=0,
+        description="counts of an encoder, or steps of a drive, in one turn of the spool, gear included; for values in "
+        "counts",
     )
     largest_command: float | None = Field(
         default=None,
@@ -128,7 +136,7 @@ class CsvColumns(BaseModel):
     motor_angles: list[str] | None = Field(
         default=None, description="columns of the measured motor angles, one for each command; empty cells are left out"
     )
-    motor_angle_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of the motor angles")
+    motor_angle_unit: Literal["rad", "deg", "counts"] = Field(default="rad", description="unit of the motor angles")
     object_pose: list[str] | None = Field(
         default=None,
         min_length=7,
@@ -163,6 +171,8 @@ class CsvColumns(BaseModel):
     def _fits(self) -> CsvColumns:
         if (self.time is None) == (self.sample_time is None):
             raise ValueError("give either time (a column) or sample_time (seconds)")
+        if (COUNTS in (self.command_unit, self.motor_angle_unit)) != (self.counts_per_turn is not None):
+            raise ValueError(f'counts_per_turn belongs to the unit "{COUNTS}": give both or neither')
         for key, names, count in (
             ("markers", self.markers, len(self.positions)),
             ("cables", self.cables, len(self.commands)),
@@ -177,6 +187,12 @@ class CsvColumns(BaseModel):
                 first = self.positions.index(point) + 1
                 raise ValueError(f"markers {first} and {number + 1} of positions have the same columns {list(point)}")
         return self
+
+    def sized(self, unit: CommandUnit) -> tuple[str, float]:
+        """The unit in which a recording keeps values of ``unit``, and the size of ``unit`` in it."""
+        if unit == COUNTS and self.counts_per_turn is not None:
+            return "rad", 2.0 * np.pi / self.counts_per_turn
+        return COMMAND_UNITS[unit]
 
 
 def axes_matrix(axes: tuple[str, str, str]) -> Float[np.ndarray, "3 3"]:
@@ -220,8 +236,7 @@ def read_tables(
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = None
     if columns.motor_angles is not None:
-        degree = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
-        angle = degree * table.numbers(columns.motor_angles, allow_missing=True)
+        angle = columns.sized(columns.motor_angle_unit)[1] * table.numbers(columns.motor_angles, allow_missing=True)
     settings = faults.settings | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)})
     return Recorded(
         replace(origin or origin_of(table, columns), settings=settings),
@@ -258,13 +273,13 @@ def marker_names(columns: CsvColumns) -> list[str]:
 
 def _channels(columns: CsvColumns) -> tuple[str, list[str]]:
     """Unit of the commands in a recording, and the names of their channels."""
-    return COMMAND_UNITS[columns.command_unit][0], columns.cables or columns.commands
+    return columns.sized(columns.command_unit)[0], columns.cables or columns.commands
 
 
 def _largest(columns: CsvColumns) -> float | None:
     """Largest command that is to be believed, in the unit of a recording; None for what most drives do."""
     stated = columns.largest_command
-    return None if stated is None else COMMAND_UNITS[columns.command_unit][1] * stated
+    return None if stated is None else columns.sized(columns.command_unit)[1] * stated
 
 
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
@@ -313,7 +328,7 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
 
 
 def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
-    values = COMMAND_UNITS[columns.command_unit][1] * source.numbers(columns.commands)
+    values = columns.sized(columns.command_unit)[1] * source.numbers(columns.commands)
     if columns.command_time is None and len(values) not in (len(table), len(table) - 1):
         raise InputError(
             f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",

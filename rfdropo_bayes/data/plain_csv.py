@@ -10,7 +10,6 @@ from jaxtyping import Float
 from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.named_columns import (
-    COMMAND_UNITS,
     CsvColumns,
     command_clock,
     coordinates,
@@ -71,7 +70,7 @@ def command_columns(
     """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
     clock, unit = command_clock(columns)
     stamped = {} if clock is None else {clock: time * PER_SECOND[unit]}
-    return stamped | dict(zip(columns.commands, command.T / COMMAND_UNITS[columns.command_unit][1], strict=True))
+    return stamped | dict(zip(columns.commands, command.T / columns.sized(columns.command_unit)[1], strict=True))
 
 
 def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:

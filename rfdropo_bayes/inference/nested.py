@@ -20,6 +20,7 @@ from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.nuts import log_densities
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
@@ -28,8 +29,8 @@ SHRINKAGES = 100  # simulated prior volumes behind the evidence's deviation
 EVALUATIONS = 8  # of a slice, roughly: stepping out and shrinking
 
 
-@dataclass(frozen=True)
-class NestedConfig:
+@dataclass(frozen=True, repr=False)
+class NestedConfig(MethodOptions, called="Nested"):
     """Nested slice sampling: posterior and evidence, where JAX can trace the likelihood.
 
     Attributes:

@@ -20,14 +20,15 @@ from rfdropo_bayes.bayes.problem import Problem, TraceableProblem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
 
-@dataclass(frozen=True)
-class NutsConfig:
+@dataclass(frozen=True, repr=False)
+class NutsConfig(MethodOptions, called="NUTS"):
     """NUTS: the posterior by Hamiltonian Monte Carlo, where JAX can differentiate the likelihood.
 
     Attributes:

@@ -30,6 +30,7 @@ from rich.progress import Progress as Bar
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import append_line, whole
+from rfdropo_bayes.inference.method_options import settings_text
 from rfdropo_bayes.interrupts import check_interrupt
 
 SCHEMA_VERSION = 6
@@ -170,7 +171,7 @@ def run_digest(problem: Problem, method: str, config: Any, key: PRNGKeyArray) ->
     parts = {
         "schema": SCHEMA_VERSION,
         "method": method,
-        "config": repr(config),
+        "config": settings_text(config),
         "key": np.asarray(jax.random.key_data(key)).tolist(),
         "names": list(problem.names),
         "units": dict(problem.units),

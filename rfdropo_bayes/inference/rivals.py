@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, with_rollouts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc.moves import host_generator
@@ -34,8 +35,8 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 FEWEST_ROLLOUTS = 50
 
 
-@dataclass(frozen=True)
-class BayesSimConfig:
+@dataclass(frozen=True, repr=False)
+class BayesSimConfig(MethodOptions, called="BayesSim"):
     """BayesSim, a baseline of the paper with its settings there: a mixture density network.
 
     Attributes:
@@ -56,8 +57,8 @@ class BayesSimConfig:
         _check_budget(self.rollouts, FEWEST_ROLLOUTS)
 
 
-@dataclass(frozen=True)
-class NpdrConfig:
+@dataclass(frozen=True, repr=False)
+class NpdrConfig(MethodOptions, called="NPDR"):
     """NPDR, a baseline of the paper with its settings there: rounds of neural posterior estimation.
 
     Attributes:
@@ -82,8 +83,8 @@ class NpdrConfig:
         _check_budget(self.rollouts, FEWEST_ROLLOUTS * self.rounds)
 
 
-@dataclass(frozen=True)
-class UdrConfig:
+@dataclass(frozen=True, repr=False)
+class UdrConfig(MethodOptions, called="UDR"):
     """UDR, a baseline of the paper: uniform ranges drawn at random inside the central 99 % of the prior.
 
     Attributes:

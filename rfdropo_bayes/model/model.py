@@ -25,11 +25,12 @@ from rfdropo_bayes.model.assembly import (
     measurement_specs,
     model_specs,
 )
-from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.experiment import Experiment, ModelTable, load_experiment
 from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe
 from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
 from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.signatures import with_keywords_of
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
@@ -78,6 +79,7 @@ class Model:
 
     file: ExperimentFile | None = None
 
+    @with_keywords_of(ModelTable)
     def __init__(
         self,
         robot: str | Path | Robot | BlackBox,

@@ -58,6 +58,7 @@ from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
@@ -72,6 +73,7 @@ JOURNAL = "checkpoints/audit"
 FINER = 2
 
 
+@with_keys_of(AuditTable)
 def audit(
     model: Model,
     runs: Sequence[Trajectory] | None = None,
@@ -86,7 +88,7 @@ def audit(
     workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
     between: Between | None = None,
-    **options: Any,
+    **keys: Any,
 ) -> Audit:
     """Say what a model lacks, by name, and measure what it gains with that. What is not given is as the experiment file
     of the model has it.
@@ -107,13 +109,13 @@ def audit(
         between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
             Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
             What both lack is named, too.
-        options: keys of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
+        keys: of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
             ``bootstraps``, ``minutes``.
 
     Raises:
         InputError: bad input, before anything long has started.
     """
-    model = _asked(model, noise, options)
+    model = _asked(model, noise, keys)
     runs, test = model.runs(runs, test)
     chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)

@@ -10,6 +10,7 @@ from typing import Literal, TypeVar
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import (
@@ -300,16 +301,29 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
     if travel is not None:
         yield from _travel(travel, robot)
         command = travel.follow(trajectory.initial_command, command)
-    asked = command @ np.asarray(robot.channel_matrix({})).T
-    for cable, low, high, (least, most) in zip(
-        robot.cable_names, asked.min(axis=0), asked.max(axis=0), robot.displacement_limits(), strict=True
-    ):
-        if low < least - 1e-9 or high > most + 1e-9:
-            found.notes.append(
-                f"{trajectory.name}: cable {cable} is asked for {MILLIMETRES * low:.3g} to {MILLIMETRES * high:.3g} "
-                f"mm; beyond its displacement_limit_m, {MILLIMETRES * least:.3g} to {MILLIMETRES * most:.3g} mm, it is "
-                "held"
-            )
+    _say_reach(found, trajectory.name, robot, command @ np.asarray(robot.channel_matrix({})).T)
+
+
+def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:
+    """Cables that are asked for more than they are allowed, or for more than a body has."""
+    low, high = asked.min(axis=0), asked.max(axis=0)
+    least, most = np.array(robot.displacement_limits()).T
+    beyond = np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
+    if not len(beyond):
+        return
+    words = ", ".join(
+        f"{robot.cable_names[k]} {MILLIMETRES * low[k]:.3g} to {MILLIMETRES * high[k]:.3g} mm "
+        f"(limits {MILLIMETRES * least[k]:.3g} to {MILLIMETRES * most[k]:.3g})"
+        for k in beyond
+    )
+    length = robot.body.station_m[-1] - robot.body.station_m[0]
+    if high.max() > length:
+        found.doubts.append(
+            f"{name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: {words}: look at "
+            "command_unit, at counts_per_turn, and at spool_radius and gain of the robot file"
+        )
+        return
+    found.notes.append(f"{name}: cables are held at their displacement_limit_m where commands ask for more: {words}")
 
 
 def _travel(travel: Travel, robot: Robot) -> Iterator[str]:

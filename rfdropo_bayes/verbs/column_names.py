@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,7 +44,11 @@ STRUCTURE = re.compile(
 )
 """Words that formats put around the name of a marker."""
 WORD = re.compile(r"[a-z0-9]+")
-UNITS = {"mm", "cm", "m", "deg", "rad"}
+UNITS = {unit: unit for unit in ("mm", "cm", "m", "deg", "rad")} | dict.fromkeys(
+    ("count", "counts", "cnt", "cnts", "tick", "ticks", "pulse", "pulses", "steps", "qc"), named_columns.COUNTS
+)
+"""Words in the name of a column, and the unit they tell."""
+ANGLES = ("rad", "deg", named_columns.COUNTS)
 TIME_UNITS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
@@ -69,6 +74,8 @@ class Guess(NamedTuple):
         positions, position_unit: columns of x, y and z of each marker, and their unit.
         markers: a name for each marker, made of its columns'; numbered where they tell none.
         tensions, motor_angles: columns of measured forces and angles, as many as commands; else empty.
+        motor_angle_unit: of the latter.
+        counts_per_turn: of the spool, where a unit is "counts".
         left: columns that are nothing of these.
         format: of the file, one of `mapped_formats.MAPPED`.
         command_time, command_time_unit: column and unit of the commands' own times; None without one.
@@ -87,6 +94,13 @@ class Guess(NamedTuple):
     format: str = named_columns.FORMAT
     command_time: str | None = None
     command_time_unit: str = "s"
+    motor_angle_unit: str = "rad"
+    counts_per_turn: float | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether a unit is one of counts."""
+        return named_columns.COUNTS in (self.command_unit, self.motor_angle_unit if self.motor_angles else "")
 
 
 def guess_columns(path: Path, sent: Path | None = None) -> Guess:
@@ -125,20 +139,26 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
                 if format == motive_csv.FORMAT and positions
                 else "leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
             )
+    unit_sent = _command_unit(source, commands)
+    angles = angles if len(angles) == len(commands) else []
+    unit_measured = (_written_unit(angles, ANGLES) or _angle_unit(table, angles)) if angles else "rad"
+    if unit_measured == named_columns.COUNTS and unit_sent not in ANGLES:
+        angles, unit_measured = [], "rad"  # nothing would use them, and their size is not known
     return Guess(
         time,
         "s" if format == rosbag.FORMAT else _time_unit(whole, time),
         commands,
-        _command_unit(source, commands),
+        unit_sent,
         positions,
-        unit or _written_unit(names_of(positions)) or _length_unit(table[names_of(positions)]),
+        unit or _written_unit(names_of(positions), named_columns.METRES) or _length_unit(table[names_of(positions)]),
         _marker_names(list(triples), None if format == named_columns.FORMAT else STRUCTURE),
         tensions if len(tensions) == len(commands) else [],
-        angles if len(angles) == len(commands) else [],
+        angles,
         [name for name in free if name not in commands],
         format,
         clock,
         _time_unit(sending, clock),
+        unit_measured,
     )
 
 
@@ -218,9 +238,9 @@ def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list
     return names if len(set(names)) == len(names) else [f"m{k}" for k in range(1, len(names) + 1)]
 
 
-def _written_unit(names: list[str]) -> str | None:
-    """The unit that all of some columns carry in their names, such as ``x1_mm`` or ``tip x [m]``."""
-    told = [{word for word in WORD.findall(name.lower()) if word in UNITS} for name in names]
+def _written_unit(names: list[str], known: Collection[str] = frozenset(UNITS.values())) -> str | None:
+    """The unit, one of ``known``, that all of some columns carry in their names, such as ``x1_mm`` or ``tip x [m]``."""
+    told = [{UNITS[word] for word in WORD.findall(name.lower()) if UNITS.get(word) in known} for name in names]
     return told[0].pop() if told and all(len(each) == 1 and each == told[0] for each in told) else None
 
 
@@ -265,5 +285,10 @@ def _command_unit(table: pd.DataFrame, commands: list[str]) -> str:
         return written or "mm"
     largest = float(np.nanmax(np.abs(table[commands].to_numpy())))
     if all(ANGLE.search(name) for name in commands):
-        return "deg" if largest > DEGREES_ABOVE else "rad"
+        return _angle_unit(table, commands)
     return "mm" if largest > 0.2 else "m"
+
+
+def _angle_unit(table: pd.DataFrame, names: list[str]) -> str:
+    """The unit of angles by their size."""
+    return "deg" if float(np.nanmax(np.abs(table[names].to_numpy()))) > DEGREES_ABOVE else "rad"

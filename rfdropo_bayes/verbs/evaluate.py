@@ -39,6 +39,7 @@ from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
+from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.verbs.make_vec import randomisation_of, steps_of, training_of, with_training
 from rfdropo_bayes.verbs.train import POLICY
 
@@ -48,6 +49,7 @@ OF_EPISODES = ("task", "goals", "start", "actions", "observation", "period", "no
 """Keys of [training] that say what an episode is, whatever is simulated."""
 
 
+@with_keys_of(TrainingTable)
 def evaluate(
     model: Model,
     policies: Sequence[Path],
@@ -59,7 +61,7 @@ def evaluate(
     seed: int = 0,
     film: bool = True,
     overwrite: bool = False,
-    **options: Any,
+    **keys: Any,
 ) -> dict[str, Any]:
     """Play exported policies on the same episodes of a model.
 
@@ -75,7 +77,7 @@ def evaluate(
         seed: of the cases.
         film: whether to draw the animations.
         overwrite: start anew whatever ``out`` holds.
-        options: keys of an experiment file's [training], such as the task. Of an experiment without that table they
+        keys: of an experiment file's [training], such as the task. Of an experiment without that table they
             are those of the first policy's training.
 
     Returns:
@@ -87,7 +89,7 @@ def evaluate(
     if episodes < 1:
         raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for one at least")
     opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
-    model = with_training(model, {**(_task_of(policies) if model.settings.training is None else {}), **options})
+    model = with_training(model, {**(_task_of(policies) if model.settings.training is None else {}), **keys})
     table, task, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, posterior)
     loaded = dict(zip(_names(policies), opened, strict=True))

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
-from rfdropo_bayes.data import lerobot, motive_csv, rosbag
+from rfdropo_bayes.data import lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
+from rfdropo_bayes.data.named_columns import COUNTS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import matching_files, output_folder
-from rfdropo_bayes.model.experiment import load_experiment
+from rfdropo_bayes.model.experiment import Experiment, load_experiment
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, robot_text
 from rfdropo_bayes.verbs.column_names import Guess, guess_columns, lost_positions
+from rfdropo_bayes.verbs.placement import frame_lines
 
 PRIORS = (
     ("young_modulus", "how stiff"),
@@ -81,6 +84,23 @@ def guess_units(path: Path, commands: Path | None, command_unit: str | None, pos
     )
 
 
+def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
+    """A guess with the counts of one turn; whoever gives them, and no unit (``told``), has commands in counts.
+
+    Raises:
+        InputError: counts of one turn that are not positive, or are given for commands in another unit.
+    """
+    if counts is None:
+        return guess
+    if counts <= 0.0:
+        raise InputError(f"{counts:g} counts in one turn", where="--counts-per-turn", remedy="give a positive number")
+    if not guess.counts and told:
+        remedy = "leave it out, or give --command-unit counts"
+        raise InputError(f"commands are in {guess.command_unit}", where="--counts-per-turn", remedy=remedy)
+    unit = guess.command_unit if guess.counts else COUNTS
+    return guess._replace(counts_per_turn=counts, command_unit=unit)
+
+
 def write_first_files(
     folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess | None
 ) -> tuple[Path, Path]:
@@ -102,15 +122,37 @@ def write_first_files(
         if path.exists():
             raise InputError("is there already", where=str(path), remedy="choose another folder, or move the file away")
     robot.write_text(robot_text(outline), encoding="utf-8")
-    Robot.load(robot)
-    data = (
-        _random_commands(outline)
-        if guess is None
-        else data_tables(folder, outline.markers, recordings, commands, guess, outline.gravity)
-    )
-    experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
-    load_experiment(experiment)
+    made = Robot.load(robot)
+
+    def write(data: list[str]) -> Experiment:
+        experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
+        return load_experiment(experiment)[0]
+
+    if guess is None:
+        write(_random_commands(outline))
+        return robot, experiment
+    tables = partial(data_tables, folder, outline.markers, recordings, commands, guess, outline.gravity)
+    frame = _frame(write(tables()), made, folder)
+    if frame:
+        write(tables(frame=frame))
     return robot, experiment
+
+
+def _frame(experiment: Experiment, robot: Robot, folder: Path) -> list[str]:
+    """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
+
+    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
+    """
+    if experiment.data is None or experiment.data.columns is None:
+        return []
+    columns = experiment.data.columns
+    try:
+        first = load_recordings(experiment.data, folder)[0]
+    except InputError:  # what is wrong with it is said by check, which the user runs next
+        return []
+    found = frame_lines(robot, first, columns)
+    turned = found and found[0] != f"axes = {quoted(columns.axes)}"
+    return [] if turned and experiment.data.format == motive_csv.FORMAT else found
 
 
 def _head(name: str) -> list[str]:
@@ -155,8 +197,12 @@ def data_tables(
     commands: list[Path],
     guess: Guess,
     gravity: str = "",
+    frame: Sequence[str] = (),
 ) -> list[str]:
-    """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it."""
+    """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
+
+    ``frame`` are the lines of axes and origin, where the first row tells them.
+    """
     entries = _entries(folder, recordings, commands, guess)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
     lost = lost_positions(recordings, guess)
@@ -166,11 +212,11 @@ def data_tables(
     axes, assumed = ["x", "y", "z"], ""
     if guess.format == motive_csv.FORMAT:
         axes, assumed = AXES.get(gravity, axes), "  # ASSUMED: Motive's y axis points up"
-    optional = [
-        f"{key} = {quoted(values)}"
-        for key, values in (("tensions", guess.tensions), ("motor_angles", guess.motor_angles))
-        if values
-    ]
+    optional = [f"tensions = {quoted(guess.tensions)}"] if guess.tensions else []
+    if guess.motor_angles:
+        optional += [f"motor_angles = {quoted(guess.motor_angles)}", f'motor_angle_unit = "{guess.motor_angle_unit}"']
+    counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
+    found = [f"{line}  # ASSUMED: found from the first row" for line in frame]
     left = [f"# not used: {', '.join(guess.left)}"] if guess.left else []
     return [
         "[data]",
@@ -184,6 +230,7 @@ def data_tables(
         *_clock(guess),
         f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order",
         f'command_unit = "{guess.command_unit}"',
+        *counts,
         *_command_clock(guess),
         "positions = [",
         *(f"    {quoted(triple)}," for triple in guess.positions),
@@ -191,7 +238,7 @@ def data_tables(
         f'position_unit = "{guess.position_unit}"',
         f"markers = {quoted(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
-        f"axes = {quoted(axes)}{assumed}",
+        *(found or [f"axes = {quoted(axes)}{assumed}"]),
         *optional,
         *left,
         "",

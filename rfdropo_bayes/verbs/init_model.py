@@ -16,10 +16,10 @@ from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.simulators.adapters import first_tables
 from rfdropo_bayes.tables import parse_table
-from rfdropo_bayes.verbs.column_names import Guess
+from rfdropo_bayes.verbs.column_names import ANGLES, Guess
 from rfdropo_bayes.verbs.init import data_tables, quoted
 
-OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ("rad", "deg")}
+OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}
 """Units that a recording may have of what a simulator takes in each of these."""
 
 
@@ -78,6 +78,7 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
         "position_unit": guess.position_unit,
         "markers": guess.markers,
     }
+    columns |= {} if guess.counts_per_turn is None else {"counts_per_turn": guess.counts_per_turn}
     columns |= {"sample_time": 0.05} if guess.time is None else {"time": guess.time, "time_unit": guess.time_unit}
     entry = str(recordings[0]) if not commands else {"observations": str(recordings[0]), "commands": str(commands[0])}
     table = {"format": guess.format, "fit": [entry], "columns": columns, "missing": "mask"}

@@ -35,6 +35,7 @@ from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot
+from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import changed, parse_table
 
@@ -43,8 +44,9 @@ LONGER = 0.15
 of a trunk whose tip rests at 184 mm, so that an arm of 166 to 224 mm ends 7 to 100 mm beyond them."""
 
 
+@with_keys_of(TrainingTable)
 def make_vec(
-    task: str, model: Model, *, posterior: Calibration | Path | None = None, n: int = 64, **options: Any
+    task: str, model: Model, *, posterior: Calibration | Path | None = None, n: int = 64, **keys: Any
 ) -> TrunkVecEnv:
     """Environments of a task, side by side, for Stable-Baselines3.
 
@@ -53,12 +55,12 @@ def make_vec(
         model: that is simulated; its fixed values hold.
         posterior: whose draws the episodes' parameters are, or its folder; nominal values without.
         n: how many environments.
-        options: further keys of an experiment file's [training], such as ``observation`` or ``period``.
+        keys: further keys of an experiment file's [training], such as ``observation`` or ``period``.
 
     Raises:
         InputError: an unknown task or key, or a posterior of another robot.
     """
-    model = with_training(model, {"task": task, **options})
+    model = with_training(model, {"task": task, **keys})
     table, chosen, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, posterior)
     return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, episode_settings(table)))

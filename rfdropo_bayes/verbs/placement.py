@@ -106,36 +106,74 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     return [*hints, f"{head}; {found or 'look at axes, origin, units, the order of markers and their point_m'}"]
 
 
-def _cause(start: Start, length: float, read: Read) -> str | None:
-    """The simplest of a shift, an order of markers, axes, or axes and a shift, that brings the first row near."""
+def frame_lines(robot: Robot, trajectory: Trajectory, columns: CsvColumns) -> list[str]:
+    """Lines of [data.columns], axes and origin, that bring a first row to the undeformed robot.
+
+    None where it is near already, or where no frame brings it near.
+
+    Args:
+        robot: with the undeformed markers.
+        trajectory: the recording, as ``columns`` read it.
+        columns: the table by which it was read.
+    """
+    start, length = start_of(robot, trajectory), robot.body.station_m[-1] - robot.body.station_m[0]
+    if not start.names or _rms(start.first - start.rest) <= FAR * length:
+        return []
+    found, read = _frame(start, length), Read.by(columns)
+    if found is None:
+        return []
+    turn, shift = found
+    axes = f"axes = {axes_words(turn @ read.turn)}"
+    return [axes, read.shifted(turn, shift)] if np.any(shift) else [axes]
+
+
+def _ordered(start: Start) -> np.ndarray:
+    """Which undeformed marker each marker of the first row is nearest to, each taken once."""
+    cost = np.linalg.norm(start.first[:, None] - start.rest[None], axis=2)
+    return linear_sum_assignment(cost**2)[1]
+
+
+def _frame(start: Start, length: float) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
+    """The simplest of a shift, a turn, or both, that brings the first row near, unless an order of markers does."""
     names, rest, first = start
     shift = np.mean(rest - first, axis=0)
     if _rms(first + shift - rest) <= NEAR * length and len(names) > 1:
-        line = read.shifted(np.eye(3), shift)
+        return np.eye(3), shift
+    if _rms(first - rest[_ordered(start)]) <= NEAR * length:
+        return None
+    for turn in _turns():
+        if _rms(first @ turn.T - rest) <= NEAR * length:
+            return turn, np.zeros(3)
+    for turn in _turns():
+        shift = np.mean(rest - first @ turn.T, axis=0)
+        if len(names) > 1 and _rms(first @ turn.T + shift - rest) <= NEAR * length:
+            return turn, shift
+    return None
+
+
+def _cause(start: Start, length: float, read: Read) -> str | None:
+    """The simplest of a shift, an order of markers, axes, or axes and a shift, that brings the first row near."""
+    names, rest, first = start
+    found, order = _frame(start, length), _ordered(start)
+    if found is None and _rms(first - rest[order]) <= NEAR * length:
+        meant = ", ".join(names[index] for index in order)
+        return f"another order of the markers would bring it there: {', '.join(names)} look like {meant}"
+    if found is None:
+        return None
+    turn, shift = found
+    line = read.shifted(turn, shift)
+    if np.array_equal(turn, np.eye(3)):
         if not read.unit:
             return f"{line} would bring it there: give offset_x, offset_y and offset_z priors as wide"
         return f"{line} in [data.columns] would bring it there: the robot's base in the file's frame, in {read.unit}"
-    cost = np.linalg.norm(first[:, None] - rest[None], axis=2)
-    order = linear_sum_assignment(cost**2)[1]
-    if _rms(first - rest[order]) <= NEAR * length:
-        meant = ", ".join(names[index] for index in order)
-        return f"another order of the markers would bring it there: {', '.join(names)} look like {meant}"
     straight = bool(np.all(2.0 * np.linalg.norm(rest[:, :2], axis=1) <= NEAR * length))  # half a turn moves them little
     twist = (
         ". Markers along the body do not show its turn about z; check compares motions with commands once they are near"
     )
     twist = twist if straight else ""
-    for turn in _turns():
-        if _rms(first @ turn.T - rest) <= NEAR * length:
-            return f"axes = {axes_words(turn @ read.turn)} in [data.columns] would bring it there{twist}"
-    for turn in _turns():
-        shift = np.mean(rest - first @ turn.T, axis=0)
-        if len(names) > 1 and _rms(first @ turn.T + shift - rest) <= NEAR * length:
-            return (
-                f"axes = {axes_words(turn @ read.turn)} and {read.shifted(turn, shift)} in [data.columns] would bring "
-                f"it there{twist}"
-            )
-    return None
+    axes = f"axes = {axes_words(turn @ read.turn)}"
+    lines = f"{axes} and {line}" if np.any(shift) else axes
+    return f"{lines} in [data.columns] would bring it there{twist}"
 
 
 def _stretched(start: Start) -> list[str]:

@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings
+from rfdropo_bayes.signatures import with_keys_of
 
 
+@with_keys_of(DataSpec, without=("fit", "test"))
 def read(
     files: str | Path | Mapping[str, Any] | Sequence[str | Path | Mapping[str, Any]],
     format: str = "netcdf",
     columns: Mapping[str, Any] | None = None,
     *,
     folder: Path | str = Path(),
-    **options: Any,
+    **keys: Any,
 ) -> list[Trajectory]:
     """Read recordings.
 
@@ -25,12 +27,12 @@ def read(
         format: csv, motive-csv, rosbag, lerobot, netcdf, asl-csv, optitrack-csv or sofa-csv.
         columns: for the first four, what each column is, as in an experiment file's [data.columns].
         folder: that names are relative to.
-        options: further keys of [data], such as ``resample``, ``missing`` or ``initial_command``.
+        keys: further keys of [data], such as ``resample``, ``missing`` or ``initial_command``.
 
     Raises:
         InputError: a file that is missing or damaged, a pattern that matches nothing, or an unknown key.
     """
     entries = [files] if isinstance(files, str | Path | Mapping) else list(files)
     named = [dict(entry) if isinstance(entry, Mapping) else str(entry) for entry in entries]
-    table = {"format": format, "fit": named, **({} if columns is None else {"columns": dict(columns)}), **options}
+    table = {"format": format, "fit": named, **({} if columns is None else {"columns": dict(columns)}), **keys}
     return load_recordings(DataSpec.parse(table, where="read"), Path(folder))

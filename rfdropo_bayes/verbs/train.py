@@ -28,6 +28,7 @@ from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
+from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.verbs.make_vec import episode_settings, randomisation_of, steps_of, training_of, with_training
 
 POLICY, CARD, SUMMARY, CURVE, PAGE = "policy.onnx", "card.md", "summary.json", "curve.png", "report.html"
@@ -35,6 +36,7 @@ SCHEMA_VERSION = 1
 PLAYED = 64  # lanes in which the policy that is kept is played
 
 
+@with_keys_of(TrainingTable)
 def train(
     model: Model,
     out: Path | str,
@@ -45,7 +47,7 @@ def train(
     overwrite: bool = False,
     show: bool | None = None,
     page: bool = True,
-    **options: Any,
+    **keys: Any,
 ) -> dict[str, Any]:
     """Train a policy on a model, and export it.
 
@@ -58,7 +60,7 @@ def train(
         resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
         show: progress on the terminal, as in `calibrate`.
         page: whether to play the policy and draw report.html, which takes 20 s of processor time.
-        options: keys of an experiment file's [training].
+        keys: of an experiment file's [training], in the place of those of the model's own file.
 
     Returns:
         the content of summary.json.
@@ -68,7 +70,7 @@ def train(
     """
     if resume and command_of(Path(out)) is None:
         raise InputError("holds no run to go on with", where=str(out), remedy="correct --out, or leave out --resume")
-    model = with_training(model, options)
+    model = with_training(model, keys)
     tables = model.record({"seed": model.settings.seed}, {"seed": seed})
     seed = model.settings.seed if seed is None else seed
     table, task, simulator = training_of(model)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
 from typer.testing import CliRunner
 
 from rfdropo_bayes.cli.main import app
@@ -19,10 +20,11 @@ ROW = {"mean": 1.0, "sd": 0.1, "q05": 0.9, "q95": 1.1, "unit": "[m]"}
 def test_an_audit_is_shown_as_it_is(capsys):
     finding = {"mechanism": "play", "parameters": {"play@[red]": ROW}}
     found = {"verdict": "explained", "sentence": WORDS, "findings": [finding], "next_experiment": {"sentence": WORDS}}
-    show_audit(found, FOLDER, quiet=False, as_json=False)
+    show_audit({**found, "adopted": ["play"]}, FOLDER, quiet=False, as_json=False)
     shown = capsys.readouterr().out
     assert shown.count(WORDS) == 2
-    assert shown.count(str(FOLDER)) == 2
+    assert shown.count(str(FOLDER)) == 3
+    assert "then: rfdropo calibrate 'runs [red] :bomb:/extended.toml' --out OUT" in shown
     assert "play@[red]" in shown
 
 
@@ -36,11 +38,28 @@ def test_a_calibration_is_shown_as_it_is(capsys):
     }
     caution = SimpleNamespace(sentence=WORDS, grave=True)
     found = SimpleNamespace(content=content, folder=FOLDER, verdict="safe", sentence="", cautions=[caution])
-    show_calibration(found, quiet=False, as_json=False)
+    show_calibration(found, Path("a.toml"), quiet=False, as_json=False)
     shown = capsys.readouterr().out
     assert shown.count(WORDS) == 2
     assert shown.count(str(FOLDER)) == 3  # the rest of the parameters, what to run next, the report
     assert "3@[red]" in shown
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [("safe", "predict fit --commands FILE --out OUT"), ("unsafe", "audit 'own arm.toml' --base fit --out OUT")],
+)
+def test_a_calibration_says_what_to_type_next(capsys, verdict, words):
+    content = {"headline": [], "details": {}, "parameters": {"modulus": ROW}, "method": "laplace"}
+    found = SimpleNamespace(content=content, folder=Path("fit"), verdict=verdict, sentence="", cautions=[])
+    show_calibration(found, Path("own arm.toml"), quiet=False, as_json=False)
+    assert f"\nnext: rfdropo {words}\n" in capsys.readouterr().out
+
+
+def test_an_audit_that_adopts_nothing_has_no_model_to_fit(capsys):
+    found = {"verdict": "unexplained", "sentence": "", "findings": [], "adopted": []}
+    show_audit({**found, "next_experiment": {"sentence": ""}}, FOLDER, quiet=False, as_json=False)
+    assert "then:" not in capsys.readouterr().out
 
 
 def test_a_bar_shows_its_title_as_it_is(capsys):

@@ -181,6 +181,27 @@ def test_the_origin_of_the_base_is_taken_off_in_the_frame_and_unit_of_the_file(p
     np.testing.assert_allclose(read.position - moved.position, shift, atol=1e-12)
 
 
+def test_counts_are_angles_by_the_counts_of_one_turn(plain):
+    """Commands and measured angles alike; the largest command that is believed is in counts, too."""
+    counted = MAPPING | {"command_unit": "counts", "counts_per_turn": 360.0}
+    counted |= {"motor_angles": ["motor"], "motor_angle_unit": "counts"}
+    read = read_plain_csv(plain, CsvColumns.model_validate(counted))
+    assert read.command_unit == "rad"
+    np.testing.assert_allclose(read.command_at(read.time)[:, 0], np.deg2rad(np.arange(40)))
+    np.testing.assert_allclose(read.motor_angle[:, 0], np.deg2rad(np.arange(40)))
+    winch = counted | {"counts_per_turn": 4.0}
+    with pytest.raises(InputError, match="largest_command"):
+        read_plain_csv(plain, CsvColumns.model_validate(winch))
+    far = read_plain_csv(plain, CsvColumns.model_validate(winch | {"largest_command": 40.0}))
+    np.testing.assert_allclose(far.command.max(), 0.5 * np.pi * 39)
+
+
+@pytest.mark.parametrize("change", [{"command_unit": "counts"}, {"counts_per_turn": 360.0}])
+def test_counts_and_the_counts_of_a_turn_belong_together(change):
+    with pytest.raises(ValueError, match="counts_per_turn belongs to the unit"):
+        CsvColumns.model_validate(MAPPING | change)
+
+
 def test_plain_csv_takes_commands_from_a_file_of_their_own(plain, tmp_path):
     (tmp_path / "commands.csv").write_text("motor\n" + "\n".join(["7"] * 39))
     recording = read_plain_csv(plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")

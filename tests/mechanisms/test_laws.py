@@ -93,6 +93,22 @@ def test_a_law_of_zero_changes_no_bit_and_another_one_acts(port):
     assert np.abs(moved.position - still.position).max() > 1e-6
 
 
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_a_base_tilt_at_a_port_is_the_mechanism_of_the_other_sign(axis):
+    """The port turns gravity, the mechanism the base: docs/mechanisms.md says how the signs relate."""
+    angle, plain = 1e-4, build_robot_simulator(spec())
+    acting = build_robot_simulator(spec(law(f"base tilt {axis}", "constant")))
+    tables = {"robot": "smooth_arm", "model": {"mechanisms": ["base_tilt"]}, "simulator": {"time_step": STEP}}
+    tilted = build_robot_simulator(spec_of(parse_table(Experiment, tables, where="test"), Path()))
+    given = commands(plain)
+    still = np.asarray(plain.rollout({}, given).position)
+    port = np.asarray(acting.rollout({"c": jnp.asarray(angle)}, given).position) - still
+    level = {f"base_tilt_{other}": jnp.asarray(0.0) for other in "xz"}
+    mechanism = tilted.rollout(level | {f"base_tilt_{axis}": jnp.asarray(-angle)}, given).position - still
+    assert np.abs(port).max() > 1e-8
+    np.testing.assert_allclose(port, mechanism, atol=5e-3 * np.abs(port).max())
+
+
 @pytest.mark.slow
 def test_a_law_at_a_cable_is_a_change_of_its_command_in_rollouts_and_in_sessions():
     acting, plain = build_robot_simulator(spec(law("cable left", "product", commands=["up", "left"]))), None

@@ -240,6 +240,21 @@ def test_recordings_alike_share_a_note(tmp_path):
     assert any(note.startswith("run, again: the first row is ") for note in found.doubts)
 
 
+@pytest.mark.parametrize(("factor", "doubtful"), [(1.0, False), (10.0, False), (100.0, True)])
+def test_pulls_longer_than_the_body_are_doubtful_and_those_beyond_a_limit_a_note(tmp_path, factor, doubtful):
+    """Commands in another unit than the file says; a line for each recording, whatever its cables."""
+    checked(tmp_path)
+    run = pd.read_csv(tmp_path / "run.csv")
+    names = [name for name in run if name.startswith("c")]
+    run[names] *= factor * 8.0 / np.abs(run[names].to_numpy()).max()  # mm
+    run.to_csv(tmp_path / "run.csv", index=False)
+    found = run_check(tmp_path / "own.toml", tmp_path / "pictures")
+    doubts = [line for line in found.doubts if "pulls that no body of" in line]
+    assert bool(doubts) == doubtful
+    assert not doubts or "look at command_unit" in doubts[0]
+    assert sum("displacement_limit_m" in line for line in found.notes) == int(factor == 10.0)
+
+
 def listed(tmp_path: Path, *copies: str, fit: str, test: str = "[]", more: str = "") -> Check:
     """What check says of copies of one recording, some of them under the names of folders."""
     checked(tmp_path, more=more)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,7 +16,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.method_options import attributes_of, settings_text
+from rfdropo_bayes.model.experiment import AuditTable, ModelTable
+from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.verbs.predict import fitted_parts
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -199,3 +206,61 @@ def test_an_audit_of_a_black_box_names_a_hidden_delay(runs):
         found.plot_residual("rates")
     with pytest.raises(InputError, match="cannot draw"):
         replace(found, shown=None).plot_blocks()
+
+
+def test_every_call_shows_the_keywords_that_it_takes():
+    """Tab completion and help show what may be given; nothing hides behind ``**keys``."""
+    hidden = []
+    for name in rb.__all__:
+        called = getattr(rb, name)
+        if callable(called):
+            entries = inspect.signature(called).parameters.values()
+            hidden += [name for entry in entries if entry.kind is entry.VAR_KEYWORD]
+    assert hidden == []
+
+
+@pytest.mark.parametrize(
+    ("called", "schema", "without"),
+    [
+        (rb.read, DataSpec, {"fit", "test"}),
+        (rb.train, TrainingTable, set()),
+        (rb.make_vec, TrainingTable, set()),
+        (rb.evaluate, TrainingTable, set()),
+        (rb.audit, AuditTable, set()),
+        (rb.Model, ModelTable, set()),
+    ],
+)
+def test_a_call_shows_the_keys_of_its_table(called, schema, without):
+    shown, told = inspect.signature(called).parameters, inspect.getdoc(called) or ""
+    keys = set(schema.model_fields) - without
+    assert keys <= set(shown)
+    if called is not rb.Model:  # whose docstring names the table
+        assert [key for key in keys if not re.search(rf"^\s+{key}: \S|``{key}``", told, re.MULTILINE)] == []
+
+
+def test_a_mistyped_key_names_the_nearest(tmp_path):
+    with pytest.raises(InputError, match=r"unknown key 'resampel'.*did you mean 'resample'"):
+        rb.read("run.csv", "csv", {}, folder=tmp_path, resampel=0.1)
+
+
+@pytest.mark.parametrize("name", sorted(rb._METHODS))
+def test_the_options_of_a_method_say_what_they_are(name):
+    """The first line is the call that makes them; a line for each option says its value and its meaning."""
+    kind = getattr(rb, name)
+    assert kind.called == name
+    shown = repr(kind())
+    assert shown.splitlines()[0] == kind().call == f"rb.{name}()"
+    told = attributes_of(kind)
+    for field in dataclasses.fields(kind):
+        assert re.search(rf"^  {field.name} .*{re.escape(told[field.name].split()[0])}", shown, re.MULTILINE)
+    changed = kind(draws=123)
+    assert changed.call == f"rb.{name}(draws=123)"
+    assert eval(changed.call) == changed
+
+
+def test_the_options_inside_options_are_a_call_too():
+    chosen = rb.Bridge(climb=rb.Laplace(starts=2), particles=50)
+    assert chosen.call == "rb.Bridge(climb=rb.Laplace(starts=2), particles=50)"
+    assert "climb        rb.Laplace(starts=2)  " in repr(chosen)
+    assert settings_text(rb.UDR(draws=5)) == "UdrConfig(draws=5)"  # checkpoints of earlier versions know it so
+    assert settings_text(chosen).startswith("BridgeConfig(climb=LaplaceConfig(starts=2, screen=64, ")

@@ -39,13 +39,15 @@ def table(time: str, position: str, command: str, scale: float = 1.0, factor: fl
         ("timestamp", "{marker}_{axis}", "cmd_{0}", 1e-3, ("s", "m", "m"), ["low", "tip"]),
         ("Time_s", "{marker}.{axis}", "theta_{0}_deg", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
         ("Zeit [s]", "{marker} {axis} [mm]", "Motor {0} [deg]", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
+        ("Time_s", "{marker}_{axis}_mm", "M{0}_cmd_counts", 1.0, ("s", "counts", "mm"), ["low", "tip"]),
+        ("t", "{marker}_{axis}_mm", "axis {0} (ticks)", 1.0, ("s", "counts", "mm"), ["low", "tip"]),
     ],
 )
 def test_columns_are_recognised_by_their_names(tmp_path, time, position, command, scale, units, markers):
     path = tmp_path / "run.csv"
     table(time, position, command, scale).to_csv(path, index=False)
     guess = guess_columns(path)
-    if "cmd" in command or command.startswith("u"):  # lengths: 0.4 is more than a cable moves in metres
+    if command == "cmd_{0}" or command.startswith("u"):  # lengths: 0.4 is more than a cable moves in metres
         units = (units[0], "mm", units[2])
     assert (guess.time_unit, guess.command_unit, guess.position_unit) == units
     assert guess.time == time
@@ -202,3 +204,75 @@ def test_a_recording_with_signs_of_patterns_in_its_name(tmp_path, monkeypatch, c
     assert [run.name for run in load_recordings(experiment.data, tmp_path / "arm")] == ["run [1]"]
     assert matching(["run [1]", "run 1"], "run [1]", where="here") == ["run [1]"]
     assert matching(["run [2]", "run 1"], "run [1]", where="here") == ["run 1"]
+
+
+COUNTS = 4096.0
+
+
+def counted(tmp_path, turn=None, clamp=(0.0, 0.0, 0.0)) -> pd.DataFrame:
+    """A recording in counts of encoders, whose positions are in a frame of its own; it is written to run.csv."""
+    run = table("t", "{marker}_{axis}_mm", "M{0}_cmd_counts")
+    for k in range(1, 5):
+        run[f"M{k}_cmd_counts"] = np.round(COUNTS / (2.0 * np.pi) * run[f"M{k}_cmd_counts"]).astype(int)
+    for marker in ("low", "tip"):
+        names = [f"{marker}_{axis}_mm" for axis in "xyz"]
+        run[names] = run[names].to_numpy() @ (np.eye(3) if turn is None else turn).T + clamp
+    run.to_csv(tmp_path / "run.csv", index=False)
+    return run
+
+
+def test_counts_become_angles_once_the_counts_of_a_turn_are_given(tmp_path, monkeypatch, capsys):
+    run = counted(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    words = ("--recording", "run.csv", "--length-mm", "200", "--counts-per-turn", "4096", "--spool-radius-mm", "8")
+    assert init(monkeypatch, capsys, "arm", *words)[0] == 0
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    assert read.command_unit == find_robot(experiment.robot, tmp_path / "arm").command_unit == "rad"
+    sent = run[[f"M{k}_cmd_counts" for k in range(1, 5)]].to_numpy()
+    np.testing.assert_allclose(read.command, 2.0 * np.pi / COUNTS * sent, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "give --counts-per-turn: counts in one turn of the spool"),
+        (("--counts-per-turn", "0"), "0 counts in one turn"),
+        (("--counts-per-turn", "4096", "--command-unit", "mm"), "commands are in mm"),
+    ],
+)
+def test_counts_have_no_default_size(tmp_path, monkeypatch, capsys, words, message):
+    counted(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", "--recording", "run.csv", *words)
+    assert status == 2
+    assert message in told
+
+
+def test_measured_angles_keep_the_unit_that_their_columns_tell(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}_mm", "motor{0} [rad]")
+    for k in range(1, 5):
+        run[f"motor{k}_meas [deg]"] = np.degrees(run[f"motor{k} [rad]"])
+    run.to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    assert init(monkeypatch, capsys, "arm", "--recording", "run.csv", "--length-mm", "200")[0] == 0
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    np.testing.assert_allclose(read.motor_angle, read.command)
+
+
+@pytest.mark.parametrize("clamp", [(35.0, 1420.0, -210.0), (0.0, 0.0, 0.0)])
+def test_the_frame_of_a_laboratory_is_found_from_the_first_row(tmp_path, monkeypatch, capsys, clamp):
+    """A robot that hangs in a frame whose y axis points up: axes and origin are written, up to a turn about z."""
+    up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    counted(tmp_path, up, clamp)
+    monkeypatch.chdir(tmp_path)
+    words = ("--recording", "run.csv", "--length-mm", "200", "--counts-per-turn", "4096")
+    assert init(monkeypatch, capsys, "arm", *words)[0] == 0
+    text = (tmp_path / "arm" / "experiment.toml").read_text(encoding="utf-8")
+    assert text.count("# ASSUMED: found from the first row") == (2 if any(clamp) else 1)
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    assert experiment.data.columns.axes[2] == "-y"
+    np.testing.assert_allclose(read.position[0, :, 2], 1e-3 * MARKERS, atol=0.01)
+    np.testing.assert_allclose(read.position[0, :, :2], 0.0, atol=0.01)

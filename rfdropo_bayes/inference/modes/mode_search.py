@@ -29,6 +29,7 @@ from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, Tra
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.modes.climb import (
     Climbable,
     Laplace,
@@ -63,8 +64,8 @@ SURVEY_MOVES = 8  # of a stage, at most: climbs need a place in the right basins
 FEWEST_STEPS = 4.0  # of a climb that is worth its start
 
 
-@dataclass(frozen=True)
-class LaplaceConfig:
+@dataclass(frozen=True, repr=False)
+class LaplaceConfig(MethodOptions, called="Laplace"):
     """Laplace: a normal posterior around the optima that Levenberg-Marquardt climbs reach.
 
     Attributes:

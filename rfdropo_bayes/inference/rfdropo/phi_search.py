@@ -23,6 +23,7 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, with_rollouts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
 from rfdropo_bayes.inference.rfdropo.candidate_scores import ScorePlan, motion_scale, row_scores, simulate, uniforms
@@ -35,8 +36,8 @@ FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
 
 
-@dataclass(frozen=True)
-class RfdropoConfig:
+@dataclass(frozen=True, repr=False)
+class RfdropoConfig(MethodOptions, called="RFDROPO"):
     """RF-DROPO: phi, the distribution to randomise over, by a search along a growing horizon.
 
     Attributes:

@@ -29,6 +29,7 @@ from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProble
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import evaluate_prior
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, mode_values
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
@@ -48,8 +49,8 @@ MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
 
 
-@dataclass(frozen=True)
-class BridgeConfig:
+@dataclass(frozen=True, repr=False)
+class BridgeConfig(MethodOptions, called="Bridge"):
     """Bridge: posterior and an evidence that scatters little, by SMC from the optima to the posterior.
 
     Attributes:

@@ -27,6 +27,7 @@ from rfdropo_bayes.inference.evaluations import (
     evaluate_rows,
     representable_draws,
 )
+from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import (
     InferenceResult,
@@ -49,8 +50,8 @@ NOT_REPRESENTABLE = "not_representable"
 FROM_PRIOR = "smc_from_prior"
 
 
-@dataclass(frozen=True)
-class SmcConfig:
+@dataclass(frozen=True, repr=False)
+class SmcConfig(MethodOptions, called="SMC"):
     """Horizon SMC: posterior and evidence of every block of rows, by sampling ever longer prefixes.
 
     Attributes:

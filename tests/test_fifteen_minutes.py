@@ -1,0 +1,47 @@
+"""What a new user types from the README alone: the commands that are replayed are the README's, and they work."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SCRIPT = REPOSITORY / "benchmarks" / "fifteen_minutes.py"
+
+
+def replay() -> ModuleType:
+    """The script as a module."""
+    found = importlib.util.spec_from_file_location("fifteen_minutes", SCRIPT)
+    assert found is not None
+    assert found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    sys.modules[found.name] = module
+    found.loader.exec_module(module)
+    return module
+
+
+def test_the_commands_that_are_replayed_are_those_of_the_readme():
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    block = re.search(r"```sh\n(rfdropo init.*?)```", text, re.DOTALL)
+    assert block is not None
+    told = [shlex.split(line, comments=True)[1] for line in block[1].splitlines()]
+    typed = [shlex.split(command)[1] for command in replay().COMMANDS]
+    assert [verb for k, verb in enumerate(typed) if k == 0 or verb != typed[k - 1]] == told
+
+
+@pytest.mark.slow
+def test_a_stranger_gets_from_a_csv_to_a_prediction(tmp_path):
+    """Seven minutes of one processor: the shift in time is found, and the prediction errs by little more than noise."""
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, str(SCRIPT), str(tmp_path)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "reading and typing" in done.stdout
