@@ -27,7 +27,7 @@ from rfdropo_bayes.studies.table2 import ORACLE, OURS, ROWS, Table2Size, run_tab
 
 SIZES = {
     "reach": Table2Size(seeds=1, steps=200_000, episodes=200, budget=3_000, minutes=25.0, exact_oracle=True),
-    "push": Table2Size(seeds=1, steps=600_000, episodes=200, budget=2_000, minutes=15.0, exact_oracle=True),
+    "push": Table2Size(seeds=1, steps=600_000, episodes=200, budget=2_000, minutes=300.0, exact_oracle=True),
 }
 LEADING, RIVALS = (ORACLE, OURS, "ours", "no randomisation"), ("UDR", "BayesSim", "NPDR", "RF-DROPO as published")
 STAGES = ((LEADING, 1), (LEADING, 2), (RIVALS, 2), (tuple(ROWS), 3))  # rows, trainings of each
