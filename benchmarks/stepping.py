@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rfdropo_bayes.fem.native.layered_engine import available_threads
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.runtime import available_processors
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
 ROBOT, PERIOD, SOLVES, ACTIONS = "trunk_sofa", 0.05, 5, 20
@@ -131,7 +131,7 @@ def main() -> None:
     for push in (False, True):
         scene = "push" if push else "reach"
         for precision in ("float32", "float64"):
-            for threads in sorted({1, available_threads()}):
+            for threads in sorted({1, available_processors()}):
                 model = simulator(precision, threads, push=push, integrator=chosen.integrator)
                 for lanes in chosen.lanes:
                     wall, cpu, memory = sessions(model, lanes, chosen.seconds)

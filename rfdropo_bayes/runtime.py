@@ -11,6 +11,11 @@ from pathlib import Path
 CALLBACK_THREADS = 4
 
 
+def available_processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def limit_blas_threads() -> None:
     """Keep BLAS on one thread, unless the user chose otherwise.
 
@@ -34,8 +39,7 @@ def configure_jax() -> None:
     """
     import jax
 
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if usable < CALLBACK_THREADS:
+    if available_processors() < CALLBACK_THREADS:
         os.environ.setdefault("PJRT_NPROC", str(CALLBACK_THREADS))  # read when JAX first uses the processor
 
     jax.config.update("jax_enable_x64", True)

@@ -81,6 +81,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "next_experiment": next_experiment,
         "rollouts": answer.cost.rollouts,
         "seconds": round(answer.cost.seconds, 2),
+        "waited_seconds": round(answer.cost.waited, 2),
         "profile": {stage: round(seconds, 2) for stage, seconds in answer.cost.profile.items()},
         "seed": answer.problem.seed,
         "versions": versions,

@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from rfdropo_bayes.audit.processor_wait import delay, thread_times
+from rfdropo_bayes.runtime import available_processors
+
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
 BETWEEN_STAGES = "preparation and report"
 
@@ -18,13 +21,14 @@ class OutOfTime(Exception):
 
 @dataclass
 class Deadline:
-    """A limit on the time of a whole run.
+    """A limit on the time of a whole run, by the clock on the wall: on a busy machine, less is done within it.
 
     Attributes:
         minutes: from its making on; infinite for no limit.
         where: the setting that holds them.
         share: part of the time after which rollouts stop.
         reached: whether anything was left undone.
+        waited: seconds that the run has waited for processors which other programs held, see `delay`.
     """
 
     minutes: float = float("inf")
@@ -32,9 +36,11 @@ class Deadline:
     share: float = 1.0 - KEPT
     began: float = field(default_factory=time.monotonic)
     reached: bool = False
+    waited: float = 0.0
     _spent: dict[str, float] = field(default_factory=dict)
     _stages: list[str] = field(default_factory=lambda: [BETWEEN_STAGES])
     _charged: float = field(default_factory=time.monotonic)
+    _threads: dict[str, tuple[float, float]] = field(default_factory=thread_times)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -58,9 +64,10 @@ class Deadline:
         return dict(self._spent)
 
     def _charge(self) -> None:
-        now = time.monotonic()
+        now, threads = time.monotonic(), thread_times()
         self.recall(now - self._charged)
-        self._charged = now
+        self.waited += delay(now - self._charged, self._threads, threads, available_processors())
+        self._charged, self._threads = now, threads
 
     @property
     def left(self) -> float:
@@ -69,6 +76,7 @@ class Deadline:
 
     def check(self) -> None:
         """Raise OutOfTime once the time is up."""
+        self._charge()
         if self.left <= 0.0:
             self.reached = True
             raise OutOfTime

@@ -42,7 +42,6 @@ from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 LEAST = 0.01
 """Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
-TERMS = 3  # of a law
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
 EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
 FRESH = 3  # terms that are refitted in each round
@@ -253,7 +252,7 @@ class LawSearch:
         seed: of simulated data sets.
         family: probability that a port is named where nothing is hidden.
         report: called with a line of words.
-        most: terms that a law may have.
+        most: terms that a law may have; None leaves their number to the recordings.
         taken: names of coefficients that the model has, of laws that an earlier audit found.
     """
 
@@ -264,7 +263,7 @@ class LawSearch:
     seed: int
     family: float
     report: Callable[[str], None] = lambda line: None
-    most: int = TERMS
+    most: int | None = None
     taken: frozenset[str] = frozenset()
 
     def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
@@ -284,7 +283,7 @@ class LawSearch:
         afterwards: list[PortEvidence] = []
         offered = 0.0
         try:
-            while len(terms) < self.most and (where[0].adjusted_p <= self.family or (forced and not terms)):
+            while len(terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not terms)):
                 if not terms:
                     found = self._sharpened(known, fit, found, values, where)
                     offered = next((row.gain for row in self._ranked(found, values, 0.0)), 0.0)

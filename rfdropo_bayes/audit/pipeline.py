@@ -112,11 +112,13 @@ class Cost:
         stopped: whether the time was up before all was done.
         rollouts: of the whole run.
         profile: seconds of each stage, of all parts of an audit that was resumed.
+        waited: seconds for which its last part waited for processors that other programs held.
     """
 
     stopped: bool
     rollouts: int
     profile: dict[str, float]
+    waited: float
 
     @property
     def seconds(self) -> float:
@@ -282,7 +284,7 @@ def audit(
         sizes,
         draws,
         Doubts(suspected, target.measurements.shift, shown, decided_by_priors(target, draws)),
-        Cost(stopped, judge.forward.rollouts + (finer.rollouts if finer else 0), deadline.profile),
+        Cost(stopped, judge.forward.rollouts + (finer.rollouts if finer else 0), deadline.profile, deadline.waited),
     )
 
 

@@ -63,10 +63,11 @@ def _left_out(answer: Answer) -> str:
 def _stopped(answer: Answer) -> str:
     if not answer.cost.stopped:
         return ""
-    minutes = answer.problem.rules.minutes
+    minutes, waited = answer.problem.rules.minutes, round(answer.cost.waited / 60.0)
+    busy = f" For {waited} of them the audit waited for processors that other programs held." if waited else ""
     return (
         f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
-        "go on with --resume."
+        f"go on with --resume.{busy}"
     )
 
 

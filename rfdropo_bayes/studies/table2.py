@@ -293,6 +293,8 @@ def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
         audit(Model.read(study.audit, [minutes]), out=out, resume=(out / CHECKPOINTS).exists())
         write_text(out / ASKED, asked)
     found = json.loads((out / AUDIT).read_text(encoding="utf-8"))
+    if found["out_of_time"]:  # what it says so far depends on the machine
+        raise InputError(found["sentence"], where=str(out), remedy="give the audit more minutes, and go on")
     if found["verdict"] == NO_VERDICT:
         raise InputError(found["sentence"], where=str(out), remedy="mend the audit's file, then remove this folder")
     before, after = read_tables(study.audit), read_tables(out / EXTENDED)

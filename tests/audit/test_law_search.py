@@ -92,6 +92,21 @@ class Lagging(Toy):
         return seen._replace(position=seen.position.at[:, 2, 0].add(self.pushed * ahead))
 
 
+MANY = {(0, 0): (0, 0), (1, 1): (0, 1), (2, 0): (1, 1), (3, 2): (0, 0)}
+"""Markers and coordinates that are pushed, and the commands by whose product."""
+
+
+class PushedAtMany(Toy):
+    """Four markers, each along one coordinate by a product of commands."""
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level, position = jnp.concatenate([commands.initial[None], commands.step]), seen.position
+        for (marker, axis), (one, other) in MANY.items():
+            position = position.at[:, marker, axis].add(SIZE * level[:, one] * level[:, other])
+        return seen._replace(position=position)
+
+
 def searched(toy, alike=False):
     """Problem, judge, base model and the search's findings of recordings of a toy."""
     question = asked(6, toy, alike)
@@ -292,6 +307,14 @@ def test_the_shape_of_a_feature_is_inferred_and_leaves_no_further_term():
     ((term,),) = [table["terms"] for table in law_tables(answer)]
     assert term["shape_parameter"] == f"{term['coefficient']}_shape"
     assert abs(term["shape"] - row["shape"]) < row["shape_sd"]
+
+
+@pytest.mark.slow
+def test_a_law_has_as_many_terms_as_act():
+    _, _, _, found = searched(PushedAtMany())
+    ports = {refit.term.port.name for refit in found.terms}
+    assert ports == {f"marker m{marker + 1} {'xyz'[axis]}" for marker, axis in MANY}
+    assert len(found.terms) == len(MANY)
 
 
 class PushedPlaying(Pushed):

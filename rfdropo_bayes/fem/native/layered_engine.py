@@ -52,6 +52,7 @@ from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads
+from rfdropo_bayes.runtime import available_processors
 
 Precision = Literal["float64", "float32"]
 # When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
@@ -98,11 +99,6 @@ def _kernel() -> Callable:
     return compile_rollout(kernel_sources("layered_rollout"))
 
 
-def available_threads() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class NativeLayered:
     """Rollouts of one layered body with its cables.
 
@@ -138,7 +134,7 @@ class NativeLayered:
             raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
         self.system, self.time_step, self.integrator = system, float(time_step), integrator
         self.precision, self.dtype = precision, np.dtype(precision)
-        self.threads = threads or available_threads()
+        self.threads = threads or available_processors()
         self.lanes = lanes or native_lanes(self.dtype)
         self.points = len(points.node)
         self.tables = layered_tables(system, points, self.dtype.type)

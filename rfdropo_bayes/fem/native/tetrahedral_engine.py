@@ -28,12 +28,13 @@ from rfdropo_bayes.fem.native.contact_records import (
 )
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
-from rfdropo_bayes.fem.native.layered_engine import available_threads, in_blocks
+from rfdropo_bayes.fem.native.layered_engine import in_blocks
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
+from rfdropo_bayes.runtime import available_processors
 
 
 class TetrahedralEngine:
@@ -62,7 +63,7 @@ class TetrahedralEngine:
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
         self._kernel = _kernel()  # here, so that threads do not make one each
         self.lanes = native_lanes(dtype)
-        self.threads = threads or available_threads()
+        self.threads = threads or available_processors()
         self._order, self._number = _numbering(body)
         self._rest = body.rest[self._order].astype(self.dtype).ravel()
         self._reach = LOST * float(np.ptp(body.rest, axis=0).max())
