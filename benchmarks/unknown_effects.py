@@ -1,9 +1,10 @@
 """How often an audit says where an effect enters that the library lacks, and by what law; resumable.
 
     python benchmarks/unknown_effects.py [--out reports/unknown_effects] [--effects crosstalk,bouc_wen] [--seeds 0,1]
-                                         [--rho 1.0] [--null 0] [--alone | --force]
+                                         [--rho 1.0] [--null 0] [--alone | --force] [--body arm]
 
-Effects are those of `rfdropo_bayes/studies/unknown_effects.py`, hidden in recordings of the layered arm; ``--null`` is
+Effects are those of `rfdropo_bayes/studies/unknown_effects.py`, hidden in recordings of the layered arm, or, with
+``--body mesh``, of SOFA's trunk on its own mesh, whose data and audits have one mesh and one time step; ``--null`` is
 the number of data sets with nothing hidden. A line of the ledger for each data set: verdict, port, law, unseen errors,
 and seconds. All share compiled simulators. A data set in the ledger is not run again. One takes one to four minutes on
 two cores.
@@ -33,18 +34,26 @@ from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line
 from rfdropo_bayes.model.experiment import AuditTable
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.studies.audit_study import MESH
+from rfdropo_bayes.studies.hidden_effects import Setting
 from rfdropo_bayes.studies.unknown_effects import EFFECTS, FOREIGN, conceal
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 
 ALL, NONE, FORCED = "all", "none", "forced"
 WITHIN = 1.15  # of the noise, an unseen error counts as explained
-MINUTES = 300.0  # no limit: what else the machine does must not decide a verdict
+ARM = "arm"
+BODIES = {ARM: Setting(), "mesh": MESH}
+
+Case = tuple[str, float, int, str, str]  # effect, rho, seed, library, body
 
 
-def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: Workshop) -> dict[str, Any]:
+def one(case: Case, folder: Path, workshop: Workshop) -> dict[str, Any]:
     """A data set, audited with a library of all candidates or none."""
-    line: dict[str, Any] = {"effect": name, "rho": rho, "seed": seed, "library": library}
-    hidden = conceal(name, rho, seed, folder / f"{name or 'nothing'}_{rho:g}_{seed}", workshop=workshop)
+    name, rho, seed, library, body = case
+    line: dict[str, Any] = {"effect": name, "rho": rho, "seed": seed, "library": library, "body": body}
+    place = folder / f"{'' if body == ARM else f'{body}_'}{name or 'nothing'}_{rho:g}_{seed}"
+    hidden = conceal(name, rho, seed, place, setting=BODIES[body], workshop=workshop)
     if hidden is None:
         return {**line, "verdict": "no size reaches this rho"}
     model = rb.Model.read(hidden.experiment)
@@ -56,7 +65,8 @@ def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: 
         problem = build_problem(model.spec, AuditTable(), model.runs(None, ())[0], [], seed, workshop=workshop)
         left_out = [candidate.name for candidate in problem.candidates]
     began, used = time.monotonic(), time.process_time()
-    found = rb.audit(model, test=unseen, seed=seed, workshop=workshop, exclude=left_out, minutes=MINUTES)
+    options = {"exclude": left_out, "minutes": float("inf")}  # how busy the machine is must not change a line
+    found = rb.audit(model, test=unseen, seed=seed, workshop=workshop, **options)
     line |= {"size": hidden.size, "verdict": found.verdict, "sentence": found.sentence}
     line |= {"law": found.content["law"], "findings": [row["mechanism"] for row in found.content["findings"]]}
     line |= {"seconds": round(time.monotonic() - began, 1), "cpu_seconds": round(time.process_time() - used, 1)}
@@ -87,6 +97,11 @@ def noise_of(unseen: Sequence[rb.Trajectory], clean: np.ndarray) -> float:
     return float(1e3 * np.sqrt(3.0 * np.nanmean(apart**2)))
 
 
+def robot_of(line: dict[str, Any]) -> Robot:
+    """The robot of a line's recordings."""
+    return Robot.load(BODIES[line["body"]].robot)
+
+
 def leading_ports(ports: dict[str, Any] | None) -> list[list[Any]]:
     """The first ports by evidence, with their log evidences."""
     return [[row["port"], round(row["log_evidence"], 1)] for row in (ports or {"ports": []})["ports"][:5]]
@@ -101,9 +116,9 @@ def judged(line: dict[str, Any], name: str, noise: float) -> dict[str, Any]:
     effect, law = (EFFECTS | FOREIGN).get(name), line["law"]
     if effect is None or law is None or line["verdict"] != DESCRIBED:
         return {"port_right": False, "law_right": False} if effect else {}
-    ports = [law["port"], *(tie["port"] for tie in law["ties"])]
+    ports, right = [law["port"], *(tie["port"] for tie in law["ties"])], effect.ports_of(robot_of(line))
     return {
-        "port_right": any(port in effect.ports for port in ports),
+        "port_right": any(port in right for port in ports),
         "law_right": law["terms"][0]["feature"] in effect.leading,
         "unseen_over_noise": round(law["rmse_after_mm"] / noise, 3),
     }
@@ -117,13 +132,14 @@ def main() -> None:
     parser.add_argument("--seeds", default="0,1")
     parser.add_argument("--rho", type=float, default=1.0)
     parser.add_argument("--null", type=int, default=0)
+    parser.add_argument("--body", choices=BODIES, default=ARM)
     kinds = parser.add_mutually_exclusive_group()
     kinds.add_argument("--alone", action="store_const", const=NONE, default=ALL, dest="library")
     kinds.add_argument("--force", action="store_const", const=FORCED, dest="library")
     given = parser.parse_args()
-    cases = [("", 0.0, seed, given.library) for seed in range(given.null)]
+    cases: list[Case] = [("", 0.0, seed, given.library, given.body) for seed in range(given.null)]
     cases += [
-        (name, given.rho, int(seed), given.library)
+        (name, given.rho, int(seed), given.library, given.body)
         for seed in given.seeds.split(",")
         for name in given.effects.split(",")
         if name and given.library != FORCED
@@ -131,11 +147,11 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     ledger = given.out / "ledger.jsonl"
     lines = [json.loads(line) for line in ledger.read_text().splitlines()] if ledger.exists() else []
-    known = {(line["effect"], line["rho"], line["seed"], line["library"]) for line in lines}
+    known = {(*(line[key] for key in ("effect", "rho", "seed", "library")), line.get("body", ARM)) for line in lines}
     workshop: Workshop = {}
     for case in cases:
         if case not in known:
-            lines.append(one(*case, given.out / "data", workshop))
+            lines.append(one(case, given.out / "data", workshop))
             append_line(ledger, json.dumps(lines[-1]))
             print(f"{case[0] or 'nothing'} {case[2]}: {lines[-1]['verdict']}", flush=True)
     for library in (ALL, NONE):

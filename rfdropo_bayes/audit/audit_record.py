@@ -57,14 +57,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "explained_fraction": gain.explained,
             "explained_fraction_interval": list(gain.interval),
             "test_trajectories": gain.trajectories,
-            "by_trajectory": {
-                name: {
-                    "rmse_base_mm": MILLIMETRES * each.rmse_base,
-                    "rmse_extended_mm": MILLIMETRES * each.rmse_extended,
-                    "elpd_difference": each.elpd,
-                }
-                for name, each in gain.differences.items()
-            },
+            "by_trajectory": gain.by_trajectory,
             "measured_on": answer.validation.recordings,
         },
         "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},

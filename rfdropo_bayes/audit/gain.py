@@ -114,6 +114,18 @@ class Gain:
         return len(self.differences)
 
     @property
+    def by_trajectory(self) -> dict[str, dict[str, float]]:
+        """Errors [mm] and log density of each trajectory, as plain values."""
+        return {
+            name: {
+                "rmse_base_mm": 1e3 * each.rmse_base,
+                "rmse_extended_mm": 1e3 * each.rmse_extended,
+                "elpd_difference": each.elpd,
+            }
+            for name, each in self.differences.items()
+        }
+
+    @property
     def worse(self) -> bool:
         """Whether unseen trajectories are predicted worse: their error grows, or the discrepancy surely does."""
         return self.rmse_extended > self.rmse_base or self.interval[1] < 0.0

@@ -49,6 +49,7 @@ def law_record(answer: Answer) -> dict[str, Any] | None:
         "explained_fraction": None if gain is None else gain.explained,
         "explained_fraction_interval": None if gain is None else list(gain.interval),
         "elpd_difference": None if gain is None else gain.elpd_difference,
+        "by_trajectory": None if gain is None else gain.by_trajectory,
     }
 
 
@@ -103,7 +104,8 @@ def law_sentence(answer: Answer) -> str:
     share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}]"
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
-    head = f"Something acts that stands for no mechanism of the library: {laws}{_when(described)}"
+    unknown = "stands for no mechanism of the library" if answer.problem.candidates else "the model lacks"
+    head = f"Something acts that {unknown}: {laws}{_when(described)}"
     worth = f"it explains {share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
     looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.found.terms))
     return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
@@ -167,11 +169,25 @@ def ports_sentence(answer: Answer) -> str:
         return ""
     left = answer.extended.residual
     if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as what is left, and shrinks the signal
-        return f" Of all ports, a signal at {rows[0].port.words} explains most of it; no law of it holds."
+        return f" Of all ports, a signal at {rows[0].port.words} explains most of it; {_no_law(answer)}."
     size = f"{rows[0].amplitude:.2g}" + ("" if rows[0].port.unit == "-" else f" {rows[0].port.unit}")
     others = ", ".join(row.port.words for row in rows[1 : 1 + MOST_TIES])
     beside = f" ({others} explain less)" if others else ""
-    return f" A signal at {rows[0].port.words}, of {size}, explains most of it{beside}; no law of it holds."
+    return f" A signal at {rows[0].port.words}, of {size}, explains most of it{beside}; {_no_law(answer)}."
+
+
+def _no_law(answer: Answer) -> str:
+    """That no law holds; of a law of the fitted recordings, how unseen ones are predicted with it."""
+    described = answer.causes.described
+    assert described is not None
+    if described.last is None or described.gain is None:
+        return "no law of it holds"
+    rows = coefficients(described, answer.problem.seed)
+    terms = zip(described.found.terms, rows, strict=True)
+    laws = " and ".join(_one(refit, row, channels_of(answer)) for refit, row in terms)
+    gain = described.gain
+    errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
+    return f"no law of it holds. The fitted recordings ask for a law that unseen ones do not support ({errors}): {laws}"
 
 
 def law_tables(answer: Answer) -> list[dict[str, Any]]:

@@ -156,7 +156,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         return f"Something is wrong with the base model (joint test p {_p(answer)}); no candidate was tried to the end."
     if not findings:
         tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
-        return f"Something is wrong with the base model, and no candidate of the library says what: {tail}."
+        asked = "no candidate of the library says what" if answer.problem.candidates else "no candidate was asked"
+        return f"Something is wrong with the base model, and {asked}: {tail}."
     named = " and ".join(_named(finding) for finding in findings)
     gain = answer.validation.gain
     if gain is None:

@@ -233,6 +233,10 @@ class AuditTable(ExperimentTable):
         description="mechanisms that are tried beside the registry's, e.g. mine.py:MyMechanism",
     )
     exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
+    library: bool = Field(
+        default=True,
+        description="try the registry's mechanisms, quantities of the robot, and differences between groups",
+    )
     ports: bool = Field(
         default=True,
         description="look for unknown causes, as laws at ports, where the library leaves something",

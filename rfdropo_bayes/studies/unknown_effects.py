@@ -1,5 +1,5 @@
-"""Effects that no mechanism of the library has, hidden in recordings of an arm: where, and by what law, does the audit
-say that they act? Each is written here as a law, in code that the audit never sees.
+"""Effects that no mechanism of the library has, hidden in recordings of an arm or a mesh: where, and by what law, does
+the audit say that they act? Each is written here as a law, in code that the audit never sees.
 
 Three repeats of one random command and three recordings of others are fitted, four more are untouched. Data come from a
 finer mesh and time step than the audit's own. Sizes are rho, see `hidden_effects`.
@@ -25,6 +25,7 @@ from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import AuditTable, SimulatorTable
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 from rfdropo_bayes.studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
@@ -48,7 +49,7 @@ class Effect(NamedTuple):
     """An effect that the library lacks.
 
     Attributes:
-        ports: names of the ports where it may rightly be found.
+        ports: names of the ports where it may rightly be found, with cables and markers by number; see `ports_of`.
         leading: kinds of feature that say its law rightly.
         acts: size and scene to signals by name: "command", "delay", "force", "stiffness", "damping".
         sees: size, positions (row, marker, 3) and time of observations, and commands then, to positions; None where
@@ -62,9 +63,13 @@ class Effect(NamedTuple):
     sees: Callable[[float, Any, Any, Any], Any] | None = None
     moves: bool = False
 
+    def ports_of(self, robot: Robot) -> tuple[str, ...]:
+        """Names of the ports on a robot."""
+        return tuple(port.format(cables=robot.channel_names, markers=robot.marker_names) for port in self.ports)
 
-def _channel(k: int, w: Any) -> Any:
-    return jnp.zeros((len(w), 4)).at[:, k].set(w)
+
+def _channel(scene: Scene, k: int, w: Any) -> Any:
+    return jnp.zeros_like(scene.levels).at[:, k].set(w)
 
 
 def _at_tip(force: Any) -> Any:
@@ -90,14 +95,14 @@ def _clock(size: float, position: Any, time: Any, command: Any) -> Any:
 
 
 def _slide(size: float, position: Any, time: Any, command: Any) -> Any:
-    """Marker m3 slides towards the tip by 4 mm in the whole recording."""
+    """The third marker slides towards the tip by 4 mm in the whole recording."""
     chord = position[:, 3] - position[:, 1]
     chord = chord / jnp.linalg.norm(chord, axis=1, keepdims=True)
     return position.at[:, 2].add(4e-3 * size * (time / time[-1])[:, None] * chord)
 
 
 def _twisted_mount(size: float, position: Any, time: Any, command: Any) -> Any:
-    """The cameras' mount turns about z as cable left pulls."""
+    """The cameras' mount turns about z as the second cable pulls."""
     turn = 5.0 * size * command[:, 1]
     return position + turn[:, None, None] * jnp.cross(jnp.array([0.0, 0.0, 1.0]), position)
 
@@ -143,24 +148,28 @@ def _filtered_marker(size: float, position: Any, time: Any, command: Any) -> Any
 
 EFFECTS: dict[str, Effect] = {
     "crosstalk": Effect(
-        ("cable left",), ("product",), lambda a, s: {"command": _channel(1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])}
+        ("cable {cables[1]}",),
+        ("product",),
+        lambda a, s: {"command": _channel(s, 1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])},
     ),
     "bouc_wen": Effect(
-        ("cable up",),
+        ("cable {cables[0]}",),
         ("play", "direction"),
-        lambda a, s: {"command": _channel(0, -8e-4 * a * _bouc_wen(s.levels[:, 0], s.time))},
+        lambda a, s: {"command": _channel(s, 0, -8e-4 * a * _bouc_wen(s.levels[:, 0], s.time))},
     ),
     "slipping_cable": Effect(
-        ("cable right",),
+        ("cable {cables[3]}",),
         ("travelled",),
         lambda a, s: {
-            "command": _channel(3, -0.05 * a * jnp.cumsum(jnp.abs(jnp.diff(s.levels[:, 3], prepend=s.levels[:1, 3]))))
+            "command": _channel(
+                s, 3, -0.05 * a * jnp.cumsum(jnp.abs(jnp.diff(s.levels[:, 3], prepend=s.levels[:1, 3])))
+            )
         },
     ),
     "one_lagging_cable": Effect(
-        ("cable down",),
+        ("cable {cables[2]}",),
         ("rate",),
-        lambda a, s: {"command": _channel(2, -0.04 * a * jnp.asarray(jnp.gradient(s.levels[:, 2], s.time)))},
+        lambda a, s: {"command": _channel(s, 2, -0.04 * a * jnp.asarray(jnp.gradient(s.levels[:, 2], s.time)))},
     ),
     "slow_queue": Effect(("command delay",), ("time",), lambda a, s: {"delay": 0.02 * a * s.time}),
     "magnet": Effect(
@@ -180,7 +189,7 @@ EFFECTS: dict[str, Effect] = {
         lambda a, s: {"stiffness": -10.0 * a * jax.lax.cummax(jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1))},
         moves=True,
     ),
-    "sliding_marker": Effect(("marker m3 along the body", "marker m3 z"), ("time",), sees=_slide),
+    "sliding_marker": Effect(("marker {markers[2]} along the body", "marker {markers[2]} z"), ("time",), sees=_slide),
     "slow_clock": Effect(("observation delay",), ("time",), sees=_clock),
     "twisted_mount": Effect(("camera turn z",), ("command",), sees=_twisted_mount),
     "zooming_camera": Effect(("camera scale",), ("time",), sees=_zoom),
@@ -294,7 +303,7 @@ def _signals(effect: Effect, size: Any, scene: Scene) -> PortSignals:
     body = none._replace(**{name: part for name, part in given.items() if name in BodySignals._fields})
     acts = any(name in given for name in BodySignals._fields)
     return PortSignals(
-        given.get("command", jnp.zeros((rows, 4))), given.get("delay", jnp.zeros(rows)), body if acts else None
+        given.get("command", jnp.zeros_like(scene.levels)), given.get("delay", jnp.zeros(rows)), body if acts else None
     )
 
 

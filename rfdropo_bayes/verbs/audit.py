@@ -189,13 +189,18 @@ def build_problem(
 
     ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
     are the candidates, where it is not all; ``groups`` of recordings are compared, or have candidates of their own.
+
+    Raises:
+        InputError: [audit] leaves nothing to ask.
     """
     spreads, robot = spec.per_group, spec.robot
     if groups is not None and groups.compared:  # what the groups do not share is to be found
         spec = replace(spec, per_group={})
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
-    library = names is None
+    whole = names is None
+    if whole and not table.library:
+        _something_asked(table, groups)
     if names is None:
         names = candidate_names(spec, table)
         left_out = obstacles(spec, names, trajectories[0])
@@ -204,7 +209,7 @@ def build_problem(
     model, base = _model(spec, simulator, trajectories, len(fitted))
     added, specs = simulator.mechanisms[len(spec.mechanisms) :], simulator.parameters
     candidates = _named(table, model, names, added)
-    if library:
+    if whole and table.library:
         of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
         plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
@@ -233,8 +238,19 @@ def build_problem(
         seed,
         {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
-        port_map(simulator, model.recordings.markers) if library and table.ports else None,
+        port_map(simulator, model.recordings.markers) if whole and table.ports else None,
     )
+
+
+def _something_asked(table: AuditTable, groups: Groups | None) -> None:
+    """Refuse an audit without the library that has no laws at ports or candidates of one's own to ask for either."""
+    ports = table.ports and (groups is None or not groups.compared)
+    if not (ports or table.candidates):
+        raise InputError(
+            "nothing is asked: the library is left out, and laws at ports are, too",
+            where="[audit] library",
+            remedy="set library = true, or ports = true without --between",
+        )
 
 
 def _rules(table: AuditTable) -> Rules:
@@ -273,7 +289,7 @@ def _with_own(
 
 
 def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
-    """What may be in the model: the registry and the experiment's own, less what is in its base model.
+    """What may be in the model: the registry, if it is asked, and the experiment's own, less what is in its base model.
 
     Excluded ones are among them, so that what is compiled does not depend on what is excluded.
 
@@ -285,7 +301,8 @@ def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
     for name in table.exclude:
         if name not in known and not any(parameter.startswith(f"{name}_") for parameter in own):
             raise InputError(f"unknown mechanism {name!r}", where="[audit] exclude", remedy=nearest(name, known))
-    return [name for name in known if name not in spec.sources]
+    asked = known if table.library else table.candidates
+    return [name for name in asked if name not in spec.sources]
 
 
 def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> dict[str, str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.model_spec import spec_of
@@ -95,3 +96,22 @@ def test_beside_a_cube_every_candidate_runs():
     asked = build_problem(spec_of(read, Path()), read.audit, [recording()], [], seed=0)
     assert not asked.left_out
     assert {c.name for c in asked.candidates} == set(REGISTRY) | {"initial_displacement"}
+
+
+def test_without_the_library_a_mesh_is_asked_for_laws_alone(bar_mesh):
+    read = experiment(bar_mesh, library=False)
+    asked = build_problem(spec_of(read, Path()), read.audit, [recording()], [], seed=0)
+    assert not asked.candidates
+    assert not asked.left_out
+    assert asked.coordinates.base == len(asked.coordinates.names)
+    assert asked.ports is not None
+    names = {port.name for port in asked.ports.ports}
+    assert {"cable long_1", "command delay", "observation delay"} <= names
+    assert "stiffness" not in names
+    assert asked.ports.left_out
+
+
+def test_an_audit_without_library_and_ports_is_refused():
+    read = experiment(Path("bar.vtk"), library=False, ports=False)
+    with pytest.raises(InputError, match="nothing is asked"):
+        build_problem(spec_of(read, Path()), read.audit, [recording()], [], seed=0)
