@@ -19,6 +19,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, read_lines, write_text
 from rfdropo_bayes.inference.progress import Progress
@@ -156,7 +157,7 @@ def _one(job: Job, truth: Truth, base: Mapping[str, Any], folder: Path) -> dict[
     began, processor = time.monotonic(), time.process_time()
     name = str(job["effect"])
     effect = truth.effects.get(name)
-    number = [int(job["seed"]), 1 + [NOTHING, *truth.effects].index(name), int(job["index"])]
+    number = seed_of(truth, name, int(job["seed"]), int(job["index"]))
     place = folder / "data" / f"{name.replace(' ', '_')}_{job['index']}"
     hidden = _recorded(truth, base, effect, float(job["rho"]), number, place)
     if hidden is None:
@@ -176,17 +177,27 @@ def _one(job: Job, truth: Truth, base: Mapping[str, Any], folder: Path) -> dict[
     }
 
 
-def _recorded(
-    truth: Truth, base: Mapping[str, Any], effect: EngineEffect | None, rho: float, seed: Sequence[int], out: Path
-) -> Path | None:
-    """Write a data set; None where no size of the effect reaches rho."""
-    out = output_folder(out)
+def drawn_arm(truth: Truth, effect: EngineEffect | None, seed: Sequence[int]) -> tuple[EngineArm, list[Trajectory]]:
+    """The arm of a data set, and its recordings without positions: repeats first, other fitted ones, untouched ones."""
     rng = np.random.default_rng(list(seed))
     spread = np.exp(0.2 * rng.standard_normal(len(truth.centre)))
     values = {name: float(v * s) for (name, v), s in zip(truth.centre.items(), spread, strict=True)}
     names = [*(f"fit_{k + 1}" for k in range(FITTED)), *(f"test_{k + 1}" for k in range(UNTOUCHED))]
     blank = blank_recordings(truth.setting, rng, names, [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)])
-    arm = truth.arm(Robot.load(truth.setting.robot), values, effect)
+    return truth.arm(Robot.load(truth.setting.robot), values, effect), blank
+
+
+def seed_of(truth: Truth, effect: str, seed: int, index: int) -> list[int]:
+    """Of a data set of the study, in which nothing or an effect is hidden."""
+    return [seed, 1 + [NOTHING, *truth.effects].index(effect), index]
+
+
+def _recorded(
+    truth: Truth, base: Mapping[str, Any], effect: EngineEffect | None, rho: float, seed: Sequence[int], out: Path
+) -> Path | None:
+    """Write a data set; None where no size of the effect reaches rho."""
+    out = output_folder(out)
+    arm, blank = drawn_arm(truth, effect, seed)
     size, reached = 0.0, 0.0
     if effect is not None:
         sized = _sized(base, arm, effect, rho, blank, out)
@@ -198,7 +209,7 @@ def _recorded(
         noisy(recording, clean, jax.random.fold_in(key, index), truth.setting).save(out / f"{recording.name}.nc")
     tables = {**base, "seed": int(seed[-1]), "audit": {"minutes": MINUTES}}
     (out / "audit.toml").write_text(describe(tables), encoding="utf-8")
-    told = {"size": size, "unit": effect.unit if effect else "-", "reached": reached, "values": values}
+    told = {"size": size, "unit": effect.unit if effect else "-", "reached": reached, "values": arm.values}
     (out / "hidden.json").write_text(json.dumps(told), encoding="utf-8")
     return out
 

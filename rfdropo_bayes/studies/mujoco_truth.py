@@ -1,9 +1,9 @@
 """A robot made anew in MuJoCo, a truth that this package's engine did not make: springs and links, tendons for cables.
 
-Links are rigid. Between their middles lie joints that stretch along the axis, bend in two planes and twist, with the
-section's stiffness over a link's length. A rigid section does not swell where the arm is compressed, as if Poisson's
-ratio were zero. Cables are tendons through the guides' places, each drawn in by a stiff servo that can only pull. What
-is hidden is hidden by means of that engine: masses, gravity, dry friction, tendons, gains, sites.
+Links are rigid. Between their middles lie joints that stretch along the axis, shear and bend in two planes and twist,
+with the section's stiffness over a link's length. A rigid section does not swell where the arm is compressed, as if
+Poisson's ratio were zero. Cables are tendons through the guides' places, each drawn in by a stiff servo that can only
+pull. What is hidden is hidden by means of that engine: masses, gravity, dry friction, tendons, gains, sites.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import commands_on_grid
 
-LINKS = 20  # 40 move the tip of smooth_arm by 0.07 mm, root mean square, where it moves by 56 mm
+LINKS = 20  # as many as put guides and markers of smooth_arm into the middle of links; the next number is 40
 STEP = 1e-4  # [s]: springs along the axis are explicit, and the stiffest turns a link's mass within 6 of them
 POISSON = 0.0  # of the arm: its sections are rigid, and twist with E / 2
+SHEARED = 6.0 * (1.0 + POISSON) / (7.0 + 6.0 * POISSON)  # share of a solid round section that shears (Cowper 1966)
 CONTROL = 1e-3  # [s] for which a command is held
 CABLE = 5e4  # [N/m] of a servo
 CABLE_DAMPING = 5.0  # [N s/m]
@@ -115,13 +116,22 @@ ENGINE_EFFECTS: dict[str, EngineEffect] = {
 
 
 class _Section(NamedTuple):
-    """A joint in the middle of a piece of the body, and the link from there to the next."""
+    """A joint in the middle of a piece of the body, and the link from there to the next.
+
+    Attributes:
+        at: height of the joint [m].
+        stretch, shear: [N/m]; bend: about x and y, twist: [N m].
+        mass: of the link [kg]; centre: of it above the joint [m]; turn: moments of inertia about that [kg m2].
+    """
 
     at: float
     stretch: float
+    shear: float
     bend: tuple[float, float]
     twist: float
     mass: float
+    centre: float
+    turn: tuple[float, float, float]
 
 
 def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS) -> str:
@@ -148,7 +158,7 @@ def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS) -> st
         if section is not None:
             body = ElementTree.SubElement(body, "body", name=f"link{number}", pos=f"0 0 {section.at - low:.9g}")
             low = section.at
-            _link(body, section, values["rayleigh_stiffness"], robot.body.station_m[-1] / links)
+            _link(body, section, values["rayleigh_stiffness"], mirrored=number % 2 == 0)
         high = sections[number].at if number < len(sections) else np.inf
         for name, (x, y, z) in (*guides, *marks):
             if (low <= z < high) or (section is None and z < high):
@@ -177,39 +187,64 @@ def _sections(robot: Robot, values: Mapping[str, float], links: int) -> list[_Se
     shape, modulus = robot.body, values["young_modulus"]
     station = np.asarray(shape.station_m)
     length = station[-1] / links
-    middle = 0.5 * (station[1:] + station[:-1])
-    area, moment = np.asarray(shape.axial_area_m2), np.asarray(shape.bending_moment_area_m4)
-    torsion, shear = np.asarray(shape.torsion_constant_m4), modulus / (2.0 * (1.0 + POISSON))
-    mass = np.asarray(shape.mass_area_m2)
-    density = values["trunk_mass"] / float(np.sum(mass * np.diff(station)))
+
+    def within(table: Any, low: float, high: float) -> float:
+        """Integral of a profile, which is uniform in each of the robot's layers."""
+        total = np.concatenate([[0.0], np.cumsum(np.asarray(table) * np.diff(station))])
+        return float(np.interp(high, station, total) - np.interp(low, station, total))
+
+    def spring(own: float, table: Any, at: float) -> float:
+        """Of the piece with this middle: its parts yield one after the other."""
+        return own / within(1.0 / np.asarray(table), at - 0.5 * length, at + 0.5 * length)
+
+    moment, area = np.asarray(shape.bending_moment_area_m4), shape.axial_area_m2
+    shear = modulus / (2.0 * (1.0 + POISSON))
+    density = values["trunk_mass"] / within(shape.mass_area_m2, 0.0, station[-1])
     found = []
     for k in range(links):
         at = (k + 0.5) * length
-        extent = length if k < links - 1 else 0.5 * length
-        centre = at + 0.5 * extent
         # The layer's plane x bends by forces along x, that is about y.
-        bends = [modulus * float(np.interp(at, middle, moment[:, axis])) / length for axis in (1, 0)]
-        stretch = modulus * float(np.interp(at, middle, area)) / length
-        twist = shear * float(np.interp(at, middle, torsion)) / length
-        weight = density * float(np.interp(centre, middle, mass)) * extent
-        found.append(_Section(at, stretch, (bends[0], bends[1]), twist, weight))
+        bends = [spring(modulus, moment[:, axis], at) for axis in (1, 0)]
+        rest = (bends[0], bends[1]), spring(shear, shape.torsion_constant_m4, at)
+        springs = (spring(modulus, area, at), spring(SHEARED * shear, area, at), *rest)
+        found.append(_Section(at, *springs, *_inertia(within, robot, density, at, length)))
     return found
 
 
-def _link(body: Any, section: _Section, damping: float, length: float) -> None:
-    """Joints and inertia of a link."""
+def _inertia(
+    within: Callable[[Any, float, float], float], robot: Robot, density: float, at: float, length: float
+) -> tuple[float, float, tuple[float, float, float]]:
+    """Mass [kg] of the link that begins at a joint, its centre above it [m] and its moments of inertia [kg m2]."""
+    shape = robot.body
+    middle, end = at + 0.5 * length, min(at + length, shape.station_m[-1])
+    halves = np.array([density * within(shape.mass_area_m2, *part) for part in ((at, middle), (middle, end))])
+    mass, extent = float(np.sum(halves)), end - at
+    moments = np.asarray(shape.mass_moment_area_m4)
+    by_x, by_y = (density * within(moments[:, axis], at, end) for axis in (0, 1))
+    along = mass * extent**2 / 12.0
+    centre = float(length * (halves @ np.array([0.25, 0.75])) / mass)
+    return mass, centre, (by_y + along, by_x + along, by_x + by_y)
+
+
+def _link(body: Any, section: _Section, damping: float, mirrored: bool) -> None:
+    """Joints and inertia of a link; ``mirrored`` are joints in the order from tip to base.
+
+    A link that bends about one axis before the other is turned about the third, and one that is compressed along the
+    link below is moved sideways. Where every other link is mirrored, both are of second order in their length.
+    """
     kinds = (
         ("slide", "0 0 1", section.stretch),
+        ("slide", "1 0 0", section.shear),
+        ("slide", "0 1 0", section.shear),
         ("hinge", "1 0 0", section.bend[0]),
         ("hinge", "0 1 0", section.bend[1]),
         ("hinge", "0 0 1", section.twist),
     )
-    for kind, axis, stiffness in kinds:
+    for kind, axis, stiffness in reversed(kinds) if mirrored else kinds:
         given = {"type": kind, "axis": axis, "stiffness": f"{stiffness:.9g}", "damping": f"{damping * stiffness:.9g}"}
         ElementTree.SubElement(body, "joint", given)
-    turn = section.mass * length**2 / 6.0  # of a disk as thick as it is wide
-    about = {"mass": f"{section.mass:.9g}", "diaginertia": " ".join([f"{turn:.9g}"] * 3)}
-    ElementTree.SubElement(body, "inertial", {"pos": f"0 0 {0.5 * length:.9g}", **about})
+    about = {"mass": f"{section.mass:.9g}", "diaginertia": " ".join(f"{part:.9g}" for part in section.turn)}
+    ElementTree.SubElement(body, "inertial", {"pos": f"0 0 {section.centre:.9g}", **about})
 
 
 def _guides(robot: Robot) -> list[tuple[str, tuple[float, float, float]]]:
