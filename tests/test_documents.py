@@ -237,10 +237,6 @@ def test_every_page_of_the_site_is_in_its_navigation():
     assert sorted(wanted - listed) == []
 
 
-UNDER_WAY = {"audit_engines"}
-"""Reports of studies that still grow: they get their short form when they end."""
-
-
 @pytest.mark.parametrize("path", sorted(REPOSITORY.glob("reports/*/README.md")), ids=lambda path: path.parent.name)
 def test_a_report_answers_its_question_first(path: Path) -> None:
     """Question, answer, table, caveat and command in at most 60 lines; all else is on a page of details."""
@@ -248,6 +244,5 @@ def test_a_report_answers_its_question_first(path: Path) -> None:
     order = [text.find(f"**{word}") for word in ("Question", "Answer")]
     assert 0 < order[0] < order[1] < text.find("|---")
     assert re.search(r"`?(rfdropo|python|make|pytest) |tests/", text)
-    if path.parent.name not in UNDER_WAY:
-        assert "**Caveat" in text
-        assert len(text.splitlines()) <= 60
+    assert "**Caveat" in text
+    assert len(text.splitlines()) <= 60
