@@ -198,20 +198,22 @@ EFFECTS: dict[str, Effect] = {
 
 FOREIGN: dict[str, Effect] = {
     "rate_limited_drive": Effect(
-        ("cable left",),
+        ("cable {cables[1]}",),
         ("lag", "rate", "low_pass"),
-        lambda a, s: {"command": _channel(1, _rate_limited(s.levels[:, 1], 2e-4 / a) - s.levels[:, 1])},
+        lambda a, s: {"command": _channel(s, 1, _rate_limited(s.levels[:, 1], 2e-4 / a) - s.levels[:, 1])},
     ),
     "giving_pulley": Effect(
-        ("cable up",),
+        ("cable {cables[0]}",),
         ("excess", "magnitude", "product", "command"),
-        lambda a, s: {"command": _channel(0, -0.3 * a * jnp.maximum(s.levels[:, 0] - 3e-3, 0.0))},
+        lambda a, s: {"command": _channel(s, 0, -0.3 * a * jnp.maximum(s.levels[:, 0] - 3e-3, 0.0))},
     ),
     "warming_cable": Effect(
-        ("cable right",), ("time",), lambda a, s: {"command": _channel(3, 1e-3 * a * -jnp.expm1(-s.time / 2.0))}
+        ("cable {cables[3]}",),
+        ("time",),
+        lambda a, s: {"command": _channel(s, 3, 1e-3 * a * -jnp.expm1(-s.time / 2.0))},
     ),
     "cable_that_jumps": Effect(
-        ("cable down",), ("time",), lambda a, s: {"command": _channel(2, 1e-3 * a * (s.time > 2.0))}
+        ("cable {cables[2]}",), ("time",), lambda a, s: {"command": _channel(s, 2, 1e-3 * a * (s.time > 2.0))}
     ),
     "fan": Effect(
         ("force x at the tip", "force x at the middle"),
@@ -225,15 +227,19 @@ FOREIGN: dict[str, Effect] = {
         moves=True,
     ),
     "lens": Effect(("camera scale", "camera x", "camera y"), ("product", "magnitude", "command"), sees=_lens),
-    "filtered_marker": Effect(("marker m2 x", "marker m2 y", "marker m2 z"), ("rate", "lag"), sees=_filtered_marker),
+    "filtered_marker": Effect(
+        ("marker {markers[1]} x", "marker {markers[1]} y", "marker {markers[1]} z"),
+        ("rate", "lag"),
+        sees=_filtered_marker,
+    ),
     "crosstalk_and_slide": Effect(
-        ("cable left", "marker m3 along the body", "marker m3 z"),
+        ("cable {cables[1]}", "marker {markers[2]} along the body", "marker {markers[2]} z"),
         ("product", "time"),
-        lambda a, s: {"command": _channel(1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])},
+        lambda a, s: {"command": _channel(s, 1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])},
         _slide,
     ),
     "clock_and_weak_cable": Effect(
-        ("observation delay",), ("time",), lambda a, s: {"command": _channel(0, -0.1 * a * s.levels[:, 0])}, _clock
+        ("observation delay",), ("time",), lambda a, s: {"command": _channel(s, 0, -0.1 * a * s.levels[:, 0])}, _clock
     ),
 }
 """Effects that were written after the features, for which no feature was made; the last two are two effects each."""
