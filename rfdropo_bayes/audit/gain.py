@@ -137,8 +137,10 @@ class Gain:
 
     @property
     def against(self) -> dict[str, Difference]:
-        """Trajectories that are clearly less likely with the extension."""
-        return {name: each for name, each in self.differences.items() if each.elpd <= -TELLING}
+        """Trajectories that are clearly less likely with the extension: were it right, there would be any in at most
+        `CHANCE` of cases, however many they are (Bonferroni)."""
+        least = TELLING + np.log(max(self.trajectories, 1))
+        return {name: each for name, each in self.differences.items() if each.elpd <= -least}
 
     @property
     def clear(self) -> bool:

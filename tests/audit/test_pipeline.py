@@ -604,6 +604,9 @@ def test_the_smallest_p_value_of_a_bootstrap_is_a_bound():
 
 GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, {"run": Difference(2.0, 1.0, 50.0)})
 OPPOSED = {"a": Difference(2.0, 1.0, 54.0), "b": Difference(2.0, 2.1, -4.0)}
+FOUR = {"a": Difference(2.0, 1.0, 18.0), "b": Difference(2.0, 1.0, 18.0), "c": Difference(2.0, 1.0, 18.0)} | {
+    "d": Difference(2.0, 2.1, -4.3)
+}
 
 
 @pytest.mark.parametrize(
@@ -618,6 +621,7 @@ OPPOSED = {"a": Difference(2.0, 1.0, 54.0), "b": Difference(2.0, 2.1, -4.0)}
         ({"elpd_difference": 4.0, "elpd_p": None}, False, True),  # too few recordings to tell from chance
         ({"elpd_difference": 2.0, "elpd_p": None}, False, False),  # of few, a twentieth of a chance is allowed
         ({"elpd_p": None, "differences": OPPOSED}, False, False),  # one of these few speaks against it
+        ({"elpd_p": None, "differences": FOUR}, False, True),  # of four, a right model loses 4.3 nats in one by chance
     ],
 )
 def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
