@@ -30,6 +30,8 @@ from rfdropo_bayes.audit.screen import Screen, ScreenRow, p_in_words, screen
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
+SCANNED = (np.arange(16) + 0.5) / 16
+"""Quantiles of the prior of a candidate's size among which a climb's start is looked for."""
 TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
 PAIRS = 3  # that are refitted
 # Nats of evidence that a parameter which the data fix costs under a prior twice as wide. Widths are chosen by hand: a
@@ -396,11 +398,28 @@ class ExtensionSearch:
         assert row.probe is not None
         candidate = next(c for c in self.candidates if c.name == row.name)
         free = np.array([*fit.free, *np.setdiff1d(candidate.indices, fit.free)], dtype=int)
-        found = climb(self.target, best_between(self.target, fit.x, start, list(row.probe.point), SHARES), free)
+        start = best_between(self.target, fit.x, start, list(row.probe.point), SHARES)
+        if len(candidate.indices) == 1:
+            start = self._scanned(candidate.indices[0], fit.x, start)
+        found = climb(self.target, start, free)
         # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
         if found.residual @ found.residual > fit.residual @ fit.residual:
             found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
         return found
+
+    def _scanned(
+        self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"]
+    ) -> Float[np.ndarray, " d"]:
+        """The best of a start and of a base with a size from all over its prior.
+
+        Of a shift in time the likelihood has a summit wherever jumps of commands meet the rows of a recording; on one
+        of them a climb from no shift would end.
+        """
+        coordinates = self.target.forward.coordinates
+        points = np.repeat(base[None], 1 + len(SCANNED), axis=0)
+        points[0] = start
+        points[1:, index] = np.clip(coordinates.quantiles(index, SCANNED), *(end[index] for end in coordinates.bounds))
+        return points[int(np.argmax(heights(self.target, points, "scan")))]
 
     def _from_afar(self, name: str, fit: Fit) -> Fit:
         """A fit with one amplitude that leaves most of a large misfit, or a better one from elsewhere: the base model's
@@ -408,15 +427,11 @@ class ExtensionSearch:
         candidate = next((c for c in self.candidates if c.name == name), None)
         if candidate is None or len(candidate.indices) != 1 or not far_off(self.target, fit.x):
             return fit
-        coordinates, (index,) = self.target.forward.coordinates, candidate.indices
-        signs = (coordinates.one_sided[index],) if coordinates.one_sided[index] else (-1, 1)
-        tried = []
-        for sign in signs:
-            far = coordinates.prior_mean.copy()
-            far[coordinates.base :] = fit.x[coordinates.base :]
-            for start in (fit.x.copy(), far):
-                start[index] = coordinates.null[index] + sign * coordinates.prior_sd[index]
-                tried.append(climb(self.target, start, fit.free, evaluations=FIRST))
+        coordinates = self.target.forward.coordinates
+        far = coordinates.prior_mean.copy()
+        far[coordinates.base :] = fit.x[coordinates.base :]
+        starts = [self._scanned(candidate.indices[0], base, base) for base in (fit.x, far)]
+        tried = [climb(self.target, start, fit.free, evaluations=FIRST) for start in starts]
         best = climb(self.target, max(tried, key=lambda end: end.log_evidence).x, fit.free)
         if best.log_evidence <= fit.log_evidence:
             return fit
