@@ -223,7 +223,7 @@ FOREIGN: dict[str, Effect] = {
     "stiffening_body": Effect(
         ("stiffness",),
         ("position", "magnitude", "largest"),
-        lambda a, s: {"stiffness": 5.0 * a * jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1)},
+        lambda a, s: {"stiffness": 25.0 * a * jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1)},
         moves=True,
     ),
     "lens": Effect(("camera scale", "camera x", "camera y"), ("product", "magnitude", "command"), sees=_lens),
