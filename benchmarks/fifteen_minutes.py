@@ -83,7 +83,7 @@ def type_all(folder: Path) -> list[Step]:
         steps.append(typed(command, folder))
         print(f"{steps[-1].wall:6.0f} s {steps[-1].cpu:6.0f} s of processor  {command}", flush=True)
         if number == PASTED:
-            paste_axes(folder / "finger" / "experiment.toml", folder / "reports" / "experiment-check" / "check.json")
+            paste_axes(folder / "finger" / "experiment.toml", folder / "reports" / "finger-check" / "check.json")
     return steps
 
 
