@@ -20,15 +20,7 @@ from rfdropo_bayes.audit.candidates import (
     start_together,
 )
 from rfdropo_bayes.audit.deadline import OutOfTime, about
-from rfdropo_bayes.audit.fit import (
-    FIRST,
-    Fit,
-    FitTarget,
-    best_between,
-    climb,
-    climb_rollouts,
-    heights,
-)
+from rfdropo_bayes.audit.fit import FIRST, Fit, FitTarget, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.inadequacy import as_measured, far_off, fit_with_noise
