@@ -39,7 +39,7 @@ def test_the_commands_that_are_replayed_are_those_of_the_readme():
 
 @pytest.mark.slow
 def test_a_stranger_gets_from_a_csv_to_a_prediction(tmp_path):
-    """Seven minutes of one processor: the shift in time is found, and the prediction errs by little more than noise."""
+    """Six minutes of one processor: the delay is named, and the prediction errs by little more than noise."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     command = [sys.executable, str(SCRIPT), str(tmp_path)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
