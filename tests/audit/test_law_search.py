@@ -244,6 +244,7 @@ def test_terms_are_told_apart_under_the_noise_that_the_model_with_the_best_one_l
         assert 0.5 * (tie.square - best.square) < TIED
 
 
+@pytest.mark.slow
 def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
     question = asked(6, Elsewhere())
     judge, base = base_model(question, question.seed)

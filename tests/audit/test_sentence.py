@@ -37,6 +37,7 @@ def said(answer: Answer) -> str:
     return record(answer, versions={}, data_sha256="", next_experiment=None)["sentence"]
 
 
+@pytest.mark.slow
 def test_nothing_else_is_at_work_where_all_that_remains_is_noise(answer):
     """Errors 1 % below and 10 % above what the noise makes of a marker's distance."""
     gain = answer.validation.gain

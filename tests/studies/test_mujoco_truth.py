@@ -100,6 +100,7 @@ def test_the_arm_sags_as_a_beam_that_bends_and_shears(arm, blank):
     np.testing.assert_allclose(-seen[-1, :, 1], sag, rtol=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENGINE_EFFECTS)
 def test_an_effect_of_no_size_changes_nothing_and_one_of_its_usual_size_does(arm, blank, name):
     effect = ENGINE_EFFECTS[name]

@@ -136,6 +136,7 @@ def test_what_cannot_be_is_refused(tmp_path) -> None:
         Table2Size(seeds=0)
 
 
+@pytest.mark.slow
 def test_an_interval_knows_that_the_episodes_of_a_policy_succeed_together() -> None:
     """Of policies with success p ~ Beta(2, 2), three a row, the mean is 0.5. Three seeds are few for a bootstrap, whose
     interval holds it in 80 % of rows, Wilson's in 31 %. Of 200 rows, 65 % is five deviations below."""

@@ -186,6 +186,7 @@ def test_the_folder_of_a_day_predicts_the_other_days_too(known, zeros):
     assert off[0] < 3.0 * SIGMA < 10.0 * SIGMA < off[1]
 
 
+@pytest.mark.slow
 def test_the_folder_of_a_day_keeps_the_values_of_the_recordings_that_were_fitted(known):
     """Free in each recording: the new one gets its own, the others keep theirs, and further ones of the day take it."""
     rng, posterior, infos = np.random.default_rng(3), dict(known.record.posterior), list(known.record.free)
