@@ -23,14 +23,13 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.audit.audit_record import STIFFNESS
+from rfdropo_bayes.audit.audit_record import STIFFNESS, relative_sizes
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.fit import Fit, climb, widened
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import first_target
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.space import force_power
 from rfdropo_bayes.files import append_line
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable
@@ -68,22 +67,15 @@ def one(name: str, number: int, given: argparse.Namespace, workshop: Workshop) -
 
 def deviation(coordinates: Coordinates, fit: Fit, index: int, hidden: Hidden) -> dict[str, Any] | None:
     """A size less its truth in its deviations, as an audit reports it; None if the data hardly say it."""
-    place = {int(i): k for k, i in enumerate(fit.free)}
-    name, k = coordinates.names[index], place[index]
+    name, k = coordinates.names[index], list(fit.free).index(index)
+    row = next(iter(relative_sizes(coordinates, fit, [index]).values()), None)
+    if row is not None:
+        truth = hidden.values[name] * hidden.values[STIFFNESS] ** -row["power"]
+        return {"name": name, "deviations": (row["mean"] - truth) / row["sd"], "sd": row["sd"]}
     sd = float(np.sqrt(fit.covariance[k, k]))
-    away = float(fit.x[index] - coordinates.encode(hidden.values)[index])
-    power = force_power(coordinates.space.parameters[index].spec.unit)
-    if power and coordinates.named(fit.x)[name]:
-        modulus, gradient = coordinates.names.index(STIFFNESS), np.zeros(len(fit.free))
-        slopes, found = coordinates.slopes(fit.x[None])[0], coordinates.named(fit.x)
-        gradient[k] = slopes[index] / found[name]
-        gradient[place[modulus]] -= power * slopes[modulus] / found[STIFFNESS]
-        sd = float(np.sqrt(gradient @ fit.covariance @ gradient))
-        truth = hidden.values[name] * hidden.values[STIFFNESS] ** -power
-        away = 1.0 - truth / (found[name] * found[STIFFNESS] ** -power)
-    elif sd > LEARNT * coordinates.prior_sd[index]:
+    if sd > LEARNT * coordinates.prior_sd[index]:
         return None
-    return {"name": name, "deviations": away / sd, "sd": sd}
+    return {"name": name, "deviations": float(fit.x[index] - coordinates.encode(hidden.values)[index]) / sd, "sd": sd}
 
 
 def main() -> None:
@@ -122,6 +114,8 @@ def show(lines: list[dict[str, Any]]) -> None:
     for kind in sorted({(line["rho"], line["made"], line["noise"]) for line in lines}):
         own = [line for line in lines if (line["rho"], line["made"], line["noise"]) == kind]
         away = np.array([row["deviations"] for line in own for row in line.get("sizes", [])])
+        if not len(away):
+            continue
         held = int(np.sum(np.abs(away) <= WITHIN))
         ends = binomtest(held, len(away)).proportion_ci(0.95, method="exact")
         words = [*kind, len(own), len(away), f"{held} [{100 * ends.low:.0f}, {100 * ends.high:.0f}] %"]

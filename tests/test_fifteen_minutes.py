@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from tests.scripts import script
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 SCRIPT = REPOSITORY / "benchmarks" / "fifteen_minutes.py"
-
-
-def replay() -> ModuleType:
-    """The script as a module."""
-    found = importlib.util.spec_from_file_location("fifteen_minutes", SCRIPT)
-    assert found is not None
-    assert found.loader is not None
-    module = importlib.util.module_from_spec(found)
-    sys.modules[found.name] = module
-    found.loader.exec_module(module)
-    return module
 
 
 def test_the_commands_that_are_replayed_are_those_of_the_readme():
@@ -33,7 +22,7 @@ def test_the_commands_that_are_replayed_are_those_of_the_readme():
     block = re.search(r"```sh\n(rfdropo init.*?)```", text, re.DOTALL)
     assert block is not None
     told = [shlex.split(line, comments=True)[1] for line in block[1].splitlines()]
-    typed = [shlex.split(command)[1] for command in replay().COMMANDS]
+    typed = [shlex.split(command)[1] for command in script("benchmarks/fifteen_minutes.py").COMMANDS]
     assert [verb for k, verb in enumerate(typed) if k == 0 or verb != typed[k - 1]] == told
 
 

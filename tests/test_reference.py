@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -15,13 +14,10 @@ from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
+from tests.scripts import script
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SPEC = importlib.util.spec_from_file_location("reference", REPOSITORY / "tools" / "reference.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-reference = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(reference)
+reference = script("tools/reference.py")
 
 PAGES = reference.pages()
 ROOTS = (Experiment, Robot, Deployment, SectionedBody, *SHAPES)

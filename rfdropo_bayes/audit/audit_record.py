@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import spoken
+from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added
+from rfdropo_bayes.audit.fit import Fit
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
 from rfdropo_bayes.audit.law_words import unknown_record
 from rfdropo_bayes.audit.pipeline import Answer
@@ -211,7 +213,7 @@ def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]
     relative: dict[str, Any] = {}
     if candidate is not None:
         parameters = _drawn_parameters(answer, candidate.indices)
-        relative = _relative_sizes(answer, candidate.indices)
+        relative = relative_sizes(answer.problem.coordinates, answer.sizes, candidate.indices)
     return {
         "mechanism": candidate.title if candidate else step.name,
         "group": candidate.group if candidate else "",
@@ -264,10 +266,9 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
     return found
 
 
-def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
+def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
     """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free,
     so that only the ratio is known where no force was measured. First-order error propagation in logarithms."""
-    coordinates, fit = answer.problem.coordinates, answer.sizes
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}
     place = {int(i): k for k, i in enumerate(fit.free)}

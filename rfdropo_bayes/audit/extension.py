@@ -20,7 +20,7 @@ from rfdropo_bayes.audit.candidates import (
     start_together,
 )
 from rfdropo_bayes.audit.deadline import OutOfTime, about
-from rfdropo_bayes.audit.fit import FIRST, Fit, FitTarget, best_between, climb, climb_rollouts, heights
+from rfdropo_bayes.audit.fit import Fit, FitTarget, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.inadequacy import as_measured, far_off, fit_with_noise
@@ -33,7 +33,6 @@ SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 SCANNED = tuple((k + 0.5) / 32 for k in range(32))
 """Quantiles of the prior of a candidate's size among which a climb's start is looked for. Of a delay of 70 ms under
 a noise of 0.3 mm the summit is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms."""
-RESCANNED = 3  # times that they are looked through again with the base parameters of the last climb
 TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
 PAIRS = 3  # that are refitted
 # Nats of evidence that a parameter which the data fix costs under a prior twice as wide. Widths are chosen by hand: a
@@ -419,12 +418,12 @@ class ExtensionSearch:
         the rows of a recording; on one of them a climb from no shift ends.
         """
         found = climb(self.target, self._best_size(index, base, start), free)
-        for _ in range(RESCANNED):
+        while True:
             better = self._best_size(index, found.x, found.x)
-            if np.array_equal(better, found.x):
-                break
-            found = max(found, climb(self.target, better, free), key=lambda end: end.log_evidence)
-        return found
+            again = found if np.array_equal(better, found.x) else climb(self.target, better, free)
+            if again.log_evidence <= found.log_evidence:
+                return found
+            found = again
 
     def _best_size(
         self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"]
@@ -437,17 +436,16 @@ class ExtensionSearch:
         return points[int(np.argmax(heights(self.target, points, "sizes")))]
 
     def _from_afar(self, name: str, fit: Fit) -> Fit:
-        """A fit with one amplitude that leaves most of a large misfit, or a better one from elsewhere: the base model's
-        optimum, where it has made up for the effect, may be in another valley than that of both together."""
+        """A fit with one amplitude that leaves most of a large misfit, or a better one from the middle of the base
+        parameters' priors: the base model's optimum, where it has made up for the effect, may be in another valley than
+        that of both together."""
         candidate = next((c for c in self.candidates if c.name == name), None)
         if candidate is None or len(candidate.indices) != 1 or not far_off(self.target, fit.x):
             return fit
         coordinates = self.target.forward.coordinates
         far = coordinates.prior_mean.copy()
         far[coordinates.base :] = fit.x[coordinates.base :]
-        starts = [self._best_size(candidate.indices[0], base, base) for base in (fit.x, far)]
-        tried = [climb(self.target, start, fit.free, evaluations=FIRST) for start in starts]
-        best = climb(self.target, max(tried, key=lambda end: end.log_evidence).x, fit.free)
+        best = climb(self.target, self._best_size(candidate.indices[0], far, far), fit.free)
         if best.log_evidence <= fit.log_evidence:
             return fit
         self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")

@@ -32,7 +32,7 @@ from rfdropo_bayes.inference import Target as Climbed
 from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
-FIRST, ALL = 8, 40  # steps of a short climb, and most of one to its end
+ALL = 40  # most steps of a climb to its end
 USUAL = 12  # steps of a climb, each with a Jacobian
 TOLERANCE = 0.01  # nats that a step promises at the end of a climb
 CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that

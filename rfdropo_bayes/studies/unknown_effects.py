@@ -119,8 +119,9 @@ def _magnet(size: float, scene: Scene) -> dict[str, Any]:
     return {"force": _at_tip(0.1 * size * way / jnp.sqrt(square) * 0.03**2 / (0.03**2 + square))}
 
 
-def _rate_limited(u: Any, most: Any) -> Any:
-    """A command that a drive follows by at most so much a step [m]."""
+def _rate_limited(u: Any, time: Any, speed: Any) -> Any:
+    """A command that a drive follows at most so fast [m/s]."""
+    most = speed * (time[1] - time[0])
 
     def one(reached: Any, wanted: Any) -> tuple[Any, Any]:
         reached = reached + jnp.clip(wanted - reached, -most, most)
@@ -200,7 +201,7 @@ FOREIGN: dict[str, Effect] = {
     "rate_limited_drive": Effect(
         ("cable {cables[1]}",),
         ("lag", "rate", "low_pass"),
-        lambda a, s: {"command": _channel(s, 1, _rate_limited(s.levels[:, 1], 2e-4 / a) - s.levels[:, 1])},
+        lambda a, s: {"command": _channel(s, 1, _rate_limited(s.levels[:, 1], s.time, 0.04 / a) - s.levels[:, 1])},
     ),
     "giving_pulley": Effect(
         ("cable {cables[0]}",),

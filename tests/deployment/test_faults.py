@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
 
-PATH = Path(__file__).resolve().parents[2] / "benchmarks" / "motor_faults.py"
-SPEC = importlib.util.spec_from_file_location("motor_faults", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-campaign = importlib.util.module_from_spec(SPEC)
-sys.modules[SPEC.name] = campaign
-SPEC.loader.exec_module(campaign)
+from tests.scripts import script
+
+campaign = script("benchmarks/motor_faults.py")
 
 
 @pytest.mark.slow

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import jax
-import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
-from tests.verbs.toys import BOX, STEP
 
 FILE = """
 robot = "smooth_arm"
@@ -57,17 +54,3 @@ def test_recordings_come_from_the_call_or_from_the_file(model: rb.Model) -> None
     assert model.runs(given, given) == (given, given)
     with pytest.raises(rb.InputError, match=r"\[data\]"):
         model.runs(None)
-
-
-def test_a_stated_noise_lasts_for_as_many_seconds_in_rows_of_every_rate() -> None:
-    """Of two recordings of different rates the likelihood is the sum of theirs."""
-    walk = {"duration": 1.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
-    fast, other = rb.simulate(rb.Model(BOX), walk | {"recordings": ["fast", "other"]})
-    slow = other.resample(3 * STEP)
-    model = rb.Model(BOX, noise={"standard_deviation": 1e-3, "correlation_time": 0.1})
-    both, *single = (model.problem(runs) for runs in ([fast, slow], [fast], [slow]))
-    drawn = both.sample_prior(jax.random.key(0), 3)
-    together, *apart = (
-        np.sum(problem.row_log_likelihood(drawn, problem.n_rows)[0], axis=1) for problem in (both, *single)
-    )
-    np.testing.assert_allclose(together, sum(apart), rtol=1e-9)

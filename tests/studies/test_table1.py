@@ -27,6 +27,7 @@ from rfdropo_bayes.studies.table1 import (
     summarise,
 )
 from rfdropo_bayes.studies.virtual_tasks import TASKS, draw_truth, excited, task_problem
+from tests.scripts import script
 
 STUCK = Caution(Code.PARTICLES_STUCK, "the last moves left the particles where they were", grave=True).as_dict()
 AT_BOUND = Caution(Code.AT_BOUND, "friction sits on its lower bound").as_dict()
@@ -141,19 +142,14 @@ def test_a_posterior_misleads_where_it_says_less_than_the_prior(task):
 
 def test_an_exact_posterior_on_a_ridge_holds_truths_of_its_prior():
     """90 % of 40000 in a closed form, which scatters by 0.15 %; fewer where truths are drawn off the centre."""
-    path = Path(__file__).parents[2] / "benchmarks" / "attainable_coverage.py"
-    spec = importlib.util.spec_from_file_location("attainable_coverage", path)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    coverage = script("benchmarks/attainable_coverage.py")
     rng = np.random.default_rng(5)
-    for ridge in (("friction",), script.RIDGE[:2], script.RIDGE):
+    for ridge in (("friction",), coverage.RIDGE[:2], coverage.RIDGE):
         truths = {name: rng.uniform(*PUSH.ranges[name], 40000) for name in ridge}
-        assert script.held(PUSH, truths).mean() == pytest.approx(0.9, abs=0.008)
+        assert coverage.held(PUSH, truths).mean() == pytest.approx(0.9, abs=0.008)
     low, high = PUSH.ranges["friction"]
     edge = low + (high - low) * np.array([0.04, 0.06, 0.5, 0.94, 0.96])
-    assert script.held(PUSH, {"friction": edge}).tolist() == [False, True, True, True, False]
+    assert coverage.held(PUSH, {"friction": edge}).tolist() == [False, True, True, True, False]
 
 
 def test_off_centre_truths_stay_out_of_the_middle():

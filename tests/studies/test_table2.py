@@ -110,9 +110,9 @@ def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_pat
     found["simulator"] = {"refine": 2}
     (tmp_path / "audit").mkdir()
     (tmp_path / "audit" / "extended.toml").write_text(describe(found))
-    found_out = {"sentence": "The drives lag.", "out_of_time": False}
+    common = {"sentence": "The drives lag.", "out_of_time": False}
     (tmp_path / "audit" / "run.json").write_text(json.dumps({"settings": {}, "command": "audit", "status": "done"}))
-    (tmp_path / "audit" / "audit.json").write_text(json.dumps({**found_out, "verdict": "explained"}))
+    (tmp_path / "audit" / "audit.json").write_text(json.dumps({**common, "verdict": "explained"}))
     (tmp_path / "audit" / "asked.toml").write_text(f"# audit.minutes={SMALL.minutes}\n{AUDIT.read_text()}")
     study = Study({"push": PUSH}, TRUTH, AUDIT, tmp_path, SMALL)
     extended = table2._with_causes(study, table2._tables(study, "push"))
@@ -124,7 +124,7 @@ def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_pat
     assert set(experiment.model.priors) == {*table2._tables(study, "push")["model"]["priors"], "actuator_lag"}
     assert (experiment.simulator.push, experiment.simulator.refine) == (True, 2)
     for other, why in (({"verdict": "no_verdict"}, "remove this folder"), ({"out_of_time": True}, "more minutes")):
-        (tmp_path / "audit" / "audit.json").write_text(json.dumps({**found_out, "verdict": "explained", **other}))
+        (tmp_path / "audit" / "audit.json").write_text(json.dumps({**common, "verdict": "explained", **other}))
         with pytest.raises(InputError, match=why):
             table2._with_causes(study, table2._tables(study, "push"))
 
