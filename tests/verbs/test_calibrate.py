@@ -18,7 +18,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, load_posterior
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.calibrate import calibrate, earlier_draws, implausible_fit
@@ -73,7 +73,7 @@ def test_two_runs_of_the_same_data_are_compared_by_what_they_predict_of_each_row
     for noise in ("white", "auto"):
         overrides = [*SHORT, "inference.rollouts=4000", "inference.replicates=2", f'model.noise="{noise}"']
         calibrate(Model.read(DEMO, overrides), out=tmp_path / noise)
-        runs[noise] = load_posterior(tmp_path / noise / "posterior.nc")
+        runs[noise] = arviz.from_netcdf(tmp_path / noise / "posterior.nc")
         summary = json.loads((tmp_path / noise / "summary.json").read_text())
         rows = [row for row in summary["parameters"].values() if not row.get("derived")]
         assert runs[noise].posterior.sizes["chain"] == 2
