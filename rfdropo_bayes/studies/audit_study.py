@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
 from rfdropo_bayes.audit.audit_record import STIFFNESS
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
+from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import output_folder, read_lines, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
@@ -79,7 +79,7 @@ class Condition:
         """Verdicts that are right."""
         if self.effects == 0:
             return (NO_DISCREPANCY,)
-        return (PARTLY, UNEXPLAINED) if self.removed else (EXPLAINED, EQUIVALENT)
+        return (PARTLY, UNEXPLAINED, DESCRIBED) if self.removed else (EXPLAINED, EQUIVALENT)
 
     @property
     def setting(self) -> Setting:
@@ -294,6 +294,7 @@ def judge(
         "explained_fraction": content["gain"]["explained_fraction"] if content["gain"] else None,
         "covered": covered,
         "undetermined": undetermined,
+        "law": (content.get("law") or {}).get("formula"),
         "audit_seconds": content["seconds"],
     }
 
