@@ -7,7 +7,7 @@ goals, or the virtual trunk, which pushes a cube.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,20 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.studies.fresh_laws import LAWS, CableEffect, HystereticCable, LaggingCable
+from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, arm_xml, write_arm
 from rfdropo_bayes.verbs.simulate import simulate
 
-KINDS = ("library", "unknown")
-FROM_LIBRARY, UNKNOWN = 3, 2  # effects of a target
-LARGER = (1.0, 2.0)  # sizes of an unknown law, in usual ones
+KINDS = ("library", "unknown", "mujoco")
+FROM_LIBRARY, UNKNOWN = 3, 2  # effects of a target; MuJoCo's has as many as one with unknown laws
+LARGER = (1.0, 2.0)  # sizes of an unknown law or of an engine's effect, in usual ones
+ENGINE_LINKS, ENGINE_STEP = 10, 2e-3
+"""Links and time step [s] of MuJoCo's arm: a control period takes 1 ms of a processor, with 20 links and 1 ms 7. The
+step moves the tip by 0.01 mm, so few links by 5 mm of 100: this arm is a robot of its own, no converged one."""
 RECORDINGS = tuple(f"recording_{k + 1}" for k in range(6))
 AUDITED = 4  # recordings that an audit fits; it measures the gain in the others
 NOISE = 5e-4  # m, of motion capture
+ENGINE_ARM, MODEL_ARM = "arm.xml", "arm.toml"
+UNSWOLLEN = {"poisson_ratio": (0.1, 0.499)}
 INNER = (0.2, 0.8)  # shares of the ranges between which truths are drawn
 
 
@@ -102,8 +108,10 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
     """Draw a target, and write its files and recordings.
 
     Args:
-        kind: "library", three mechanisms of the library, their sizes drawn from their priors; or "unknown", two laws
-            that the library lacks, each of as many cables as the scene says, as large as usual to twice as large.
+        kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", two laws
+            that the library lacks, each of as many cables as the scene says, as large as usual to twice as large; or
+            "mujoco", an arm that MuJoCo moves with two effects of its own, as large. Only the arm that reaches can be
+            made in MuJoCo, and its rigid sections do not swell, so that the models' Poisson's ratio has a wider prior.
         seed: of all that is drawn: the same seed makes the same target.
         out: folder to write to.
         scene: a name of `SCENES`.
@@ -113,15 +121,22 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
         the audit. The last two have no part of the truth.
 
     Raises:
-        InputError: an unknown kind or scene, or a target whose recordings cannot be simulated.
+        InputError: an unknown kind or scene, a trunk in MuJoCo, or a target whose recordings cannot be simulated.
     """
     model, chosen = draw_flaws(kind, seed, scene), SCENES[scene]
     out = output_folder(Path(out))
+    truth, robot = (
+        {"robot": chosen.robot, "simulator": {**chosen.simulated, **chosen.finer}, "model": model},
+        chosen.robot,
+    )
+    if kind == "mujoco":
+        truth, robot = _in_mujoco(chosen, model, out)
+        chosen = replace(chosen, robot=robot, ranges={**chosen.ranges, **UNSWOLLEN})
     training = {**chosen.task, "noise": NOISE}
     every = training | {"anneal": True, "evaluate_every": chosen.evaluated}
     training.pop("task")
     tables: dict[str, dict[str, Any]] = {
-        "truth": {"simulator": {**chosen.simulated, **chosen.finer}, "model": model, "training": training},
+        "truth": truth | {"training": training},
         scene: _fitted(chosen, RECORDINGS, (), {"noise": "white"}) | {"training": every},
         "audit": _fitted(chosen, RECORDINGS[:AUDITED], RECORDINGS[AUDITED:], {})
         | {"noise": {"standard_deviation": NOISE}},
@@ -129,20 +144,23 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
     files = {}
     for name, table in tables.items():
         files[name] = out / f"{name}.toml"
-        write_text(files[name], describe({"robot": chosen.robot, "seed": seed, **table}))
+        write_text(files[name], describe({"robot": robot, "seed": seed, **table}))
     _record(chosen, files["truth"], seed)
     return files
 
 
 def draw_flaws(kind: str, seed: int, scene: str = "reach") -> dict[str, Any]:
-    """The table [model] of a target: its mechanisms, and its true values; see `make_target`."""
+    """The table [model] of a target: its mechanisms, or MuJoCo's effects, and its true values; see `make_target`."""
     for name, known, what in ((kind, KINDS, "kind"), (scene, tuple(SCENES), "scene")):
         if name not in known:
             remedy = f"use {' or '.join(known)}"
             raise InputError(f"unknown {what} {name!r} of target", where="make_target", remedy=remedy)
     chosen, rng = SCENES[scene], np.random.default_rng([seed, KINDS.index(kind)])
     body = {name: low + (high - low) * rng.uniform(*INNER) for name, (low, high) in chosen.ranges.items()}
-    names, sizes = _from_library(chosen, rng) if kind == "library" else _unknown(chosen, rng)
+    if kind == "mujoco" and scene != "reach":
+        raise InputError("only the arm that reaches is made in MuJoCo", where="make_target", remedy='scene = "reach"')
+    drawn = {"library": _from_library, "unknown": _unknown, "mujoco": _of_mujoco}[kind]
+    names, sizes = drawn(chosen, rng)
     return {"mechanisms": names, "fixed": {name: float(f"{v:.6g}") for name, v in {**body, **sizes}.items()}}
 
 
@@ -188,6 +206,30 @@ def _unknown(scene: Scene, rng: np.random.Generator) -> tuple[list[str], dict[st
             spec = left.pop(int(rng.integers(len(left))))
             sizes[spec.name] = float(rng.uniform(*LARGER) * spec.prior["scale"])
     return names, sizes
+
+
+def _of_mujoco(scene: Scene, rng: np.random.Generator) -> tuple[list[str], dict[str, float]]:
+    """Names of effects that stand in a MuJoCo model, and their sizes."""
+    known = sorted(name for name, effect in ENGINE_EFFECTS.items() if effect.model is not None)
+    names = sorted(rng.choice(known, UNKNOWN, replace=False).tolist())
+    return names, {name: float(rng.uniform(*LARGER) * ENGINE_EFFECTS[name].usual) for name in names}
+
+
+def _in_mujoco(scene: Scene, drawn: Mapping[str, Any], out: Path) -> tuple[dict[str, Any], str]:
+    """Write the arm as MuJoCo has it, and the robot of the models, which carries commands out at once as MuJoCo does;
+    the tables of the target, and the robot's file."""
+    robot = Robot.load(scene.robot).without_command_timing()
+    values = drawn["fixed"]
+    effects = {name: values[name] for name in drawn["mechanisms"]}
+    write_arm(out / ENGINE_ARM, arm_xml(robot, values, ENGINE_LINKS, ENGINE_STEP), effects)
+    write_text(out / MODEL_ARM, describe(robot.model_dump(mode="json", exclude_none=True, exclude_defaults=True)))
+    adapter = {
+        "start": "rest",
+        "command_unit": robot.command_unit,
+        "markers": {name: f"site/{name}" for name in robot.marker_names},
+        "channels": {name: name for name in robot.channel_names},
+    }
+    return {"robot": ENGINE_ARM, "adapter": adapter, "model": {}}, MODEL_ARM
 
 
 def _made(scene: Scene, names: list[str]) -> tuple[Mechanism, ...]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
@@ -19,7 +20,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots import Cable, Robot
 from rfdropo_bayes.simulators.commands import commands_on_grid
 
 LINKS = 20  # as many as put guides and markers of smooth_arm into the middle of links; the next number is 40
@@ -75,7 +76,7 @@ def _friction(model: Any, size: float) -> None:
 def _soft_cables(model: Any, size: float) -> None:
     kept = 1.0 / (1.0 + size * CABLE)
     model.actuator_gainprm[:, 0] *= kept
-    model.actuator_biasprm[:, 1] *= kept
+    model.actuator_biasprm[:, :2] *= kept
 
 
 def _moved_marker(model: Any, size: float) -> None:
@@ -89,8 +90,8 @@ def _softer_base(model: Any, size: float) -> None:
     model.dof_damping[:] *= 1.0 - size * share
 
 
-def _one_gain(levels: np.ndarray, size: float) -> np.ndarray:
-    return levels * np.array([1.0 + size, *[1.0] * (levels.shape[1] - 1)])
+def _one_gain(model: Any, size: float) -> None:
+    model.actuator_gainprm[0, 0] *= 1.0 + size
 
 
 def _lag(levels: np.ndarray, size: float) -> np.ndarray:
@@ -108,7 +109,7 @@ ENGINE_EFFECTS: dict[str, EngineEffect] = {
     "soft tendons": EngineEffect(("cable_compliance",), 1e-4, "m/N", model=_soft_cables),
     "site moved": EngineEffect(("marker_offset",), 2e-3, "m", model=_moved_marker),
     "softer base": EngineEffect(("stiffness_gradient",), 0.3, "-", model=_softer_base),
-    "gain of one actuator": EngineEffect(("cable_gain",), 0.1, "-", command=_one_gain),
+    "gain of one actuator": EngineEffect(("cable_gain",), 0.1, "-", model=_one_gain),
     "actuators of first order": EngineEffect(("actuator_lag",), 0.05, "s", command=_lag),
     "late camera": EngineEffect(("clock_offset",), 0.03, "s", seen=lambda size: size),
 }
@@ -134,18 +135,20 @@ class _Section(NamedTuple):
     turn: tuple[float, float, float]
 
 
-def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS) -> str:
-    """MJCF of a robot with a body of layers, cables at guides, and markers on its axis.
+def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS, step: float = STEP) -> str:
+    """MJCF of a robot with a body of layers, a channel for each cable, and markers on its axis. Actuators take
+    displacements.
 
     Args:
         robot: its file.
         values: ``young_modulus`` [Pa], ``trunk_mass`` [kg] and ``rayleigh_stiffness`` [s].
         links: pieces of the body.
+        step: of time [s].
     """
     root = ElementTree.Element("mujoco")
     gravity = " ".join(map(str, robot.gravity_m_s2))
     ElementTree.SubElement(
-        root, "option", timestep=str(STEP), gravity=gravity, integrator="implicitfast", solver="Newton"
+        root, "option", timestep=str(step), gravity=gravity, integrator="implicitfast", solver="Newton"
     )
     ElementTree.SubElement(root, "size", memory="64M")
     body, low = ElementTree.SubElement(root, "worldbody"), 0.0
@@ -164,22 +167,65 @@ def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS) -> st
             if (low <= z < high) or (section is None and z < high):
                 ElementTree.SubElement(body, "site", name=name, pos=f"{x:.9g} {y:.9g} {z - low:.9g}", size="0.001")
     tendons, actuators = ElementTree.SubElement(root, "tendon"), ElementTree.SubElement(root, "actuator")
+    limits = {
+        n: f"{low:.9g} {high:.9g}" for n, low, high in zip(robot.channel_names, *robot.command_limits(), strict=True)
+    }
     for cable in robot.cables:
         path = ElementTree.SubElement(tendons, "spatial", name=cable.name)
         for k in range(1 + len(cable.guide_z_m)):
             ElementTree.SubElement(path, "site", site=f"{cable.name}{k}")
+        rest = float(np.linalg.norm(np.diff(_path(cable), axis=0), axis=1).sum())
+        # The tension is CABLE (displacement + length - length at rest), and not below zero. A transmission of -1 turns
+        # the length's sign.
         ElementTree.SubElement(
             actuators,
             "general",
             name=cable.name,
             tendon=cable.name,
+            gear="-1",
             gainprm=f"{CABLE}",
             biastype="affine",
-            biasprm=f"0 {-CABLE} {-CABLE_DAMPING}",
+            biasprm=f"{-CABLE * rest:.12g} {-CABLE} {-CABLE_DAMPING}",
             forcelimited="true",
-            forcerange="-1e5 0",
+            forcerange="0 1e5",
+            ctrllimited="true",
+            ctrlrange=limits[cable.name],
         )
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def write_arm(path: Path, xml: str, effects: Mapping[str, float]) -> None:
+    """Write an arm with effects in it.
+
+    Args:
+        path: of the MJCF file.
+        xml: of `arm_xml`.
+        effects: sizes of some of `ENGINE_EFFECTS` that change the model.
+
+    Raises:
+        InputError: MuJoCo is not installed.
+    """
+    mujoco = engine()
+    model = mujoco.MjModel.from_xml_string(xml)
+    for name, size in effects.items():
+        change = ENGINE_EFFECTS[name].model
+        assert change is not None, f"{name} is no property of the model"
+        change(model, size)
+    mujoco.mj_saveLastXML(str(path), model)
+
+
+def engine() -> Any:
+    """The module of MuJoCo.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        remedy = 'install it: pip install "rfdropo_bayes[mujoco]"'
+        raise InputError("MuJoCo is not installed", where="an arm that it moves", remedy=remedy) from None
+    return mujoco
 
 
 def _sections(robot: Robot, values: Mapping[str, float], links: int) -> list[_Section]:
@@ -249,14 +295,15 @@ def _link(body: Any, section: _Section, damping: float, mirrored: bool) -> None:
 
 def _guides(robot: Robot) -> list[tuple[str, tuple[float, float, float]]]:
     """Names and places of anchors and guides of all cables."""
-    found = []
-    for cable in robot.cables:
-        turn = np.deg2rad(cable.azimuth_deg)
-        heights = (cable.anchor_z_m, *cable.guide_z_m)
-        radii = (cable.anchor_radius_m, *cable.guide_radius_m)
-        for k, (height, radius) in enumerate(zip(heights, radii, strict=True)):
-            found.append((f"{cable.name}{k}", (radius * np.cos(turn), radius * np.sin(turn), height)))
-    return found
+    return [(f"{cable.name}{k}", place) for cable in robot.cables for k, place in enumerate(_path(cable))]
+
+
+def _path(cable: Cable) -> list[tuple[float, float, float]]:
+    """Places of a cable's anchor and guides [m]."""
+    turn = np.deg2rad(cable.azimuth_deg)
+    heights = (cable.anchor_z_m, *cable.guide_z_m)
+    radii = (cable.anchor_radius_m, *cable.guide_radius_m)
+    return [(r * np.cos(turn), r * np.sin(turn), z) for r, z in zip(radii, heights, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -300,25 +347,19 @@ class MuJoCoArm(EngineArm):
     links: int = LINKS
 
     def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
-        try:
-            import mujoco
-        except ImportError:
-            remedy = 'install it: pip install "rfdropo_bayes[mujoco]"'
-            raise InputError("MuJoCo is not installed", where="--truth mujoco", remedy=remedy) from None
+        mujoco = engine()
         model = mujoco.MjModel.from_xml_string(arm_xml(self.robot, self.values, self.links))
         effect = self.effect
         if effect is not None and effect.model is not None:
             effect.model(model, size)
         data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        rest = data.ten_length.copy()
         clock, held = commanded(self.robot, recording, effect, size)
         markers = [model.site(name).id for name in self.robot.marker_names]
         path = np.empty((len(clock), len(markers), 3))
         for row, level in enumerate(held):
             mujoco.mj_kinematics(model, data)
             path[row] = data.site_xpos[markers]
-            data.ctrl[:] = rest - level
+            data.ctrl[:] = level
             mujoco.mj_step(model, data, nstep=round(CONTROL / STEP))
         if any(warning.number for warning in data.warning) or not np.isfinite(path).all():
             raise InputError("MuJoCo warns of the motion", where=recording.name, remedy="make the effect smaller")

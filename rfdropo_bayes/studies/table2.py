@@ -319,7 +319,9 @@ def _on_target(study: Study, tables: Mapping[str, Any]) -> dict[str, Any]:
     target = self_contained(read_tables(study.target), study.target.resolve().parent)
     training = {**tables["training"], "randomisation": "none"}
     training.pop("source", None)
-    kept = {key: copy.deepcopy(value) for key, value in target.items() if key in ("robot", "model", "simulator")}
+    kept = {
+        key: copy.deepcopy(value) for key, value in target.items() if key in ("robot", "adapter", "model", "simulator")
+    }
     return {**kept, "seed": int(tables.get("seed", 0)), "training": training}
 
 

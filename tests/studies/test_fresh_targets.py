@@ -12,6 +12,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import read_tables
 from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.policies.tasks import TASKS, layout_of
 from rfdropo_bayes.studies import table2
 from rfdropo_bayes.studies.fresh_laws import BOUC_WEN_WAY, LAWS, Crosstalk, HystereticCable, LaggingCable, SlippingCable
 from rfdropo_bayes.studies.fresh_targets import KINDS, RECORDINGS, draw_flaws, make_target
@@ -62,6 +63,25 @@ def test_recordings_and_files_of_fits_do_not_tell_the_truth(target) -> None:
         assert not [each for each in drawn if each in attributes]
     for name in ("reach", "audit"):
         assert not {"fixed", "mechanisms"} & set(read_tables(target[name])["model"])
+
+
+def test_a_target_in_mujoco_is_played_by_policies_of_our_body(tmp_path) -> None:
+    """Its recordings have the robot's markers and channels, and a policy's observation and action are the model's."""
+    pytest.importorskip("mujoco")
+    files = make_target("mujoco", 0, tmp_path)
+    truth, fitted = (Model.read(files[name]) for name in ("truth", "reach"))
+    model = draw_flaws("mujoco", 0)
+    assert len(model["mechanisms"]) == 2
+    assert not set(model["mechanisms"]) & set(files["truth"].read_text().split('"'))
+    first = fitted.recordings("fit")[0]
+    assert np.ptp(first.position[:, -1], axis=0).max() > 0.01
+    layouts = [layout_of(TASKS["TrunkReach-v0"], m.simulator.robot, "continuous", "full") for m in (truth, fitted)]
+    assert layouts[0] == layouts[1]
+
+
+def test_only_the_arm_that_reaches_is_made_in_mujoco() -> None:
+    with pytest.raises(InputError, match="only the arm that reaches"):
+        draw_flaws("mujoco", 0, "push")
 
 
 def test_every_row_sees_the_same_six_recordings(target, tmp_path, monkeypatch) -> None:

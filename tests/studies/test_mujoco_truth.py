@@ -12,7 +12,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.experiment import CommandsTable
 from rfdropo_bayes.studies.engine_study import CLOSE, TRUTHS, as_table, run_engine_study, size_of
 from rfdropo_bayes.studies.hidden_effects import Setting, blank_recordings
-from rfdropo_bayes.studies.mujoco_truth import CABLE, ENGINE_EFFECTS, MuJoCoArm
+from rfdropo_bayes.studies.mujoco_truth import CABLE, ENGINE_EFFECTS, MuJoCoArm, arm_xml, write_arm
 
 pytest.importorskip("mujoco")
 
@@ -62,6 +62,26 @@ def test_a_payload_hangs_where_ours_does(arm, blank):
     ]
     assert chain[-1, -1, 1] - light[-1, -1, 1] < -4e-3
     np.testing.assert_allclose(chain[-1, -1] - light[-1, -1], sunk[1] - sunk[0], rtol=0.01, atol=3e-5)
+
+
+def test_the_file_moves_as_the_arm_that_is_recorded(arm, blank, tmp_path):
+    """Effects stand in the file, whose actuators take displacements of cables."""
+    robot = arm.robot.without_command_timing()
+    write_arm(tmp_path / "arm.xml", arm_xml(robot, CENTRE), {"payload at the tip": 0.01, "gain of one actuator": 0.2})
+    names = {name: f"site/{name}" for name in robot.marker_names}
+    channels = {name: name for name in robot.channel_names}
+    file = rb.MuJoCo(tmp_path / "arm.xml", markers=names, channels=channels, start="rest", command_unit="m")
+    (moved,) = rb.simulate(rb.Model(file), blank)
+
+    def both(model, size):
+        for name, share in (("payload at the tip", 0.01), ("gain of one actuator", 0.2)):
+            ENGINE_EFFECTS[name].model(model, share * size)
+
+    effect = replace(ENGINE_EFFECTS["payload at the tip"], model=both)
+    plain, known = (replace(arm, robot=robot, effect=effect, _seen={}).positions(blank, size)[0] for size in (0.0, 1.0))
+    off = np.sqrt(np.mean(np.sum((moved.position - known)[:, -1] ** 2, axis=1)))
+    assert off < 0.01 * np.sqrt(np.mean(np.sum((plain - known)[:, -1] ** 2, axis=1)))
+    assert np.linalg.norm((plain - known)[:, -1], axis=1).max() > 2e-3
 
 
 def recording_of(blank, level):
