@@ -19,7 +19,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import PolicyLayout
+from rfdropo_bayes.robots.policy_layout import EARLIER_COMMANDS, EARLIER_MOVED, Earlier, PolicyLayout
 
 METADATA = "rfdropo_layout"
 """Key of the layout in the metadata of the ONNX file."""
@@ -110,7 +110,7 @@ class OnnxPolicy:
         if "goal" in names and not np.all(np.isfinite(self._goal)):
             raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
         self.rate_hz = 1.0 / self.layout.period_s
-        self.sees_markers = bool({"markers", "moved"} & set(names))
+        self.sees_markers = bool({"markers", "moved", EARLIER_MOVED} & set(names))
         self.start = np.zeros(len(robot.channel_names))
         moves = np.array(self.layout.moves)
         self._reach = np.abs(moves).max(axis=0)
@@ -118,6 +118,8 @@ class OnnxPolicy:
         self._input = self._session.get_inputs()[0]
         self._check_shapes(where)
         self._network = _bound(self._session, self.layout.size, len(self._reach))
+        self._earlier = Earlier(self.layout.history - 1, 1, len(self._reach), 3 * len(self._markers))
+        self._begun = False
         nowhere, still = np.zeros((len(robot.marker_names), 3)), np.zeros(len(robot.channel_names))
         self._last = PolicyScene(nowhere, nowhere, still, still, still)
 
@@ -131,6 +133,11 @@ class OnnxPolicy:
         Raises:
             Stop: if its output is not finite, or more than any of its actions.
         """
+        if not self._begun:
+            self._earlier.begin([0], scene.command[None])
+            self._begun = True
+        elif self.layout.history > 1:
+            self._earlier.add(self._last.command[None], self._last.moved[self._markers].reshape(1, -1))
         self._last = scene
         observation, raw = self._answer(scene)
         if not np.all(np.isfinite(observation)):
@@ -149,6 +156,7 @@ class OnnxPolicy:
             "commands": scene.command,
             "lengths": scene.length,
             "tensions": scene.tension,
+            **{name: part[0] for name, part in self._earlier.parts().items()},
         }
         return self.layout.assemble(parts)
 
@@ -223,6 +231,8 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
         )
     channels = len(robot.channel_names)
     sizes = {"markers": seen, "moved": seen, "goal": 3, "commands": channels, "lengths": channels, "tensions": channels}
+    before = layout.history - 1
+    sizes |= {EARLIER_COMMANDS: before * channels, EARLIER_MOVED: before * seen}
     for part in layout.observation:
         if part.name not in sizes:
             known = ", ".join(sizes)
@@ -232,7 +242,7 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
                 f"wants {part.size} numbers of {part.name!r}; here there are {sizes[part.name]}",
                 where=where,
                 remedy="name the markers that it sees: [policy] markers"
-                if part.name in ("markers", "moved")
+                if part.name in ("markers", "moved", EARLIER_MOVED)
                 else remedy,
             )
 

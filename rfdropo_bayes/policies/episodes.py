@@ -27,7 +27,9 @@ from rfdropo_bayes.policies.tasks import (
     parts_seen,
     resting_height,
     reward,
+    shown_of,
 )
+from rfdropo_bayes.robots.policy_layout import Earlier
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -55,7 +57,7 @@ class Settings:
     """How a task is played.
 
     Attributes:
-        actions, observed, period, step: see `layout_of`.
+        actions, observed, period, step, history: see `layout_of`.
         noise: standard deviation of white noise on what is seen of the markers and of points of the cube [m]. What a
             marker has moved is the difference of two sightings, as on a robot.
         near: an episode ends within this distance of the goal [m]; None lets it go on, which keeps the reward of
@@ -67,6 +69,7 @@ class Settings:
     period: float = 0.05
     step: float | Sequence[float] | None = None
     noise: float = 0.0
+    history: int = 1
     near: float | None = None
 
 
@@ -95,7 +98,9 @@ class Episodes:
     ) -> None:
         self.task, self.settings, self.lanes = task, settings, lanes
         self.simulator, self.robot = simulator, simulator.robot
-        self.layout = layout_of(task, self.robot, settings.actions, settings.observed, settings.period, settings.step)
+        asked = (settings.actions, settings.observed, settings.period, settings.step, settings.history)
+        self.layout = layout_of(task, self.robot, *asked)
+        self.shown = shown_of(self.layout, self.robot)
         self._specs = {spec.name: spec for spec in simulator.parameters}
         self.randomisation = fitting(randomisation, simulator.parameters)
         self.session = Session(simulator, lanes, settings.period)
@@ -109,6 +114,7 @@ class Episodes:
         self.marker = np.zeros((lanes, markers, 3))
         self.pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (lanes, 1)) if task.push else None
         self.seen, self.seen_before, self.seen_pose = self.marker, self.marker, self.pose
+        self.earlier = Earlier(settings.history - 1, lanes, len(self.layout.channels), 3 * len(self.shown))
 
     def seed(self, lane: int, seed: int | np.random.SeedSequence) -> None:
         """Let a lane draw from a generator with this seed from now on; without, no two episodes are alike."""
@@ -172,6 +178,8 @@ class Episodes:
                 remedy="look for NaN in the policy",
             )
         change = self.layout.change(actions.reshape(self.lanes, *actions.shape[1:]))
+        moved = (self.seen - self.seen_before)[:, self.shown]
+        self.earlier.add(self.commands, moved.reshape(self.lanes, -1))
         self.commands = np.clip(self.commands + change, self.layout.low, self.layout.high)
         found = self.session.act(self.commands)
         good = (np.asarray(found.status) == int(Result.OK)) & np.isfinite(found.position).all(axis=(1, 2))
@@ -227,6 +235,7 @@ class Episodes:
             self.pose = self.pose.copy()
             self.pose[rows] = found.object_pose
         self.commands[rows], self.age[rows] = 0.0, 0
+        self.earlier.begin(rows, self.commands[rows])
         self.first[rows] = self.distance()[rows]
         self._look(rows)
         self.seen_before = self.seen_before.copy()
@@ -252,8 +261,8 @@ class Episodes:
     def _observe(self, rows: Int[np.ndarray, " row"]) -> Float[np.ndarray, "row size"]:
         seen, before = self.seen[rows], self.seen_before[rows]
         pose = None if self.seen_pose is None else self.seen_pose[rows]
-        parts = parts_seen(self.layout, self.robot, seen, before, self.goal[rows], self.commands[rows], pose)
-        return self.layout.assemble(parts)
+        parts = parts_seen(self.shown, seen, before, self.goal[rows], self.commands[rows], pose)
+        return self.layout.assemble(parts | self.earlier.parts(rows))
 
 
 def _rows_of(found: Observation, chosen: Bool[np.ndarray, " row"]) -> Observation:

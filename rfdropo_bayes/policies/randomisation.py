@@ -245,6 +245,45 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     return randomisation
 
 
+def spread_out(randomisation: Randomisation, width: float, specs: Sequence[ParameterSpec]) -> Randomisation:
+    """A posterior or phi whose draws are ``width`` times as far from their middle, up to the parameters' hard bounds.
+
+    Of a parameter that is positive, distances are those of logarithms: factors stay factors.
+
+    Raises:
+        InputError: ranges or one point, which say themselves how wide they are.
+    """
+    if isinstance(randomisation, Layers):
+        *held, last = randomisation.parts
+        return replace(randomisation, parts=(*held, spread_out(last, width, specs)))
+    known = {spec.name: spec for spec in specs}
+    if isinstance(randomisation, Days):
+        spreads = {name: width * column for name, column in randomisation.spreads.items()}
+        return replace(randomisation, draws=_spread_rows(randomisation.draws, width, known), spreads=spreads)
+    if isinstance(randomisation, Draws):
+        return _spread_rows(randomisation, width, known)
+    if isinstance(randomisation, Phi):
+        normals = {name: {**normal, "std": width * normal["std"]} for name, normal in randomisation.normals.items()}
+        return replace(randomisation, normals=normals)
+    raise InputError(
+        f"width = {width:g} beside a randomisation that is no posterior",
+        where="[training]",
+        remedy='leave width out, or set randomisation = "posterior" or "phi"',
+    )
+
+
+def _spread_rows(draws: Draws, width: float, known: Mapping[str, ParameterSpec]) -> Draws:
+    columns = []
+    for name, column in zip(draws.names, draws.rows.T, strict=True):
+        if (column > 0.0).all():
+            logarithm = np.log(column)
+            wide = np.exp(logarithm.mean() + width * (logarithm - logarithm.mean()))
+        else:
+            wide = column.mean() + width * (column - column.mean())
+        columns.append(np.clip(wide, known[name].low, known[name].high))
+    return replace(draws, rows=np.stack(columns, axis=1), sha256=_digest([draws.sha256, width]))
+
+
 def read_posterior(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox | None = None) -> Draws:
     """Draws of a saved posterior, of the parameters that the simulator has: noise is none, nor what belongs to one
     recording.

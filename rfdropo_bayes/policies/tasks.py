@@ -7,7 +7,7 @@ reward of staying there; and the cube starts at rest on its plate, where SOFA's 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -16,7 +16,13 @@ from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import CommandUnit, ObservationPart, PolicyLayout
+from rfdropo_bayes.robots.policy_layout import (
+    EARLIER_COMMANDS,
+    EARLIER_MOVED,
+    CommandUnit,
+    ObservationPart,
+    PolicyLayout,
+)
 
 Actions = Literal["discrete", "continuous"]
 Observed = Literal["full", "paper", "markers"]
@@ -151,6 +157,7 @@ def layout_of(
     observed: Observed,
     period: float = PERIOD,
     step: float | Sequence[float] | None = None,
+    history: int = 1,
 ) -> PolicyLayout:
     """Observation and action of a task on a robot.
 
@@ -162,9 +169,10 @@ def layout_of(
         period: from one action to the next [s].
         step: most that an action moves a channel, in the unit of its commands, or that of each; by default as much as
             pulls a cable by 5 mm, see `Commanded.command_of`.
+        history: actions of which the commands and the markers' movements are seen, from the last one back.
 
     Raises:
-        InputError: a cube for a robot that has none, or commands that nothing limits.
+        InputError: a cube for a robot that has none, commands that nothing limits, or a history of what is not seen.
     """
     if task.push and robot.push is None:
         raise InputError(f"robot {robot.name!r} has no cube to push", where="task", remedy="use a reaching task")
@@ -176,6 +184,14 @@ def layout_of(
         parts += [
             ObservationPart("commands", len(channels), robot.command_unit),
             ObservationPart("moved", 3 * shown, "m"),
+        ]
+    if history > 1:
+        if observed == "paper":
+            remedy = 'set observation = "full" or "markers"'
+            raise InputError('the observation "paper" has no history', where="history", remedy=remedy)
+        parts += [
+            ObservationPart(EARLIER_COMMANDS, (history - 1) * len(channels), robot.command_unit),
+            ObservationPart(EARLIER_MOVED, (history - 1) * 3 * shown, "m"),
         ]
     low, high = robot.command_limits()
     given = robot.command_of(STEP) if step is None else np.broadcast_to(step, len(channels))
@@ -203,19 +219,23 @@ def observed_of(layout: PolicyLayout) -> Observed:
     return "markers" if sizes["markers"] == 3 * len(TRACKED_HEIGHTS) else "full"
 
 
+def shown_of(layout: PolicyLayout, robot: Commanded) -> list[int]:
+    """Indices of the markers that a layout shows."""
+    markers = next(part for part in layout.observation if part.name == "markers")
+    every = len(robot.marker_names)
+    return list(range(every)) if markers.size == 3 * every else list(robot.markers_near(TRACKED_HEIGHTS))
+
+
 def parts_seen(
-    layout: PolicyLayout,
-    robot: Commanded,
+    shown: Sequence[int],
     marker: Float[np.ndarray, "lane marker 3"],
     before: Float[np.ndarray, "lane marker 3"],
     goal: Float[np.ndarray, "lane 3"],
     commands: Float[np.ndarray, "lane channel"],
     pose: Float[np.ndarray, "lane 7"] | None,
-) -> Mapping[str, np.ndarray]:
-    """All pieces of an observation that a layout may ask for, from what is measured now and one action ago."""
-    markers = next(part for part in layout.observation if part.name == "markers")
-    chosen = list(robot.markers_near(TRACKED_HEIGHTS)) if markers.size != 3 * len(robot.marker_names) else slice(None)
-    seen, moved = marker[:, chosen], (marker - before)[:, chosen]
+) -> dict[str, np.ndarray]:
+    """Pieces of an observation that a layout may ask for, from what is measured now and one action ago."""
+    seen, moved = marker[:, shown], (marker - before)[:, shown]
     lanes = len(goal)
     found = {
         "markers": seen.reshape(lanes, -1),

@@ -327,6 +327,8 @@ def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None
         )
     before = json.loads(json.dumps(state["known"]))
     now = json.loads(json.dumps(known))
+    # A checkpoint of an earlier version lacks keys that came later: it was made with what they are by default.
+    before["table"] = TrainingTable().model_dump(mode="json") | before["table"]
     changed = [name for name in now if name != "table" and now[name] != before.get(name)]
     changed += [name for name in now["table"] if name != "steps" and now["table"][name] != before["table"].get(name)]
     if changed:

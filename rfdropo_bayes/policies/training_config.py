@@ -31,6 +31,12 @@ class TrainingTable(BaseModel):
         "range of commands that are no lengths",
     )
     noise: float = Field(default=0.0, ge=0.0, description="white noise on what is seen of the markers [m]")
+    history: int = Field(
+        default=1,
+        ge=1,
+        le=10,
+        description="actions whose commands, and movements of the markers since, are seen, from the last one back",
+    )
     algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"
@@ -48,6 +54,12 @@ class TrainingTable(BaseModel):
     )
     source: str | None = Field(
         default=None, description="run folder or posterior.nc that the posterior or phi is read from"
+    )
+    width: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=10.0,
+        description="draws of the posterior or of phi are so many times as far from their middle, up to hard bounds",
     )
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="lowest and highest value of each parameter, for uniform randomisation"

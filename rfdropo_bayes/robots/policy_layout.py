@@ -18,6 +18,8 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.errors import InputError
 
 CommandUnit = Literal["m", "rad", "N", "N m", "-"]
+EARLIER_COMMANDS, EARLIER_MOVED = "earlier commands", "earlier moved"
+"""Parts of an observation that show more than the last action; see `Earlier`."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,12 @@ class PolicyLayout:
     def size(self) -> int:
         """How many numbers an observation has."""
         return sum(part.size for part in self.observation)
+
+    @property
+    def history(self) -> int:
+        """How many actions an observation shows, the last one included."""
+        sizes = {part.name: part.size for part in self.observation}
+        return 1 + sizes.get(EARLIER_COMMANDS, 0) // len(self.channels)
 
     def assemble(self, parts: Mapping[str, Float[np.ndarray, "*lane size"]]) -> Float[np.ndarray, "*lane total"]:
         """An observation from its parts, of one lane or of many.
@@ -151,6 +159,38 @@ class PolicyLayout:
                     where=where,
                     remedy="use a policy that was trained for this layout",
                 )
+
+
+class Earlier:
+    """Commands and movements of earlier actions, the latest first, as many as an observation shows.
+
+    Args:
+        count: actions before the last one; may be 0.
+        lanes: robots side by side.
+        channels, moved: how many numbers a command and a movement have.
+    """
+
+    def __init__(self, count: int, lanes: int, channels: int, moved: int) -> None:
+        self._commands, self._moved = np.zeros((lanes, count, channels)), np.zeros((lanes, count, moved))
+
+    def begin(self, rows: Any, commands: Float[np.ndarray, "row channel"]) -> None:
+        """Let robots have stood still under these commands."""
+        self._commands[rows], self._moved[rows] = commands[:, None], 0.0
+
+    def add(self, commands: Float[np.ndarray, "lane channel"], moved: Float[np.ndarray, "lane size"]) -> None:
+        """Note the command that was in force until now, and how far the markers had come under it [m]."""
+        for kept, latest in ((self._commands, commands), (self._moved, moved)):
+            if kept.shape[1]:
+                kept[:, 1:] = kept[:, :-1].copy()
+                kept[:, 0] = latest
+
+    def parts(self, rows: Any = slice(None)) -> dict[str, Float[np.ndarray, "row size"]]:
+        """The two parts of an observation, of some robots."""
+        commands, moved = self._commands[rows], self._moved[rows]
+        return {
+            EARLIER_COMMANDS: commands.reshape(len(commands), -1),
+            EARLIER_MOVED: moved.reshape(len(moved), -1),
+        }
 
 
 def _brief(value: Any) -> str:

@@ -144,6 +144,7 @@ def _episodes_for(
         period=table.period,
         step=np.max(layout.moves, axis=0).tolist(),
         noise=table.noise,
+        history=layout.history,
     )
     batch = Episodes(simulator, task, lanes, randomisation, settings)
     batch.layout.require(layout, where=name)

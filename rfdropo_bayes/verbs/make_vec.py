@@ -25,6 +25,7 @@ from rfdropo_bayes.policies.randomisation import (
     drawn_rows,
     read_phi,
     read_posterior,
+    spread_out,
 )
 from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
@@ -115,7 +116,7 @@ def _check_length(task: Task, robot: Robot | BlackBox) -> None:
 
 
 def episode_settings(table: TrainingTable) -> Settings:
-    return Settings(table.actions, table.observation, table.period, table.step, table.noise)
+    return Settings(table.actions, table.observation, table.period, table.step, table.noise, table.history)
 
 
 def steps_of(simulator: AnySimulator) -> str:
@@ -156,6 +157,8 @@ def randomisation_of(
         parts.append(_of_run(Path(posterior), simulator))
     elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, spec.folder))
+    if table.width != 1.0:
+        parts[-1] = spread_out(parts[-1], table.width, simulator.parameters)
     kind = parts[-1].kind
     start = {name: ends for name, ends in table.start.items() if name not in absent}
     return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]

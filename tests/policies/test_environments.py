@@ -16,7 +16,17 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.gym_env import TrunkEnv, TrunkVectorEnv
-from rfdropo_bayes.policies.randomisation import Draws, Phi, Point, Uniform, fitting, read_phi, read_posterior
+from rfdropo_bayes.policies.randomisation import (
+    Draws,
+    Layers,
+    Phi,
+    Point,
+    Uniform,
+    fitting,
+    read_phi,
+    read_posterior,
+    spread_out,
+)
 from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, potential, reward
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
@@ -36,6 +46,12 @@ def episodes():
     """Four lanes, randomised over two ranges."""
     ranges = {"young_modulus": (3e6, 6e6), "trunk_mass": (0.3, 0.5)}
     return make_episodes(REACH, 4, actions="continuous", observed="full", randomisation=Uniform(ranges))
+
+
+@pytest.fixture
+def robot_arm():
+    """Options of an arm that moves fast in tests."""
+    return {"robot": "smooth_arm", "precision": "float32"}
 
 
 @pytest.fixture
@@ -152,6 +168,56 @@ def test_what_a_marker_has_moved_is_the_difference_of_two_sightings(task) -> Non
             0.0 < np.abs(pose[:, 3:]).max() < 0.25
         )  # 2 mm over half a side is 0.11 rad, half of which is in a quaternion
         assert np.linalg.norm(second[:, part["object"]][:, 3:], axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_history_shows_earlier_commands_and_movements(robot_arm) -> None:
+    """Each as it stood in the observations before, the latest first; an episode that begins has stood still."""
+    lanes = make_episodes(REACH, 2, actions="continuous", observed="markers", noise=0.001, history=3, **robot_arm)
+    part, start = {}, 0
+    for piece in lanes.layout.observation:
+        part[piece.name], start = slice(start, start + piece.size), start + piece.size
+    assert lanes.layout.history == 3
+    rng, seen = np.random.default_rng(0), [lanes.reset([0, 1])]
+    for _ in range(4):
+        seen.append(lanes.act(rng.uniform(-1.0, 1.0, (2, len(lanes.layout.channels)))).observation)
+    for now, name in ((4, "commands"), (4, "moved"), (1, "commands"), (1, "moved")):
+        before = [
+            seen[k][:, part[name]] if k >= 0 else np.zeros_like(seen[0][:, part[name]]) for k in (now - 1, now - 2)
+        ]
+        assert np.array_equal(seen[now][:, part[f"earlier {name}"]], np.concatenate(before, axis=1))
+    other = seen[4][1]
+    again = lanes.reset([0])
+    assert not again[:, part["earlier commands"]].any()
+    assert not again[:, part["earlier moved"]].any()
+    assert np.array_equal(lanes._observe(np.array([1]))[0], other)  # an episode of another lane goes on
+
+
+def test_a_history_of_what_is_not_seen_is_refused() -> None:
+    with pytest.raises(InputError, match="has no history"):
+        layout_of(TASKS[REACH], Robot.load("trunk_sofa"), "discrete", "paper", history=2)
+
+
+@pytest.mark.parametrize("width", [0.5, 2.0])
+def test_a_wider_posterior_keeps_its_middle_and_its_correlations(width) -> None:
+    rng = np.random.default_rng(0)
+    one = rng.normal(0.0, 0.1, 500)
+    rows = np.stack([4e6 * np.exp(one), 0.4 * np.exp(-one)], axis=1)
+    draws = Draws(("young_modulus", "trunk_mass"), rows, "x")
+    wide = spread_out(Layers((Point({}), draws), "posterior"), width, SPECS).parts[1]
+    logs, own = np.log(wide.rows), np.log(rows)
+    np.testing.assert_allclose(logs.mean(axis=0), own.mean(axis=0))
+    np.testing.assert_allclose(logs.std(axis=0), width * own.std(axis=0))
+    np.testing.assert_allclose(np.corrcoef(logs.T), np.corrcoef(own.T))
+    assert wide.sha256 != draws.sha256
+    phi = spread_out(Phi({"trunk_mass": {"mean": 0.4, "std": 0.1, "low": 0.1, "high": 0.7}}), width, SPECS)
+    assert phi.normals["trunk_mass"] == {"mean": 0.4, "std": 0.1 * width, "low": 0.1, "high": 0.7}
+
+
+def test_a_wider_posterior_ends_at_hard_bounds_and_a_point_has_no_width() -> None:
+    draws = Draws(("trunk_mass",), np.array([[1e-3], [9.0]]), "x")
+    assert np.array_equal(spread_out(draws, 5.0, SPECS).rows, [[1e-4], [10.0]])
+    with pytest.raises(InputError, match=r"width = 2 beside a randomisation that is no posterior"):
+        spread_out(Point({}), 2.0, SPECS)
 
 
 def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:

@@ -206,6 +206,19 @@ def test_a_checkpoint_of_an_earlier_version_is_refused(trained, tmp_path, lost) 
         train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)
 
 
+def test_keys_that_came_later_are_as_they_are_by_default(trained, tmp_path) -> None:
+    """A checkpoint that does not have them goes on."""
+    folder = tmp_path / "checkpoints"
+    shutil.copytree(trained[0] / "checkpoints", folder)
+    state = json.loads((folder / "state.json").read_text())
+    assert state["known"]["table"].pop("history") == 1
+    (folder / "state.json").write_text(json.dumps(state))
+    assert train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True).curve[-1]["steps"] == 6400
+    (folder / "state.json").write_text(json.dumps(state))
+    with pytest.raises(InputError, match=r"other settings: .*history"):
+        train(Points, TABLE.model_copy(update={"history": 2}), tmp_path, seed=3, gamma=0.9, resume=True)
+
+
 @pytest.mark.parametrize(
     ("change", "seed", "words"),
     [({"environments": 8}, 3, "environments"), ({}, 4, "seed")],
