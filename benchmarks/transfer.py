@@ -43,7 +43,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "the posterior's middle alone": {"width": 1e-3},
     "entropy bonus of 0.005": {"options": {"ent_coef": 0.005}},
 }
-"""Keys of [training] that differ from those of the fresh targets: half a millimetre of noise, draws of the posterior."""
+"""Keys of [training] that differ from those of the fresh targets: 0.5 mm of noise, draws of the posterior."""
 
 
 def prepared(work: Path) -> tuple[Path, Path]:
@@ -51,7 +51,9 @@ def prepared(work: Path) -> tuple[Path, Path]:
     files = make_target(KIND, SEED, work / "target", SCENE)
     truth, fitted = read_tables(files["truth"]), read_tables(files[SCENE])
     names = truth["model"]["mechanisms"]
-    own = {name: {} for name in truth["model"]["fixed"] if name not in fitted["model"]["priors"]}
+    own: dict[str, dict[str, Any]] = {
+        name: {} for name in truth["model"]["fixed"] if name not in fitted["model"]["priors"]
+    }
     fitted["model"] = {**fitted["model"], "mechanisms": names, "priors": {**fitted["model"]["priors"], **own}}
     fitted["inference"] = {"method": "laplace", "rollouts": ROLLOUTS}
     known, fit = files[SCENE].with_name("known.toml"), work / "fit"
