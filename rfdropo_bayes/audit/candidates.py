@@ -17,6 +17,8 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
 WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
+NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
+NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
 UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
 
@@ -200,18 +202,33 @@ def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, F
     alone has no amplitude: its effect has the size it has, and may be too large where it was tried. The way there from
     its null value is searched, with places and times held where there is also a size.
     """
-    coordinates = target.forward.coordinates
     if len(probe.amplitudes) == 1:
-        found = _best_of(target, fit, _sizes(target, fit, probe))
-        return found if found[0] > lm else (lm, probe.start(fit))
+        drop, start, _ = _best_of(target, fit, _sizes(target, fit, probe))
+        return (drop, start) if drop > lm else (lm, probe.start(fit))
     if probe.amplitudes:
         return lm, probe.start(fit)
-    points = np.repeat(fit.x[None], len(WAY), axis=0)
+    ladder = WAY
+    while True:
+        drop, start, best = _best_of(target, fit, _on_the_way(target, fit, probe, ladder))
+        low, high = ladder[max(best - 1, 0)], ladder[min(best + 1, len(ladder) - 1)]
+        # Of a stop that cables seldom reach, one rung does nothing and the next one far too much: the data are met
+        # between them.
+        if drop > NOTHING or high < NEIGHBOURS * low:
+            return drop, start
+        ladder = np.geomspace(low, high, len(WAY))
+
+
+def _on_the_way(
+    target: FitTarget, fit: Fit, probe: Probe, ladder: Float[np.ndarray, " way"]
+) -> Float[np.ndarray, "way d"]:
+    """A fit with a shape at some shares of the way from its null value to where it was tried."""
+    coordinates = target.forward.coordinates
+    points = np.repeat(fit.x[None], len(ladder), axis=0)
     sizes = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
     for index, value in probe.point.items():
         null = coordinates.null[index]
-        points[:, index] = null + WAY * (value - null) if index in sizes or not sizes else value
-    return _best_of(target, fit, np.clip(points, *coordinates.bounds))
+        points[:, index] = null + ladder * (value - null) if index in sizes or not sizes else value
+    return np.clip(points, *coordinates.bounds)
 
 
 def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
@@ -225,17 +242,20 @@ def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way 
     return np.clip(points, *coordinates.bounds)
 
 
-def _best_of(target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]) -> tuple[float, Float[np.ndarray, " d"]]:
-    """The point that takes most from the sum of squares, base parameters moved with it, and how much it takes."""
+def _best_of(
+    target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]
+) -> tuple[float, Float[np.ndarray, " d"], int]:
+    """How much the point that takes most takes from the sum of squares, base parameters moved with it; this point; its
+    number, the last one of several that take as much."""
     base = span(fit.jacobian)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
     left = np.sum(project_out(base, found.T) ** 2, axis=0)
-    best = int(np.argmin(left))
+    best = len(left) - 1 - int(np.argmin(left[::-1]))
     at_null = float(np.sum(project_out(base, fit.residual[:, None]) ** 2))
     start = points[best]
     step = np.linalg.lstsq(fit.jacobian, found[best], rcond=1e-6)[0]
     start[fit.free] += np.clip(step, -1.0, 1.0)
-    return at_null - float(left[best]), start
+    return at_null - float(left[best]), start, best
 
 
 def discretisation_probe(

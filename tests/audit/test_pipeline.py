@@ -416,6 +416,27 @@ def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
     assert abs(start[asked.coordinates.space.names.index("lag")]) == pytest.approx(1.0, abs=0.35)
 
 
+class Stopping(Toy):
+    """A ``play`` that does nothing up to a threshold, and soon much beyond it, as a stop that cables seldom reach."""
+
+    def rollout(self, parameters, commands, steps=None):
+        values = {spec.name: jnp.asarray(spec.nominal) for spec in Toy.parameters} | dict(parameters)
+        return super().rollout(values | {"play": 20.0 * jnp.maximum(values["play"] - 1.0, 0.0)}, commands, steps)
+
+
+def test_an_effect_is_found_between_a_point_that_does_nothing_and_one_that_does_far_too_much():
+    asked = replace(problem({**TRUTH, "play": 0.4}, 2), lanes=Lanes(Stopping(), np.arange(4)))  # at 1.02 here
+    target, base = base_model(asked, 0)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    screen, _ = search.screened(base)
+    row = screen.row("play")
+    drop, start = lead(target, base, row.probe, row.lm)
+    index = asked.coordinates.space.names.index("play")
+    assert start[index] == pytest.approx(1.02, abs=0.02)
+    assert drop > 0.3 * row.lm
+    assert asked.coordinates.named(search.refit(base, row).x)["play"] == pytest.approx(1.02, abs=0.003)
+
+
 @pytest.mark.slow
 def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it():
     asked = problem({**TRUTH, "play": 1.0}, 1)
