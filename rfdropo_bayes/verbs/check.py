@@ -42,7 +42,7 @@ from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
-from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
+from rfdropo_bayes.verbs.placement import NEAR, far_from_rest, placement_hints
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 
 MILLIMETRES = 1e3
@@ -247,6 +247,12 @@ def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator
     words = f"markers {_names(shared)}: as the robot's"
     if unknown:
         words += f"; {_names(unknown)}: not the robot's, left out"
+    if unknown and unseen:
+        found.doubts.append(
+            f"{trajectory.name}: {_names(unknown)} of the recording is no marker of the robot, and {_names(unseen)} of "
+            "the robot is not in the recording: where both are the same point, give it one name, in markers under "
+            "[data.columns] or in the robot file"
+        )
     yield words + (f"; the robot's {_names(unseen)}: not measured" if unseen else "")
     usable = trajectory.position[trajectory.position_mask]
     if len(usable):
@@ -301,7 +307,23 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
     if travel is not None:
         yield from _travel(travel, robot)
         command = travel.follow(trajectory.initial_command, command)
+    _say_unasked(found, trajectory, robot)
     _say_reach(found, trajectory.name, robot, command @ np.asarray(robot.channel_matrix({})).T)
+
+
+def _say_unasked(found: Check, trajectory: Trajectory, robot: Robot) -> None:
+    """Markers that go on moving while no command changes: a step into the recording has come to rest by its middle."""
+    if np.ptp(trajectory.command, axis=0).any():
+        return
+    middle = len(trajectory.time) // 2
+    late = np.where(trajectory.position_mask[middle:, :, None], trajectory.position[middle:], np.nan)
+    seen = late[:, np.isfinite(late).any(axis=(0, 2))]
+    way = float((np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0)).max(initial=0.0))
+    if way > NEAR * (robot.body.station_m[-1] - robot.body.station_m[0]):
+        found.doubts.append(
+            f"{trajectory.name}: no command changes, and in the second half of the recording a marker still moves by "
+            f"{MILLIMETRES * way:.3g} mm: look at the columns of the commands"
+        )
 
 
 def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:
