@@ -38,6 +38,7 @@ from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
@@ -86,7 +87,8 @@ def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflig
     Raises:
         InputError: bad input, or a model that cannot be simulated.
     """
-    return preflight(model, runs, seed=seed)
+    model = given_model(model, "check")
+    return preflight(model, model.runs(runs)[0], seed=seed)
 
 
 def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bool = False) -> Check:
