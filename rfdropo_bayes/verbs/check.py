@@ -123,6 +123,11 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_copies(found, [*recordings["fit"], *recordings["test"]])
+    if experiment.data is not None and experiment.data.fit and not experiment.data.test:
+        found.notes.append(
+            "no recording is kept for a test: nothing will say how well a fit predicts motions that it has not seen; "
+            "name one under test in [data]"
+        )
     found.doubts += [
         f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {_names(named)}"
         for group, entry in unmatched(named, experiment.model.groups)

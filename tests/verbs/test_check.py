@@ -281,6 +281,12 @@ def test_a_file_that_is_listed_twice_is_one_problem(tmp_path):
     assert "is listed twice; list each recording once" in problem
 
 
+def test_an_experiment_without_a_test_recording_is_told_so(tmp_path):
+    assert any(note.startswith("no recording is kept for a test") for note in checked(tmp_path).notes)
+    found = listed(tmp_path, fit='["run.csv"]', test='["no_such.csv"]')
+    assert not any(note.startswith("no recording is kept for a test") for note in found.notes)
+
+
 def test_a_copy_of_a_recording_is_doubtful_and_the_last_line_says_so(tmp_path):
     found = listed(tmp_path, "copy.csv", fit='["run.csv"]', test='["copy.csv"]')
     assert not found.problems
