@@ -38,13 +38,14 @@ again = rb.simulate(model, {**walk, "recordings": ["again"]}, parameters=TRUTH, 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
 axes[0].step(time, 1e3 * sent, where="post", label=channels)
 axes[0].set(xlabel="time [s]", ylabel="pull [mm]", title="proposed")
+axes[0].legend()
 spread = {}
 for words, second in (("another like it", again), ("the proposed one", designed)):
     fit = rb.calibrate(model, [*first, *second], rb.Laplace(starts=1), seed=0, show=False)
     draws = fit.posterior.posterior["rayleigh_stiffness"].values.ravel()
     axes[1].hist(1e3 * draws, bins=30, density=True, alpha=0.5, label=words)
     spread[words] = float(np.std(np.log(draws)))
-axes[1].axvline(1e3 * TRUTH["rayleigh_stiffness"], color="k")
+axes[1].axvline(1e3 * TRUTH["rayleigh_stiffness"], color="k", label="truth")
 axes[1].set(xlabel="stiffness damping [ms]", title="after a second recording")
 axes[1].legend()
 figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "design_the_next_recording.png")

@@ -50,7 +50,7 @@ figure, axes = plt.subplots(2, 1, figsize=(8, 4.5), sharex=True, layout="constra
 axes[0].plot(read.time, 1e3 * read.position[:, 0], label=["x", "y", "z"])
 axes[0].set_ylabel("tip [mm]")
 axes[0].legend()
-axes[1].step(read.command_time, 1e3 * read.command, where="post", label=read.cable_names)
+axes[1].step(read.time, 1e3 * read.command_at(read.time), where="post", label=read.cable_names)
 axes[1].set(xlabel="time [s]", ylabel="pull [mm]")
 axes[1].legend()
 figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "read_a_ros_bag.png")

@@ -239,10 +239,11 @@ def test_every_page_of_the_site_is_in_its_navigation():
 
 @pytest.mark.parametrize("path", sorted(REPOSITORY.glob("reports/*/README.md")), ids=lambda path: path.parent.name)
 def test_a_report_answers_its_question_first(path: Path) -> None:
-    """Question, answer, table, caveat and command in at most 60 lines; all else is on a page of details."""
+    """Question, answer, one table, caveat and command in at most 60 lines; all else is on a page of details."""
     text = path.read_text(encoding="utf-8")
     order = [text.find(f"**{word}") for word in ("Question", "Answer")]
     assert 0 < order[0] < order[1] < text.find("|---")
     assert re.search(r"`?(rfdropo|python|make|pytest) |tests/", text)
     assert "**Caveat" in text
+    assert len(re.findall(r"^\|-", text, re.MULTILINE)) == 1
     assert len(text.splitlines()) <= 60

@@ -1,4 +1,4 @@
-"""Run the examples and write docs/gallery.md of them: question, picture, the last line printed.
+"""Run the examples and write docs/gallery.md of them: question, picture, what it shows, the last line printed.
 
     python tools/gallery.py [NAME ...]
 
@@ -17,7 +17,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURES, PRINTED = ROOT / "docs" / "gallery.md", ROOT / "docs" / "images" / "gallery", "printed.json"
-ROW = re.compile(r"^\| \[(\w+)\.py\]\(\w+\.py\) \| (.*?) \|$", re.MULTILINE)
+ROW = re.compile(r"^\| \[(\w+)\.py\]\(\w+\.py\) \| (.*?) \| (.*?) \|$", re.MULTILINE)
 COLOURS = 128  # of a picture: a third of the size, and no difference to be seen
 HEAD = """# Gallery
 
@@ -36,12 +36,14 @@ def run(name: str) -> str:
     return printed.strip().splitlines()[-1]
 
 
-def section(name: str, question: str, printed: str) -> str:
+def section(name: str, question: str, shown: str, printed: str) -> str:
     """An example as a part of the page."""
     return f"""
 ## {question}
 
 ![{question}](images/gallery/{name}.png)
+
+{shown}
 
 It prints: {printed}
 
@@ -55,14 +57,14 @@ def main(names: list[str]) -> None:
     PICTURES.mkdir(parents=True, exist_ok=True)
     store = PICTURES / PRINTED
     printed = json.loads(store.read_text(encoding="utf-8")) if store.exists() else {}
-    for name, question in listed:
+    for name, question, _ in listed:
         if question.endswith("(needs PyElastica)"):
             continue
         if name in names or not names:
             print(name, flush=True)
             printed[name] = run(name)
     store.write_text(json.dumps(printed, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    parts = [section(name, question, printed[name]) for name, question in listed if name in printed]
+    parts = [section(name, question, shown, printed[name]) for name, question, shown in listed if name in printed]
     PAGE.write_text(HEAD + "".join(parts), encoding="utf-8")
 
 

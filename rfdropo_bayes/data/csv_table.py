@@ -26,12 +26,13 @@ MOTIVE = "Format Version"
 
 
 def closest(name: str, known: Sequence[str]) -> str:
-    """Hint that names the known entry nearest to ``name``, or lists them if none is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    """Hint that names the known entry nearest to ``name``, upper or lower case, or lists all if none is near."""
+    folded = {entry.casefold(): entry for entry in known}
+    near = difflib.get_close_matches(name.casefold(), list(folded), n=1, cutoff=0.5)
     if near:
-        return f"did you mean {near[0]!r}?"
+        return f"did you mean {folded[near[0]]!r}?"
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-    return f"there is: {shown}"
+    return f"nothing else there looks like it: {shown}"
 
 
 def read_text(path: Path) -> str:
@@ -208,16 +209,16 @@ class CsvTable:
         return name in self.frame.columns
 
     def require(self, names: Sequence[str]) -> None:
-        """Raise an InputError that names the first of ``names`` that is not a column, and the nearest that is."""
+        """Raise an InputError that names those of ``names`` that are no columns, and the nearest to the first."""
         columns = list(self.frame.columns)
-        for name in names:
-            if name not in columns:
-                spare = [column for column in columns if column not in names] or columns
-                raise InputError(
-                    f"column {name!r} is missing; {closest(name, spare)}",
-                    where=str(self.path),
-                    remedy=self.missing_remedy,
-                )
+        missing = [name for name in names if name not in columns]
+        if not missing:
+            return
+        spare = [column for column in columns if column not in names] or columns
+        words = f"column {missing[0]!r} is missing"
+        if len(missing) > 1:
+            words += f" (and {', '.join(map(repr, missing[1:]))})"
+        raise InputError(f"{words}; {closest(missing[0], spare)}", where=str(self.path), remedy=self.missing_remedy)
 
     def numbers(self, names: Sequence[str], *, allow_missing: bool = False) -> Float[np.ndarray, "rows columns"]:
         """Columns as float64; rows are counted from 0 after the header in every message.

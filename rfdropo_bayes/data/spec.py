@@ -86,7 +86,7 @@ class DataSpec(BaseModel):
     def _columns_fit(self) -> DataSpec:
         if (self.format in MAPPED) != (self.columns is not None):
             takes = "needs a" if self.format in MAPPED else "takes no"
-            raise ValueError(f"format {self.format!r} {takes} [data.columns] table")
+            raise ValueError(f"format {self.format!r} {takes} [data.columns] table (columns= of rb.read)")
         return self
 
     def piece(self, whole: Trajectory, rows: tuple[int, int] | None) -> Trajectory:

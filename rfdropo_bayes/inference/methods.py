@@ -32,7 +32,7 @@ class Method(NamedTuple):
         posterior: its draws are of a posterior, and not of a distribution to randomise over.
     """
 
-    config: type
+    config: type[Any]
     run: Callable[..., InferenceResult]
     posterior: bool = True
 
@@ -70,7 +70,7 @@ def method_of(config: Any) -> str:
     for name, method in METHODS.items():
         if isinstance(config, method.config):
             return name
-    known = ", ".join(method.config.__name__ for method in METHODS.values())
+    known = ", ".join(f"rb.{method.config.called}()" for method in METHODS.values())
     raise InputError(f"{config!r} is no method", where="method", remedy=f"give one of {known}")
 
 

@@ -285,8 +285,8 @@ class TravelStop(InCommandUnit, SteppedActuation):
     name = "travel_stop"
     stage = "actuation"
     inside_drive = True
-    cause = "commands given relative to where the drive is, at a stop or at a limit of its controller"
-    remedy = "record where the drives are, not what they were told; command absolute positions"
+    cause = "a drive that ignores commands beyond its stop, or beyond a limit of its controller"
+    remedy = "record the positions of the drives beside their commands; command absolute positions"
     in_metres = (
         ParameterSpec(
             "inverse_release_travel",

@@ -43,7 +43,7 @@ class Kind(NamedTuple):
 
 
 KINDS: Mapping[str, Kind] = {
-    "constant": Kind(0, (0, 0), "always", "1"),
+    "constant": Kind(0, (0, 0), "by a constant", "1"),
     "time": Kind(0, (0, 1), "with time", "t"),
     "command": Kind(1, (1, 0), "in proportion to {0}", "u_{0}"),
     "drift": Kind(1, (1, 1), "with time times {0}", "t u_{0}"),

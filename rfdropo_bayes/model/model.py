@@ -14,6 +14,8 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.given_recordings import given_recordings
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import (
     build_model,
     build_problem,
@@ -205,10 +207,17 @@ class Model:
     def runs(
         self, fit: Sequence[Trajectory] | None, test: Sequence[Trajectory] | None = None
     ) -> tuple[Sequence[Trajectory], Sequence[Trajectory]]:
-        """Recordings to fit and to test that a call gives, or else those that the experiment file names."""
+        """Recordings to fit and to test that a call gives, or else those that the experiment file names.
+
+        Raises:
+            InputError: something else than recordings was given, or none to fit.
+        """
         if fit is None:
-            return self.recordings("fit"), self.recordings("test") if test is None else test
-        return fit, test or ()
+            return self.recordings("fit"), self.recordings("test") if test is None else given_recordings(test, "test")
+        runs = given_recordings(fit, "runs")
+        if not runs:
+            raise InputError("the list of recordings is empty", where="runs", remedy="give at least one")
+        return runs, given_recordings(test or (), "test")
 
     def record(self, meant: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
         """Tables for the record of a run, as an experiment file has them.

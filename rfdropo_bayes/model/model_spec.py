@@ -257,4 +257,5 @@ def find_robot(name: str, folder: Path, adapter: Mapping[str, Any] | None = None
     if adapter:
         raise InputError(f"the robot {name!r} has no adapter", where="[adapter]", remedy="remove the table")
     beside = folder / name
-    return Robot.load(beside if beside.suffix == ".toml" and beside.is_file() else name)
+    own = beside.suffix == ".toml" and (beside.is_file() or not Path(name).is_file())
+    return Robot.load(beside if own else name)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -34,10 +36,12 @@ MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
 
 
 class RunKind(NamedTuple):
-    """What a command writes: the first of ``results`` says that it has ended; and whether it can be resumed."""
+    """What a command writes: the first of ``results`` says that it has ended; whether it can be resumed; and whether
+    several programs may share its folder, each with rows of its own."""
 
     results: tuple[str, ...]
     resumable: bool = False
+    shared: bool = False
 
 
 COMMANDS = {
@@ -51,8 +55,8 @@ COMMANDS = {
     "design": RunKind(("design.json", "next_commands.csv")),
     "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl", PAGE), resumable=True),
     "evaluate": RunKind(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
-    "benchmark table1": RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True),
-    "benchmark table2": RunKind(("table2.json", "table2.md", "table2.png"), resumable=True),
+    "benchmark table1": RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True, shared=True),
+    "benchmark table2": RunKind(("table2.json", "table2.md", "table2.png"), resumable=True, shared=True),
 }
 
 
@@ -88,41 +92,68 @@ def run_folder(
         the folder.
 
     Raises:
-        InputError: a folder that cannot be written, that holds another run, or whose run had other settings.
+        InputError: a folder that cannot be written, that holds another run, in which another program is running, or
+            whose run had other settings.
         Interrupted: Ctrl-C.
     """
     out = output_folder(out)
-    earlier = _read(out / RUN)
-    settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
-    check_folder(out, command, resume=resume, overwrite=overwrite)
-    for name, text in (texts or {}).items():
-        write_text(out / name, text)
-    if tables is not None:
-        contained = self_contained(tables, folder, out)
-        settings["experiment"] = contained
-        settings["robot"] = _digest(out / ROBOT_COPY)
-    if resume and earlier is not None:
-        _check_settings(out, earlier["settings"], settings)
-    if not resume:
-        _clear(out, COMMANDS[command].results)
-    if tables is not None:
-        write_text(out / CONFIG, describe(contained))
-    record = {"schema_version": SCHEMA_VERSION, "command": command, "version": __version__, "settings": settings}
-    _write(out, record, RUNNING)
-    try:
-        with running(checks=COMMANDS[command].resumable):
-            yield out
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) or interrupted():
+    with _held(out, shared=COMMANDS[command].shared):
+        earlier = _read(out / RUN)
+        settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
+        check_folder(out, command, resume=resume, overwrite=overwrite)
+        for name, text in (texts or {}).items():
+            write_text(out / name, text)
+        if tables is not None:
+            contained = self_contained(tables, folder, out)
+            settings["experiment"] = contained
+            settings["robot"] = _digest(out / ROBOT_COPY)
+        if resume and earlier is not None:
+            _check_settings(out, earlier["settings"], settings)
+        if not resume:
+            _clear(out, COMMANDS[command].results)
+        if tables is not None:
+            write_text(out / CONFIG, describe(contained))
+        record = {"schema_version": SCHEMA_VERSION, "command": command, "version": __version__, "settings": settings}
+        _write(out, record, RUNNING)
+        try:
+            with running(checks=COMMANDS[command].resumable):
+                yield out
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt) or interrupted():
+                with suppress(InputError):
+                    _write(out, record, INTERRUPTED)
+                raise Interrupted(str(out), "--resume" if COMMANDS[command].resumable else None) from None
             with suppress(InputError):
-                _write(out, record, INTERRUPTED)
-            raise Interrupted(str(out), "--resume" if COMMANDS[command].resumable else None) from None
-        with suppress(InputError):
-            _write(out, record, FAILED)
-        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
-            raise unwritten(error, Path(error.filename or out)) from None
-        raise
-    _write(out, record, DONE)
+                _write(out, record, FAILED)
+            if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
+                raise unwritten(error, Path(error.filename or out)) from None
+            raise
+        _write(out, record, DONE)
+
+
+@contextmanager
+def _held(out: Path, *, shared: bool) -> Iterator[None]:
+    """Hold the lock of a folder, which the system gives back however the program ends.
+
+    Raises:
+        InputError: another program holds it, and the two may not share it.
+    """
+    handle = os.open(out, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise InputError(
+            "another program is running in this folder",
+            where=str(out),
+            remedy="wait until it has ended, or choose another folder with --out",
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 def hashes(recordings: Iterable[Any]) -> dict[str, str]:

@@ -62,7 +62,8 @@ def draw_band(axes: Axes, recording: RecordingPrediction, marker: int, axis: int
     axes.fill_between(time, low50, high50, color=style.POSTERIOR, alpha=0.38, linewidth=0, label="50 % band")
     axes.plot(time, median, color=style.POSTERIOR, linewidth=1.0, label="predicted median")
     seen = np.where(recording.mask[rows, marker], measured, np.nan)
-    axes.plot(time, seen, color=style.MEASURED, linewidth=1.1, label="measured")
+    alone = np.isfinite(seen).sum() == 1  # a prediction has seen the first row only
+    axes.plot(time, seen, "o" if alone else "-", color=style.MEASURED, linewidth=1.1, markersize=3, label="measured")
     _at_least(axes, LEAST_SPAN)
     axes.set_ylabel(f"{recording.marker_names[marker]} {AXES[axis]} [mm]")
 

@@ -60,8 +60,13 @@ def find_robot_file(name_or_path: str | Path) -> Path:
     if path.suffix == ".toml" and path.is_file():
         return path
     if path.suffix == ".toml":
+        beside = [file.name for file in path.parent.glob("*.toml")]
+        near = difflib.get_close_matches(path.name, beside, n=1)
         raise InputError(
-            "no such robot file", where=str(path), remedy="correct the path; it counts from the experiment file"
+            "no such robot file",
+            where=str(path),
+            remedy=(f"did you mean {near[0]!r}? " if near else "")
+            + "correct the path; it counts from the experiment file",
         )
     close = difflib.get_close_matches(str(name_or_path), list(known), n=1)
     raise InputError(

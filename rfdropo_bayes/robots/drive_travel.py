@@ -24,7 +24,7 @@ Values = float | tuple[float, ...]
 
 
 class DriveTravel(RobotTable):
-    """What is known of how some drives answer commands, in some recordings.
+    """How drives answer commands: limits, start and size of their counters, of some cables in some recordings.
 
     Numbers are those of the drive's counter, one for all of the table's cables or one for each.
     """

@@ -22,6 +22,7 @@ from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpa
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import DataSpec, RecordingEntry, Trajectory, load_recordings, one_at_a_time
+from rfdropo_bayes.data.given_recordings import given_recording, given_recordings
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups, group_of, in_group, whole
@@ -54,6 +55,7 @@ from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
 
@@ -97,7 +99,8 @@ def adapt(
     Raises:
         InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
     """
-    model = model_of(fit)
+    model = model_of(given_fit(fit, "adapt"))
+    recording, test = given_recording(recording, "adapt"), given_recordings(test, "adapt, test")
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.spec.groups) if group is None else group
     left = model_error_of(fit.record)

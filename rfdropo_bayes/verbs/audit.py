@@ -65,6 +65,7 @@ from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechan
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import changed, parse_table
+from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.between import Between, extend_groups, find_groups, groups_at_hand
 
 Workshop = dict[str, Lanes]
@@ -115,7 +116,7 @@ def audit(
     Raises:
         InputError: bad input, before anything long has started.
     """
-    model = _asked(model, noise, keys)
+    model = _asked(given_model(model, "audit"), noise, keys)
     runs, test = model.runs(runs, test)
     chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)

@@ -59,6 +59,7 @@ from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
 
 PREDICTIVE_DRAWS = 200
@@ -100,6 +101,7 @@ def calibrate(
     Raises:
         InputError: bad input, before anything long has started.
     """
+    model = given_model(model, "calibrate")
     runs, test = model.runs(runs, test)
     table = model.settings.inference
     config = make_config(table.method, inference_options(table)) if method is None else method

@@ -38,11 +38,12 @@ from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
-from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
+from rfdropo_bayes.verbs.placement import NEAR, far_from_rest, placement_hints
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 
 MILLIMETRES = 1e3
@@ -86,7 +87,8 @@ def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflig
     Raises:
         InputError: bad input, or a model that cannot be simulated.
     """
-    return preflight(model, runs, seed=seed)
+    model = given_model(model, "check")
+    return preflight(model, model.runs(runs)[0], seed=seed)
 
 
 def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bool = False) -> Check:
@@ -121,6 +123,11 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_copies(found, [*recordings["fit"], *recordings["test"]])
+    if experiment.data is not None and experiment.data.fit and not experiment.data.test:
+        found.notes.append(
+            "no recording is kept for a test: nothing will say how well a fit predicts motions that it has not seen; "
+            "name one under test in [data]"
+        )
     found.doubts += [
         f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {_names(named)}"
         for group, entry in unmatched(named, experiment.model.groups)
@@ -247,6 +254,12 @@ def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator
     words = f"markers {_names(shared)}: as the robot's"
     if unknown:
         words += f"; {_names(unknown)}: not the robot's, left out"
+    if unknown and unseen:
+        found.doubts.append(
+            f"{trajectory.name}: {_names(unknown)} of the recording is no marker of the robot, and {_names(unseen)} of "
+            "the robot is not in the recording: where both are the same point, give it one name, in markers under "
+            "[data.columns] or in the robot file"
+        )
     yield words + (f"; the robot's {_names(unseen)}: not measured" if unseen else "")
     usable = trajectory.position[trajectory.position_mask]
     if len(usable):
@@ -301,7 +314,23 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
     if travel is not None:
         yield from _travel(travel, robot)
         command = travel.follow(trajectory.initial_command, command)
+    _say_unasked(found, trajectory, robot)
     _say_reach(found, trajectory.name, robot, command @ np.asarray(robot.channel_matrix({})).T)
+
+
+def _say_unasked(found: Check, trajectory: Trajectory, robot: Robot) -> None:
+    """Markers that go on moving while no command changes: a step into the recording has come to rest by its middle."""
+    if np.ptp(trajectory.command, axis=0).any():
+        return
+    middle = len(trajectory.time) // 2
+    late = np.where(trajectory.position_mask[middle:, :, None], trajectory.position[middle:], np.nan)
+    seen = late[:, np.isfinite(late).any(axis=(0, 2))]
+    way = float((np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0)).max(initial=0.0))
+    if way > NEAR * (robot.body.station_m[-1] - robot.body.station_m[0]):
+        found.doubts.append(
+            f"{trajectory.name}: no command changes, and in the second half of the recording a marker still moves by "
+            f"{MILLIMETRES * way:.3g} mm: look at the columns of the commands"
+        )
 
 
 def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:

@@ -33,6 +33,7 @@ from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.designed import COMMANDS, Design
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
+from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import build_problem, start_values
 
 SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
@@ -95,6 +96,7 @@ def design(
     Raises:
         InputError: bad input, or a base model that was not fitted in the time.
     """
+    model = given_model(model, "design")
     runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
     work = partial(_design, model, runs, base, chosen, minutes, report)
     if out is None:

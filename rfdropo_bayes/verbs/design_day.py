@@ -29,6 +29,7 @@ from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.designed import COMMANDS, Design
 from rfdropo_bayes.tables import nearest
 from rfdropo_bayes.verbs.adapt import day_space, model_error_of
+from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.design import command_table, proposals, units_said
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
 
@@ -88,7 +89,7 @@ def design_day(
     Raises:
         InputError: nothing of the model differs between days, or no recording is of the group.
     """
-    model = model_of(fit)
+    model = model_of(given_fit(fit, "design_day"))
     runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
     work = partial(_design_day, fit, runs, seconds, group, chosen, report)
     if out is None:

@@ -39,6 +39,7 @@ from rfdropo_bayes.robots import OBJECT, Robot
 from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import changed, parse_table
+from rfdropo_bayes.verbs.arguments import given_model
 
 LONGER = 0.15
 """Of a task's robot, how much longer or shorter one may be that takes its goals: these are 115 to 150 mm from the base
@@ -69,6 +70,7 @@ def make_vec(
 
 def with_training(model: Model, options: Mapping[str, Any]) -> Model:
     """The model with further keys of [training]."""
+    model = given_model(model, "training")
     if not options:
         return model
     own = model.settings.training

@@ -187,7 +187,8 @@ def _stretched(start: Start) -> list[str]:
         return []
     return [
         f"{start.names[i]} and {start.names[j]} are {1e3 * apart[i, j]:.4g} mm apart in the first row and "
-        f"{1e3 * rest[i, j]:.4g} mm on the undeformed robot: look at position_unit, and at point_m of the markers"
+        f"{1e3 * rest[i, j]:.4g} mm on the undeformed robot: look at position_unit, at the order of "
+        "their columns under positions, and at point_m of the markers"
     ]
 
 

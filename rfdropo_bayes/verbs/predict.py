@@ -29,6 +29,7 @@ from rfdropo_bayes.data import (
     load_unseen,
     start_is_known,
 )
+from rfdropo_bayes.data.given_recordings import given_recording
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
@@ -56,6 +57,7 @@ from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, of_unseen_days
 
 DRAWS = 200
@@ -87,10 +89,14 @@ def predict(
     Raises:
         InputError: a calibration without its model, or commands of another robot.
     """
-    record, model = fit.record, model_of(fit)
+    model = model_of(given_fit(fit, "predict"))
+    record = fit.record
     spec = model.spec
     _check_noise(record, spec.noise)
-    unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
+    if isinstance(commands, tuple) and len(commands) == 2 and not isinstance(commands[0], Trajectory):
+        unseen = _commanded(model, commands[0], commands[1], start)
+    else:
+        unseen = first_row_only(given_recording(commands, "predict"))
     group = record.attrs.get(ADAPTED_TO) if group is None else group
     groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
     simulator = with_groups(model.simulator, groups)

@@ -15,6 +15,7 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, shared_markers
+from rfdropo_bayes.data.given_recordings import given_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.model.assembly import AnySimulator, physical_values, robot_of
@@ -26,6 +27,7 @@ from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.motion_balance import append_balance
 from rfdropo_bayes.verbs.random_commands import random_walk
 
@@ -69,6 +71,9 @@ def simulate(
     Raises:
         InputError: bad input, or a rollout that diverged.
     """
+    model = given_model(model, "simulate")
+    if not isinstance(commands, Mapping):
+        commands = given_recordings(commands, "simulate, commands")
     spec, settings = replace(model.spec, fixed={**model.spec.fixed, **(parameters or {})}), model.settings
     if noise is not None:
         spec = replace(spec, stated=parse_table(NoiseTable, noise, where="simulate, noise"))

@@ -164,8 +164,10 @@ COLUMNS = {
 
 def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
     (tmp_path / "own.csv").write_text("x,y,z,pull\n100,0,0,1\n100,1,0,2\n")
-    with fails("column 'u' is missing; there is: x, y, z, pull"):
+    with fails("column 'u' is missing; nothing else there looks like it: x, y, z, pull"):
         read_plain_csv(tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS))
+    with fails(r"column 'X' is missing \(and 'Y'\); did you mean 'x'\?"):
+        read_plain_csv(tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS | {"positions": [["X", "Y", "z"]]}))
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,37 @@ def test_a_finished_run_is_replaced_only_when_asked(command, tmp_path):
     assert (tmp_path / "log.jsonl").read_text() == "a line\n"
 
 
+HOLDER = """
+import sys, time
+from pathlib import Path
+from rfdropo_bayes.model.run_folder import run_folder
+with run_folder(Path(sys.argv[1]), sys.argv[2]):
+    print("running", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("options", [{}, {"resume": True}, {"overwrite": True}])
+def test_a_folder_in_which_another_program_is_running_is_refused_until_that_has_ended(tmp_path, options):
+    """Killed without warning, the other program leaves no lock behind."""
+    other = subprocess.Popen([sys.executable, "-c", HOLDER, tmp_path, "calibrate"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "running\n"
+        with pytest.raises(InputError, match=r"another program is running in this folder; wait until it has ended"):
+            finish(tmp_path, **options)
+    finally:
+        other.kill()
+        other.communicate()
+    finish(tmp_path, overwrite=True)
+
+
+def test_programs_of_one_study_share_its_folder(tmp_path):
+    with run_folder(tmp_path, "benchmark table2"), run_folder(tmp_path, "benchmark table2", resume=True):
+        pass
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "done"
+
+
 def test_results_without_a_record_are_not_replaced_either(tmp_path):
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InputError, match="holds a finished run"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -280,6 +281,12 @@ def test_a_file_that_is_listed_twice_is_one_problem(tmp_path):
     assert "is listed twice; list each recording once" in problem
 
 
+def test_an_experiment_without_a_test_recording_is_told_so(tmp_path):
+    assert any(note.startswith("no recording is kept for a test") for note in checked(tmp_path).notes)
+    found = listed(tmp_path, fit='["run.csv"]', test='["no_such.csv"]')
+    assert not any(note.startswith("no recording is kept for a test") for note in found.notes)
+
+
 def test_a_copy_of_a_recording_is_doubtful_and_the_last_line_says_so(tmp_path):
     found = listed(tmp_path, "copy.csv", fit='["run.csv"]', test='["copy.csv"]')
     assert not found.problems
@@ -287,6 +294,51 @@ def test_a_copy_of_a_recording_is_doubtful_and_the_last_line_says_so(tmp_path):
     assert doubt.startswith("run, copy are the same to the last digit")
     assert ending(found).endswith("look first at the line above that is marked DOUBTFUL")
     assert ending(checked(tmp_path)) == "nothing keeps this experiment from running"
+
+
+def rewritten(tmp_path: Path, old: str, new: str, change: Callable[[pd.DataFrame], object] | None = None) -> Check:
+    """What check says after the experiment, and perhaps the table of its recording, were changed by hand."""
+    checked(tmp_path)
+    path, file = tmp_path / "own.toml", tmp_path / "run.csv"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    if change is not None:
+        table = pd.read_csv(file)
+        change(table)
+        table.to_csv(file, index=False)
+    return run_check(path, tmp_path / "pictures")
+
+
+def test_a_robot_that_moves_though_no_command_changes_is_doubtful(tmp_path):
+    def same(table: pd.DataFrame) -> None:
+        table.loc[:, ["c1", "c2", "c3", "c4"]] = 2.0
+
+    def come_to_rest(table: pd.DataFrame) -> None:
+        same(table)
+        places = [f"{axis}{k}" for axis in "xyz" for k in (1, 2, 3, 4)]
+        table.loc[len(table) // 2 :, places] = table.loc[len(table) // 2, places].to_numpy()
+
+    (doubt,) = [d for d in rewritten(tmp_path, "c1", "c1", same).doubts if "no command changes" in d]
+    assert doubt.startswith("run: no command changes")
+    assert doubt.endswith("look at the columns of the commands")
+    assert not any("no command changes" in d for d in rewritten(tmp_path, "c1", "c1", come_to_rest).doubts)
+    assert not any("no command changes" in d for d in checked(tmp_path).doubts)
+
+
+@pytest.mark.parametrize(("names", "doubtful"), [(("m1", "m2", "m3", "m5"), True), (("m1", "m2", "m3", "m4"), False)])
+def test_a_marker_under_another_name_than_the_robots_is_doubtful(tmp_path, names, doubtful):
+    listed_names = ", ".join(f'"{name}"' for name in names)
+    found = rewritten(tmp_path, 'position_unit = "mm"', f'position_unit = "mm"\nmarkers = [{listed_names}]')
+    doubts = [d for d in found.doubts if "run: m5 of the recording is no marker of the robot, and m4 of the robot" in d]
+    assert bool(doubts) == doubtful
+    assert not found.problems
+
+
+def test_a_robot_file_that_is_not_there_is_compared_with_those_beside_it(tmp_path):
+    (tmp_path / "arm.toml").write_text('name = "arm"')
+    with pytest.raises(InputError, match=r"amr\.toml: no such robot file; did you mean 'arm\.toml'\? correct the path"):
+        rewritten(tmp_path, 'robot = "smooth_arm"', 'robot = "amr.toml"')
 
 
 def test_a_group_that_names_no_recording_is_doubtful(tmp_path):

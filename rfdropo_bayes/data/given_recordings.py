@@ -1,0 +1,50 @@
+"""Recordings as a call of a verb is given them: a list, or an error that says how to make one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+READ = 'read files with rb.read("monday/*.csv", format="csv", columns=...), arrays with rb.Trajectory.from_arrays'
+
+
+def given_recordings(given: Any, where: str) -> list[Trajectory]:
+    """A list of recordings; a single recording is a list of one.
+
+    Args:
+        given: recordings, or what a caller took for recordings.
+        where: what the caller calls them.
+
+    Raises:
+        InputError: something else was given.
+    """
+    if isinstance(given, Trajectory):
+        return [given]
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise InputError(f"{_words(given)} is no list of recordings", where=where, remedy=READ)
+    found = list(given)
+    for each in found:
+        if not isinstance(each, Trajectory):
+            raise InputError(f"{_words(each)} is no recording", where=where, remedy=READ)
+    return found
+
+
+def given_recording(given: Any, where: str) -> Trajectory:
+    """A single recording.
+
+    Raises:
+        InputError: something else was given, a list of one recording among it.
+    """
+    if isinstance(given, Trajectory):
+        return given
+    if isinstance(given, list | tuple) and given and all(isinstance(each, Trajectory) for each in given):
+        raise InputError(f"a list of {len(given)} is no recording", where=where, remedy="give one of them, as runs[-1]")
+    raise InputError(f"{_words(given)} is no recording", where=where, remedy=READ)
+
+
+def _words(given: Any) -> str:
+    """A short name of what was given."""
+    return repr(given) if isinstance(given, str | int | float) or given is None else f"a {type(given).__name__}"

@@ -1,0 +1,42 @@
+"""Models and calibrations as a call of a verb is given them, or an error that says how to make one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.results.calibrated import Calibration
+
+
+def given_model(given: Any, where: str) -> Model:
+    """A model.
+
+    Args:
+        given: what a caller took for a model.
+        where: the verb that was called.
+
+    Raises:
+        InputError: something else was given.
+    """
+    if isinstance(given, Model):
+        return given
+    named = f"{str(given)!r}" if isinstance(given, str | Path) else f"a {type(given).__name__}"
+    remedy = (
+        'rb.Model("my_arm.toml", priors=...) makes one of a robot, rb.Model.read("experiment.toml") of an experiment'
+    )
+    raise InputError(f"{named} is no model", where=where, remedy=remedy)
+
+
+def given_fit(given: Any, where: str) -> Calibration:
+    """A calibration.
+
+    Raises:
+        InputError: something else was given.
+    """
+    if isinstance(given, Calibration):
+        return given
+    named = f"{str(given)!r}" if isinstance(given, str | Path) else f"a {type(given).__name__}"
+    remedy = "rb.calibrate returns one, rb.load(folder) reads that of an earlier run"
+    raise InputError(f"{named} is no calibration", where=where, remedy=remedy)
