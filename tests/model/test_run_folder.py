@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError, Interrupted
-from rfdropo_bayes.files import append_line, whole, write_text
+from rfdropo_bayes.files import append_line, read_lines, whole, write_text
 from rfdropo_bayes.inference import Checkpoint
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.model.experiment_file import look_through, self_contained
@@ -212,6 +212,17 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(kind, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "\n" not in str(raised.value)
     assert [path.name for path in tmp_path.iterdir()] == (["file"] if kind == "line" else [])
+
+
+@pytest.mark.parametrize(("cut", "kept"), [(3, [0, 1]), (1, [0, 1, 2])])
+def test_a_ledger_whose_last_line_a_kill_has_cut_is_gone_on_with(cut, kept, tmp_path):
+    path = tmp_path / "ledger.jsonl"
+    for index in range(3):
+        append_line(path, json.dumps({"index": index}))
+    os.truncate(path, path.stat().st_size - cut)  # of one byte: the newline alone is missing
+    for index in range(3, 6):
+        append_line(path, json.dumps({"index": index}))
+    assert [line["index"] for line in read_lines(path)] == [*kept, 3, 4, 5]
 
 
 def test_a_file_is_replaced_whole_or_stays(tmp_path):
