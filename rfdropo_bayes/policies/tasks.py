@@ -195,12 +195,12 @@ def layout_of(
     )
 
 
-def observed_of(layout: PolicyLayout) -> Observed:
-    """Which observation a layout has; see `layout_of`."""
+def observed_of(layout: PolicyLayout, robot: Commanded) -> Observed:
+    """Which observation of a robot a layout has; see `layout_of`."""
     sizes = {part.name: part.size for part in layout.observation}
     if "commands" not in sizes:
         return "paper"
-    return "markers" if sizes["markers"] == 3 * len(TRACKED_HEIGHTS) else "full"
+    return "full" if sizes["markers"] == 3 * len(robot.marker_names) else "markers"
 
 
 def parts_seen(

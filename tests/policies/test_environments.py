@@ -17,7 +17,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.gym_env import TrunkEnv, TrunkVectorEnv
 from rfdropo_bayes.policies.randomisation import Draws, Phi, Point, Uniform, fitting, read_phi, read_posterior
-from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, potential, reward
+from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, observed_of, potential, reward
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.robots import Robot
@@ -152,6 +152,15 @@ def test_what_a_marker_has_moved_is_the_difference_of_two_sightings(task) -> Non
             0.0 < np.abs(pose[:, 3:]).max() < 0.25
         )  # 2 mm over half a side is 0.11 rad, half of which is in a quaternion
         assert np.linalg.norm(second[:, part["object"]][:, 3:], axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("robot", ["trunk_sofa", "trunk_physical", "asl_trunk"])
+@pytest.mark.parametrize("observed", ["full", "paper", "markers"])
+def test_a_layout_tells_what_is_observed_of_a_robot(robot, observed) -> None:
+    """Of 21 markers, of the four that are tracked themselves, and of three, of which two stand for the four."""
+    described = Robot.load(robot)
+    layout = layout_of(TASKS[REACH], described, "continuous", observed)
+    assert layout_of(TASKS[REACH], described, "continuous", observed_of(layout, described)) == layout
 
 
 def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:
