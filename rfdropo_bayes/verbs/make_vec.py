@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.model.assembly import AnySimulator, build_robot_simulator, build_simulator, physical_values
+from rfdropo_bayes.model.assembly import (
+    AnySimulator,
+    build_robot_simulator,
+    build_simulator,
+    measured_parameters,
+    physical_values,
+)
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
@@ -29,7 +36,7 @@ from rfdropo_bayes.policies.randomisation import (
 from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
-from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord
 from rfdropo_bayes.prediction.day_spread import day_deviations
 from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
@@ -151,6 +158,7 @@ def randomisation_of(
         fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
         check_fitted_integrator(fitted, simulator.integrator, where="posterior")
         rows = drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot)
+        _check_parameters(posterior.record, simulator, where="posterior")
         parts.append(_beside_held(_on_its_day(rows, posterior.record, simulator), posterior.record.attrs, simulator))
     elif posterior is not None:
         parts.append(_of_run(Path(posterior), simulator))
@@ -189,15 +197,37 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     folder = source if source.is_dir() else source.parent
     file = source if source.is_file() and not phi else folder / POSTERIOR
     found: Randomisation
+    record: PosteriorRecord | None
     if phi:
         found = read_phi(source, simulator.parameters, simulator.robot)
-        attributes = PosteriorRecord.load(file).attrs if file.is_file() else {}
+        record = PosteriorRecord.load(file) if file.is_file() else None
     else:
         rows, record = read_posterior(source, simulator.parameters, simulator.robot), PosteriorRecord.load(file)
-        found, attributes = _on_its_day(rows, record, simulator), record.attrs
+        found = _on_its_day(rows, record, simulator)
+    if record is not None:
+        _check_parameters(record, simulator, where=str(source))
+    attributes = {} if record is None else record.attrs
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
     return _beside_held(found, attributes, simulator)
+
+
+def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where: str) -> None:
+    """See that the simulator has what a posterior is of, laws and mechanisms of the user's own among it: noise is none,
+    nor what belongs to one recording, nor a cube that the task lacks.
+
+    Raises:
+        InputError: a parameter that the simulator lacks.
+    """
+    known = {spec.name for spec in simulator.parameters} | measured_parameters() | set(OBJECT)
+    of_all = [info.name for info in record.free if SEPARATOR not in info.name and not info.name.endswith(SPREAD)]
+    lacking = [name for name in of_all if name not in known]
+    if lacking:
+        raise InputError(
+            f"has {lacking[0]}, which the simulator lacks",
+            where=where,
+            remedy="use the experiment that was calibrated, with its laws and mechanisms, or calibrate without them",
+        )
 
 
 def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -> Randomisation:
