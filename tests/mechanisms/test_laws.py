@@ -12,6 +12,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary, gauges_of, motion_dictionary, own_dictionary
+from rfdropo_bayes.mechanisms.laws import unit_of
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.experiment import Experiment
@@ -235,6 +236,22 @@ def test_an_effect_on_commands_of_another_unit_is_measured_by_their_size(unit, s
     simulator = BlackBoxSimulator(replace(BOX, command_unit=unit, stroke=stroke))
     port = port_map(simulator, simulator.marker_names).named("cable pull")
     assert (port.size, port.unit) == (pytest.approx(size), unit)
+
+
+@pytest.mark.parametrize(
+    ("port", "command", "kind", "unit"),
+    [
+        ("rad", "rad", "product", "1/rad"),
+        ("m", "m", "rate", "s"),
+        ("-", "-", "command", "-"),
+        ("s", "-", "product", "s"),
+        ("N", "-", "rate", "N s"),
+        ("s", "N m", "product", "s/N2 m2"),
+    ],
+)
+def test_a_coefficient_has_the_unit_of_its_port_over_that_of_its_feature(port, command, kind, unit):
+    feature = Feature(kind, (0,) * KINDS[kind].channels)
+    assert unit_of(port, feature, command) == unit
 
 
 def test_what_a_law_cannot_be_is_said():
