@@ -233,16 +233,18 @@ def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where
 def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -> Randomisation:
     """A posterior's rows on the day it was adapted to, else each on a day that no fit has seen, as predictions are.
 
-    Policies meet neither the mean of the fitted days nor one of them, but the next day.
+    Policies meet neither the mean of the fitted days nor one of them, but the next day. The sum of a shared value and a
+    day's deviation ends at the hard bounds, as in the fit.
     """
     own = {name: each for name, each in day_deviations(record, simulator.parameters).items() if name in rows.names}
     if not own:
         return rows
     shifts = np.stack([own[name].shift if name in own else np.zeros(len(rows.rows)) for name in rows.names], axis=1)
-    moved = replace(rows, rows=rows.rows + shifts)
+    ends = {spec.name: (spec.low, spec.high) for spec in simulator.parameters if spec.name in own}
+    low, high = np.transpose([ends.get(name, (-np.inf, np.inf)) for name in rows.names])
+    moved = replace(rows, rows=np.clip(rows.rows + shifts, low, high))
     spreads = {name: each.spread for name, each in own.items() if each.spread.any()}
-    ends = {spec.name: (spec.low, spec.high) for spec in simulator.parameters if spec.name in spreads}
-    return Days(moved, spreads, ends) if spreads else moved
+    return Days(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
 
 
 def _beside_held(found: Randomisation, attributes: Mapping[str, Any], simulator: AnySimulator) -> Randomisation:
