@@ -141,8 +141,8 @@ def randomisation_of(
     A task without a cube has no use for what the experiment says of one.
 
     Raises:
-        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant; or one that
-            was fitted with another integrator.
+        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant; a fixed
+            value of a parameter that is randomised; or a posterior that was fitted with another integrator.
     """
     stated = table.randomisation if "randomisation" in table.model_fields_set else None
     if posterior is not None and stated not in (None, "posterior"):
@@ -164,6 +164,13 @@ def randomisation_of(
         parts.append(_of_run(Path(posterior), simulator))
     elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, spec.folder))
+    both = sorted(set(parts[0].names) & {name for part in parts[1:] for name in part.names})
+    if both:
+        raise InputError(
+            f"{both[0]} has a fixed value, and randomisation = {parts[-1].kind!r} gives it others",
+            where="[model.fixed]",
+            remedy="leave one of them out",
+        )
     kind = parts[-1].kind
     start = {name: ends for name, ends in table.start.items() if name not in absent}
     return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]

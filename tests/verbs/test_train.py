@@ -239,6 +239,18 @@ def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
             assert drawn == {"trunk_mass": 0.31, "poisson_ratio": 0.4}
 
 
+@pytest.mark.parametrize("given", ["posterior", "uniform"])
+def test_a_fixed_value_of_what_is_randomised_is_refused(given) -> None:
+    """It would be left out without a word: an evaluation of another stiffness would be one of the posterior's."""
+    modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
+    fit = Calibration(PosteriorRecord((modulus,), {"young_modulus": np.full((1, 3), 2e6)}), {}, "")
+    ranges = {"ranges": {"young_modulus": [1e6, 3e6]}} if given == "uniform" else {}
+    model = rb.Model("trunk_sofa", fixed={"young_modulus": 4e6})
+    table, _, simulator = training_of(with_training(model, {"task": "TrunkReach-v0", "randomisation": given, **ranges}))
+    with pytest.raises(InputError, match=f"young_modulus has a fixed value, and randomisation = '{given}'"):
+        randomisation_of(table, model.spec, simulator, fit if given == "posterior" else None)
+
+
 def test_a_posterior_whose_law_the_simulator_lacks_is_refused(tmp_path) -> None:
     """A law is no mechanism of the library, and its effect would be left out without a word."""
     term = {"coefficient": "creep", "feature": "low_pass", "commands": ["own"], "shape": 0.3, "scale": 0.1}
