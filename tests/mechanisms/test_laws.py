@@ -271,7 +271,7 @@ def test_what_a_law_cannot_be_is_said():
         with pytest.raises(InputError, match=match):
             build_robot_simulator(spec(wrong))
     body = build_robot_simulator(spec(law("stiffness")))
-    with pytest.raises(InputError, match="whole rollout"):
+    with pytest.raises(InputError, match="whole rollout.*laws at cables, and laws of time"):
         body.session(1, 0.1)
 
 
