@@ -87,7 +87,7 @@ def in_simulation(settings: Deployment, goals: np.ndarray, noise: float) -> np.n
         table.pop(name, None)
     simulator, values = true_simulator(Robot.load(settings.robot), experiment, table)
     layout = policy.layout
-    seen, step = observed_of(layout, simulator.robot), float(np.max(layout.moves))
+    seen, step = observed_of(layout, len(simulator.marker_names)), float(np.max(layout.moves))
     played = Settings(layout.kind, seen, period=layout.period_s, step=step, noise=noise)
     batch = Episodes(simulator, task_named(layout.task), len(goals), Point(values), played)
     batch.layout.require(layout, where="policy")

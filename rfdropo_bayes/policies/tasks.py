@@ -195,12 +195,12 @@ def layout_of(
     )
 
 
-def observed_of(layout: PolicyLayout, robot: Commanded) -> Observed:
-    """Which observation of a robot a layout has; see `layout_of`."""
+def observed_of(layout: PolicyLayout, markers: int) -> Observed:
+    """Which observation of a robot with so many markers a layout has; see `layout_of`."""
     sizes = {part.name: part.size for part in layout.observation}
     if "commands" not in sizes:
         return "paper"
-    return "full" if sizes["markers"] == 3 * len(robot.marker_names) else "markers"
+    return "full" if sizes["markers"] == 3 * markers else "markers"
 
 
 def parts_seen(
