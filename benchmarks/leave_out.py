@@ -36,7 +36,7 @@ import numpy as np
 import rfdropo_bayes as rb
 from rfdropo_bayes.data import RecordingEntry
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import append_line
+from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import load_data
@@ -168,7 +168,7 @@ def main() -> None:
         print(store(given.store))
         return
     ledger = given.out / "ledger.jsonl"
-    lines = [json.loads(line) for line in ledger.read_text().splitlines()] if ledger.exists() else []
+    lines = read_lines(ledger)
     known = {(line["experiment"], line["left_out"], line["seconds"]) for line in lines}
     given.out.mkdir(parents=True, exist_ok=True)
     for study in tomllib.loads(given.settings.read_text())["study"]:

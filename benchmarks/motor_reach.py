@@ -87,9 +87,8 @@ def in_simulation(settings: Deployment, goals: np.ndarray, noise: float) -> np.n
         table.pop(name, None)
     simulator, values = true_simulator(Robot.load(settings.robot), experiment, table)
     layout = policy.layout
-    played = Settings(
-        layout.kind, observed_of(layout), period=layout.period_s, step=float(np.max(layout.moves)), noise=noise
-    )
+    seen, step = observed_of(layout, len(simulator.marker_names)), float(np.max(layout.moves))
+    played = Settings(layout.kind, seen, period=layout.period_s, step=step, noise=noise)
     batch = Episodes(simulator, task_named(layout.task), len(goals), Point(values), played)
     batch.layout.require(layout, where="policy")
     cases = [Case(values, tuple(map(float, goal))) for goal in goals]

@@ -25,7 +25,7 @@ from mujoco_sysid import ARM, NOISE, PARAMETERS, STEP, TRUTH, changed
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.audit.verdict import DESCRIBED
-from rfdropo_bayes.files import append_line
+from rfdropo_bayes.files import append_line, read_lines
 
 REPEATS, OTHERS, UNTOUCHED = 3, 2, 3
 SECONDS, HOLD = 3.0, 0.2  # of a recording, and of one level of the torques [s]
@@ -199,7 +199,7 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     ledger = given.out / "ledger.jsonl"
-    lines = [json.loads(text) for text in ledger.read_text().splitlines()] if ledger.exists() else []
+    lines = read_lines(ledger)
     done = {(line["effect"], line["seed"]) for line in lines}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.xml"

@@ -30,7 +30,7 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import first_target
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.files import append_line
+from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, Hidden, Setting, hide
@@ -90,7 +90,7 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     ledger = given.out / "ledger.jsonl"
-    lines = [json.loads(line) for line in ledger.read_text().splitlines()] if ledger.exists() else []
+    lines = read_lines(ledger)
     kind = {"rho": given.rho, "seed": given.seed, "made": given.made, "noise": given.noise}
     known = {line["index"] for line in lines if all(line[key] == value for key, value in kind.items())}
     workshop: Workshop = {}

@@ -32,7 +32,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.audit.law_search import law_search
 from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.verdict import DESCRIBED
-from rfdropo_bayes.files import append_line
+from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.studies.audit_study import MESH
@@ -142,7 +142,7 @@ def main() -> None:
     ]
     given.out.mkdir(parents=True, exist_ok=True)
     ledger = given.out / "ledger.jsonl"
-    lines = [json.loads(line) for line in ledger.read_text().splitlines()] if ledger.exists() else []
+    lines = read_lines(ledger)
     known = {(*(line[key] for key in ("effect", "rho", "seed", "library")), line.get("body", ARM)) for line in lines}
     workshop: Workshop = {}
     for case in cases:

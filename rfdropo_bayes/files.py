@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rfdropo_bayes.errors import InputError
 
@@ -104,23 +104,41 @@ def write_json(path: Path, content: Any, *, finite: bool = False) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a text file, whose folder is made.
+    """Add a line to a file of JSON lines, whose folder is made; a last line that a kill has cut is taken away first.
 
     Raises:
         InputError: it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
+        with path.open("a+b") as file:
+            _end_last_line(file)
+            file.write(f"{line}\n".encode())
     except OSError as error:
         raise unwritten(error, path) from None
+
+
+def _end_last_line(file: BinaryIO) -> None:
+    """Take away the last line of a file of JSON lines where it was cut; end it where its newline alone is missing."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - 1, 0))
+    if file.read(1) in (b"", b"\n"):
+        return
+    file.seek(0)
+    content = file.read()
+    start = content.rfind(b"\n") + 1
+    try:
+        json.loads(content[start:])
+    except ValueError:
+        file.truncate(start)
+    else:
+        file.write(b"\n")
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """The JSON object of each line of a file, up to the first one that a kill has cut; nothing without a file."""
     found = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
             found.append(json.loads(line))
         except ValueError:

@@ -14,10 +14,11 @@ from rfdropo_bayes.data.trajectory import Trajectory
 def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
     """Indices of recordings with identical commands, group by group, in order of first appearance.
 
-    Recordings on different robots, or under conditions that the recording itself says differ (the payload hung at the
-    tip), are not repeats. Times are not compared: repeats are sampled with the jitter of their own clocks.
+    Recordings on different robots, under conditions that the recording itself says differ (the payload hung at the
+    tip), or of the same commands at another speed are not repeats. Times are not compared otherwise: repeats are
+    sampled with the jitter of their own clocks.
     """
-    groups: dict[tuple[object, ...], list[int]] = {}
+    groups: dict[tuple[object, ...], list[list[int]]] = {}
     for index, trajectory in enumerate(trajectories):
         command = np.concatenate([trajectory.initial_command[None], trajectory.command])
         key = (
@@ -28,28 +29,53 @@ def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
             command.shape,
             np.round(command, 9).tobytes(),
         )
-        groups.setdefault(key, []).append(index)
-    return list(groups.values())
+        alike, own = groups.setdefault(key, []), _span(trajectory)
+        group = next((each for each in alike if _of_one_rate(own, _span(trajectories[each[0]]))), None)
+        if group is None:
+            alike.append([index])
+        else:
+            group.append(index)
+    return sorted(group for alike in groups.values() for group in alike)
+
+
+def _span(trajectory: Trajectory) -> float:
+    """Time from the first command to the last [s]."""
+    return float(np.ptp(trajectory.command_time))
+
+
+def _of_one_rate(one: float, other: float) -> bool:
+    """Whether two times are equal but for the jitter of clocks; no time is that of a single command."""
+    return one == other or (min(one, other) > 0.0 and max(one, other) < ONE_RATE * min(one, other))
 
 
 FIRST_OPENING = 4  # commands
 
 
 def command_openings(trajectory: Trajectory) -> dict[str, str]:
-    """Hashes of the first 4, 8, 16 ... commands of a recording, and of all, by their number."""
+    """Hashes of the first 4, 8, 16 ... commands of a recording, and of all, by their number; each with the time that
+    they take [s]."""
     command = np.round(np.concatenate([trajectory.initial_command[None], trajectory.command]), 9)
+    given = np.concatenate([trajectory.command_time[:1], trajectory.command_time])
     counts = {len(command)}
     count = FIRST_OPENING
     while count < len(command):
         counts.add(count)
         count *= 2
-    return {str(n): hashlib.sha256(command[:n].tobytes()).hexdigest()[:16] for n in sorted(counts)}
+    return {
+        str(n): f"{hashlib.sha256(command[:n].tobytes()).hexdigest()[:16]} {float(np.ptp(given[:n])):.6g}"
+        for n in sorted(counts)
+    }
 
 
 def same_opening(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
-    """Whether two recordings have the same commands, as far as both can be compared (`command_openings`)."""
+    """Whether two recordings have the same commands at the same speed, as far as both can be compared
+    (`command_openings`); what earlier versions kept says nothing of the speed."""
     shared = set(one) & set(other)
-    return bool(shared) and one[max(shared, key=int)] == other[max(shared, key=int)]
+    if not shared:
+        return False
+    count = max(shared, key=int)
+    (begun, *took), (theirs, *their) = one[count].split(), other[count].split()
+    return begun == theirs and all(_of_one_rate(float(a), float(b)) for a, b in zip(took, their, strict=False))
 
 
 def _variances(repeats: Sequence[Trajectory]) -> dict[str, float]:
@@ -75,34 +101,27 @@ def _variances(repeats: Sequence[Trajectory]) -> dict[str, float]:
 def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
     """Unbiased noise per marker [m], pooled over every group of repeats; None if nothing was repeated.
 
-    Recordings of the same commands at another speed, or in rows of another rate, are not compared. The first row of a
-    group counts like any other: rest poses that differ from repeat to repeat are part of the floor.
+    Repeats in rows of another rate are not compared. The first row of a group counts like any other: rest poses that
+    differ from repeat to repeat are part of the floor.
     """
     total: dict[str, float] = {}
     freedom: dict[str, int] = {}
     for found in group_repeats(trajectories):
-        for group in _of_one_pace([trajectories[index] for index in found]):
+        for group in _in_rows_alike([trajectories[index] for index in found]):
             for marker, variance in (_variances(group) if len(group) > 1 else {}).items():
                 total[marker] = total.get(marker, 0.0) + (len(group) - 1) * variance
                 freedom[marker] = freedom.get(marker, 0) + len(group) - 1
     return {marker: float(np.sqrt(total[marker] / freedom[marker])) for marker in total} or None
 
 
-def _of_one_pace(repeats: Sequence[Trajectory]) -> list[list[Trajectory]]:
-    """Recordings of the same commands, divided where commands or rows follow one another faster than in others."""
+def _in_rows_alike(repeats: Sequence[Trajectory]) -> list[list[Trajectory]]:
+    """Repeats, divided where rows follow one another faster than in others."""
     groups: list[list[Trajectory]] = []
     for repeat in repeats:
-        own = _pace(repeat)
-        alike = (group for group in groups if np.all(np.abs(np.log(own / _pace(group[0]))) < np.log(ONE_RATE)))
-        group = next(alike, None)
+        own = sample_time(repeat.time)
+        group = next((each for each in groups if _of_one_rate(own, sample_time(each[0].time))), None)
         if group is None:
             groups.append([repeat])
         else:
             group.append(repeat)
     return groups
-
-
-def _pace(repeat: Trajectory) -> np.ndarray:
-    """Time between rows, and from the first command to the last [s]; one where there is no second command."""
-    span = float(np.ptp(repeat.command_time))
-    return np.array([sample_time(repeat.time), span if span > 0.0 else 1.0])

@@ -8,6 +8,7 @@ if the program is killed, some hundredths of a second are lost, and if the machi
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import threading
@@ -24,6 +25,7 @@ from jaxtyping import Bool, Float, Shaped
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.deployment.bus import FrameLog
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import unwritten
 from rfdropo_bayes.robots import Robot
 
 JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
@@ -93,7 +95,11 @@ class SessionLog:
         }
         text = json.dumps(header).encode()
         size = _HEADER * (1 + len(text) // _HEADER)
-        os.write(self._journal, str(size).encode().rjust(8) + text.ljust(size - 8))
+        self._whole = 0  # bytes of the journal that are whole records
+        try:
+            self._append(str(size).encode().rjust(8) + text.ljust(size - 8))
+        except OSError as error:
+            raise unwritten(error, self.folder) from None
         self.record = np.zeros((), record_type(len(robot.channel_names), len(robot.marker_names)))
         self.frames = FrameLog(self.folder / frames)
         self._records: deque[bytes] = deque()
@@ -116,32 +122,59 @@ class SessionLog:
         self._lines.append(json.dumps(line) + "\n")
 
     def close(self) -> None:
-        """End the journal."""
+        """End the journal.
+
+        Raises:
+            InputError: if a disk without room has not taken all of it.
+        """
         self._closed.set()
         for thread in self._threads:
             thread.join()
         self.flush()
         self._sync()
-        self.frames.stop()
         os.close(self._journal)
-        self._events.close()
+        try:
+            self.frames.stop()
+            self._events.close()
+        except OSError as error:
+            raise unwritten(error, self.folder) from None
+        if self._records:
+            lost = f"its last {len(self._records)} cycles could not be written"
+            raise InputError(lost, where=str(self.folder / JOURNAL), remedy="make room on the disk")
 
     def _repeat(self, what: Callable[[], None], period: float) -> None:
         while not self._closed.wait(period):
             what()
 
     def flush(self) -> None:
-        """Hand everything to the operating system; not for the thread that writes."""
-        with self._writing:
+        """Hand everything to the operating system; not for the thread that writes. What a full disk does not take waits
+        for the next time: a robot in motion must not stop for it."""
+        with self._writing, contextlib.suppress(OSError):
             while self._records:
-                os.write(self._journal, self._records.popleft())
+                self._append(self._records[0])
+                self._records.popleft()
             while self._lines:
                 self._events.write(self._lines.popleft())
             self._events.flush()
             self.frames.flush()
 
+    def _append(self, record: bytes) -> None:
+        """Add bytes to the journal, all or none: behind a part of a record nothing could be read.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        try:
+            if os.write(self._journal, record) < len(record):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            os.ftruncate(self._journal, self._whole)
+            os.lseek(self._journal, self._whole, os.SEEK_SET)
+            raise
+        self._whole += len(record)
+
     def _sync(self) -> None:
-        with contextlib.suppress(OSError):  # a full disk must not stop a robot in motion; the next write says it
+        with contextlib.suppress(OSError):  # a full disk must not stop a robot in motion; the end of the log says it
             os.fsync(self._journal)
             os.fsync(self._events.fileno())
 

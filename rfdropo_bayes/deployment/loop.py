@@ -93,6 +93,7 @@ class ControlLoop:
         self._clock: CycleClock
         self._wanted = DriveState.SWITCH_ON_DISABLED
         self._expected: DriveState | None = None
+        self._pulling = False  # whether a tension above its limit is known, and comes to rest
         self.pulse: float | None = None
         self.demanded: Stop | None = None  # by another thread
         self.lateness: list[float] = []
@@ -135,7 +136,7 @@ class ControlLoop:
             if phase is not Phase.BRAKED:
                 if self.demanded is not None:  # what follows from a stop by another thread is not its cause
                     raise self.demanded
-                self.watch.check(tick, self._expected)
+                self.watch.check(tick, self._expected, tension=not self._pulling)
         finally:
             self._write(tick, phase, acted)
         return tick
@@ -305,6 +306,7 @@ class ControlLoop:
             self._brake(began)
             return stop
         if stop.cause.reaction is Reaction.RAMP:
+            self._pulling = stop.cause is Cause.TENSION
             try:
                 acted = True
                 while not self.set_points.at_rest:

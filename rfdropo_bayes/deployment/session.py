@@ -34,6 +34,7 @@ from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, Simulated
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.robots import Motor, Robot
 
 
@@ -341,7 +342,7 @@ class _Session:
             | {name: metadata.version(name) for name in names},
             "schema_version": SCHEMA_VERSION,
         }
-        (self.out / SUMMARY).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_text(self.out / SUMMARY, json.dumps(content, indent=2) + "\n")
 
 
 def _figures(loop: ControlLoop, period: float) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from scipy.stats import chisquare
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import append_line, read_lines
+from rfdropo_bayes.files import append_line, read_lines, write_text
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.progress import Progress, run_digest
 from rfdropo_bayes.posteriors import central_interval
@@ -145,7 +145,7 @@ def _known(log: Path | None, digest: str, resume: bool) -> list[dict[str, Any]]:
     rows = read_lines(log) if resume else []
     if any(row["digest"] != digest for row in rows):
         raise InputError("belongs to another check", where=str(log), remedy="start without --resume")
-    log.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+    write_text(log, "".join(json.dumps(row) + "\n" for row in rows))
     return [{name: value for name, value in row.items() if name != "digest"} for row in rows]
 
 

@@ -59,6 +59,7 @@ def unit_of(port_unit: str, feature: Feature, command_unit: str) -> str:
     powers: dict[str, int] = {} if port_unit == "-" else {port_unit: 1}
     for name, power in feature.unit(command_unit):
         powers[name] = powers.get(name, 0) - power
+    powers.pop("-", None)  # commands without a unit
     above = [_raised(name, power) for name, power in powers.items() if power > 0]
     below = [_raised(name, -power) for name, power in powers.items() if power < 0]
     if not above and not below:
@@ -67,7 +68,7 @@ def unit_of(port_unit: str, feature: Feature, command_unit: str) -> str:
 
 
 def _raised(name: str, power: int) -> str:
-    return name if power == 1 else f"{name}{power}"
+    return name if power == 1 else " ".join(f"{part}{power}" for part in name.split())
 
 
 class Law:

@@ -159,6 +159,12 @@ def measurement_specs(noise: str, channels: DataChannels) -> tuple[ParameterSpec
     return (*own, *(s for s in further if noise != REPEATS or s == TENSION_GAIN))
 
 
+def measured_parameters() -> set[str]:
+    """Names of all parameters that some channel or some noise may have."""
+    noise = (spec.name for model in NOISE_MODELS for spec in noise_specs(model))
+    return {*noise, *(spec.name for found in SWITCHED.values() for spec in found)}
+
+
 def model_specs(spec: ModelSpec, simulator: AnySimulator) -> tuple[ParameterSpec, ...]:
     """Every parameter of a model: of the simulator, and of the channels that are data."""
     return simulator.parameters + measurement_specs(spec.noise, spec.channels)

@@ -103,25 +103,23 @@ def _robot_file(robot: str, folder: Path) -> Path:
     return beside if beside.is_file() else Path(robot)
 
 
-def self_contained(tables: Mapping[str, Any], folder: Path, out: Path | None = None) -> dict[str, Any]:
+def self_contained(
+    tables: Mapping[str, Any], folder: Path, out: Path | None = None, made: Container[str] = ()
+) -> dict[str, Any]:
     """The tables such that they mean the same in another folder.
 
     Args:
         tables: of an experiment.
         folder: that of the experiment file.
         out: folder that gets copies of the robot's file and of mechanisms' code; without one, their paths are given.
+        made: names of files that a program has made: no file of such a name that lies about is meant.
 
     Raises:
         InputError: a file cannot be copied.
     """
     placed = copy.deepcopy(dict(tables))
-    robot = _robot_file(str(placed.get("robot", "")), folder)
-    if robot.suffix == ".toml" and robot.is_file():
-        placed["robot"] = _brought(robot, out, ROBOT_COPY)
-    elif robot.suffix in MODEL_FILES and robot.is_file():  # which may name meshes beside it: it stays where it is
-        placed["robot"] = str(robot.resolve())
-    elif ".py:" in str(placed.get("robot", "")):
-        placed["robot"] = code_placed(str(placed["robot"]), folder, out)
+    if "robot" in placed and placed["robot"] not in made:
+        placed["robot"] = _robot_placed(str(placed["robot"]), folder, out)
     for table, key in (("model", "mechanisms"), ("audit", "candidates"), ("separation", "mechanisms")):
         if key in placed.get(table, {}):
             placed[table][key] = [code_placed(name, folder, out) for name in placed[table][key]]
@@ -132,6 +130,16 @@ def self_contained(tables: Mapping[str, Any], folder: Path, out: Path | None = N
         if role in placed.get("data", {}):
             placed["data"][role] = [_placed(entry, folder) for entry in placed["data"][role]]
     return placed
+
+
+def _robot_placed(robot: str, folder: Path, out: Path | None) -> str:
+    """A robot such that it is found from another folder, too; names of robots that come with the package stay."""
+    file = _robot_file(robot, folder)
+    if file.suffix == ".toml" and file.is_file():
+        return _brought(file, out, ROBOT_COPY)
+    if file.suffix in MODEL_FILES and file.is_file():  # which may name meshes beside it: it stays where it is
+        return str(file.resolve())
+    return code_placed(robot, folder, out) if ".py:" in robot else robot
 
 
 def _placed(entry: Any, folder: Path) -> Any:

@@ -9,14 +9,16 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from rfdropo_bayes import __version__
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import output_folder, unwritten, write_text
 from rfdropo_bayes.interrupts import interrupted, running
-from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe, self_contained
+from rfdropo_bayes.model.experiment_file import FILE_KEYS, ROBOT_COPY, describe, self_contained
 
 RUN, CONFIG, LOG, CHECKPOINTS, PAGE = "run.json", "config.toml", "log.jsonl", "checkpoints", "report.html"
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
@@ -31,6 +33,7 @@ FREE_TO_CHANGE = (
 )
 
 
+MOVABLE = ("experiment.data.fit", "experiment.data.test")
 # What runs of earlier versions meant where their settings say nothing.
 MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
 
@@ -101,18 +104,14 @@ def run_folder(
         earlier = _read(out / RUN)
         settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
         check_folder(out, command, resume=resume, overwrite=overwrite)
-        for name, text in (texts or {}).items():
-            write_text(out / name, text)
-        if tables is not None:
-            contained = self_contained(tables, folder, out)
-            settings["experiment"] = contained
-            settings["robot"] = _digest(out / ROBOT_COPY)
         if resume and earlier is not None:
-            _check_settings(out, earlier["settings"], settings)
+            with TemporaryDirectory() as trial:  # a run that does not go on keeps what it was made of
+                _check_settings(out, earlier["settings"], settings | _brought_along(tables, folder, texts, Path(trial)))
+        settings |= _brought_along(tables, folder, texts, out)
         if not resume:
             _clear(out, COMMANDS[command].results)
         if tables is not None:
-            write_text(out / CONFIG, describe(contained))
+            write_text(out / CONFIG, describe(settings["experiment"]))
         record = {"schema_version": SCHEMA_VERSION, "command": command, "version": __version__, "settings": settings}
         _write(out, record, RUNNING)
         try:
@@ -154,6 +153,18 @@ def _held(out: Path, *, shared: bool) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def _brought_along(
+    tables: Mapping[str, Any] | None, folder: Path, texts: Mapping[str, str] | None, out: Path
+) -> dict[str, Any]:
+    """The experiment as it is found from any folder, and the digest of its robot; ``out`` gets what it names."""
+    made = dict(texts or {})
+    for name, text in made.items():
+        write_text(out / name, text)
+    if tables is None:
+        return {}
+    return {"experiment": self_contained(tables, folder, out, made), "robot": _digest(out / ROBOT_COPY)}
 
 
 def hashes(recordings: Iterable[Any]) -> dict[str, str]:
@@ -244,8 +255,13 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
 
 
 def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise InputError where the run began with other settings; names the first few."""
+    """Raise InputError where the run began with other settings; names the first few. Recordings of the same content may
+    have been moved."""
     old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now, default=str))))
+    if before.get("data") and before["data"] == now["data"]:
+        for tables, name in product((old, new), MOVABLE):
+            if name in tables:
+                tables[name] = [_without_folders(entry) for entry in tables[name]]
     old = {name: value for name, value in MEANT_EARLIER.items() if name in new} | old
     differing = [name for name in {**old, **new} if name not in FREE_TO_CHANGE and old.get(name) != new.get(name)]
     if not differing:
@@ -261,6 +277,13 @@ def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]
         where=str(out),
         remedy="resume with the settings it began with, or start anew with --overwrite",
     )
+
+
+def _without_folders(entry: Any) -> Any:
+    """A recording's entry with the names of its files alone."""
+    if isinstance(entry, dict):
+        return {key: _without_folders(value) if key in FILE_KEYS else value for key, value in entry.items()}
+    return Path(str(entry)).name
 
 
 def _flat(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

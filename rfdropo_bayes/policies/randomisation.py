@@ -167,13 +167,12 @@ class Days:
         return _digest([self.draws.sha256, {name: column.tolist() for name, column in self.spreads.items()}])
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
-        """One row, and a day's deviations from it: normal, of the row's own spread, cut off at the hard bounds."""
+        """One row, and a day's deviations from it: normal, of the row's own spread; sums end at the hard bounds, as in
+        fits and predictions."""
         index = int(rng.integers(len(self.draws.rows)))
         found = dict(zip(self.names, map(float, self.draws.rows[index]), strict=True))
         for name, column in self.spreads.items():
-            mean, std = found[name], max(float(column[index]), 1e-300)
-            low, high = ((end - mean) / std for end in self.ends[name])
-            found[name] = float(truncnorm.rvs(low, high, loc=mean, scale=std, random_state=rng))
+            found[name] = float(np.clip(rng.normal(found[name], float(column[index])), *self.ends[name]))
         return found
 
 

@@ -211,12 +211,12 @@ def layout_of(
     )
 
 
-def observed_of(layout: PolicyLayout) -> Observed:
-    """Which observation a layout has; see `layout_of`."""
+def observed_of(layout: PolicyLayout, markers: int) -> Observed:
+    """Which observation of a robot with so many markers a layout has; see `layout_of`."""
     sizes = {part.name: part.size for part in layout.observation}
     if "commands" not in sizes:
         return "paper"
-    return "markers" if sizes["markers"] == 3 * len(TRACKED_HEIGHTS) else "full"
+    return "full" if sizes["markers"] == 3 * markers else "markers"
 
 
 def shown_of(layout: PolicyLayout, robot: Commanded) -> list[int]:

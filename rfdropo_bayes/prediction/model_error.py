@@ -153,6 +153,6 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     found, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
     if found.memory or not fitted or record.attrs.get(ADAPTED_TO):
         return found
-    # An earlier version did not say how long errors last.
-    step = sample_time(*(p.time for p in fitted))
+    # An earlier version did not say how long errors last. Of several rates one is taken, not what lies between them.
+    step = sample_time(max(fitted, key=lambda p: len(p.time)).time)
     return found._replace(step=step, memory=error_memory(fitted, step))

@@ -128,6 +128,16 @@ def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float |
     return 1e3 * float(distance[time <= last][-1]) if (time <= last).any() else None
 
 
+def _held_back(recording: Trajectory) -> float:
+    """Share of the actions whose command in force is another than the command that was asked for. What drives are told
+    while they come to rest, or are homed, nobody has asked for."""
+    phase, asked = recording.dataset["phase"].to_numpy(), recording.dataset["asked_command"].to_numpy()
+    row = np.minimum(np.searchsorted(recording.time, recording.command_time), len(phase) - 1)
+    acting = phase[row] == phase[0]
+    apart = np.any(np.abs(asked - recording.command) > CLIPPED, axis=1)
+    return float(np.mean(apart[acting])) if acting.any() else 0.0
+
+
 def session_steps(session: MotorSession) -> list[str]:
     """What to do next, each a sentence with its ground."""
     summary, recording, found = session.summary, session.recording, []
@@ -141,10 +151,10 @@ def session_steps(session: MotorSession) -> list[str]:
         found.append(f"{', '.join(lacking)} lack guards: --mode check says which, and what that costs.")
     if recording is None:
         return found or ["Nothing was recorded: go on with --mode home, shadow or run."]
-    asked = recording.dataset["asked_command"].to_numpy()
-    clipped = float(np.mean(np.any(np.abs(asked - recording.command) > CLIPPED, axis=1)))
+    clipped = _held_back(recording)
     if clipped:
-        found.append(f"A limit on length held back {100 * clipped:.0f} % of the actions: see the commands below.")
+        words = f"A limit on length or rate held back {100 * clipped:.0f} % of the actions"
+        found.append(f"{words}: see the commands below.")
     if cause == PLANNED and summary["facts"].get("simulated"):
         found.append("The drives were simulated. On a robot, begin with --mode check, home and shadow.")
     found.append(

@@ -240,7 +240,7 @@ class Session:
                 raise InputError(
                     f"{mechanism.name} needs a whole rollout: it acts on the body, or on the markers by the commands",
                     where="a session",
-                    remedy="train without it; laws at cables, delays, and laws of time on what is measured do step",
+                    remedy="train without it; laws at cables, and laws of time on what is measured, do step",
                 )
             remembers = isinstance(mechanism, ActuationMechanism | TimedSensingMechanism)
             if remembers and not isinstance(mechanism, SteppedMechanism):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import append_line, read_lines
+from rfdropo_bayes.files import append_line, read_lines, write_text
 from rfdropo_bayes.inference.progress import Progress
 
 LOCAL = "local"
@@ -42,7 +42,7 @@ def run_fits(
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     known = _read(log) if resume else {}
-    log.write_text("".join(_line(job, result) + "\n" for job, result in known.values()), encoding="utf-8")
+    write_text(log, "".join(_line(job, result) + "\n" for job, result in known.values()))
     left = [job for job in jobs if _name(job) not in known]
     for count, (job, result) in enumerate(_results(left, fit, cluster)):
         append_line(log, _line(job, result))

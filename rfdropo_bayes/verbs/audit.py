@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -153,7 +153,7 @@ def _audited(answer: Answer, model: Model, tables: Mapping[str, Any], data_sha25
     content = record(answer, versions=versions, data_sha256=data_sha256, next_experiment=following)
     seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
     page = render_audit(seen, content, model.title, describe(tables), shape)
-    extended = extended_tables(dict(tables), answer, model.folder, out)
+    extended = extended_tables(dict(tables), answer, model.folder, out, model.texts())
     made = None if model.spec.named else model.robot
     left = residual_dataset(answer) if answer.fitted else None
     return Audit(content, extended, page, made, out or model.folder, out, seen, answer, left)
@@ -439,12 +439,15 @@ def start_values(base: Calibration | Path | None) -> dict[str, float] | None:
     return {name: float(row["mean"]) for name, row in content["parameters"].items()}
 
 
-def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: Path | None = None) -> dict[str, Any]:
+def extended_tables(
+    tables: dict[str, Any], answer: Answer, folder: Path, out: Path | None = None, made: Container[str] = ()
+) -> dict[str, Any]:
     """The experiment file with the mechanisms that the model adopts, for ``rfdropo calibrate``.
 
-    ``out`` is the folder that it is written to, which gets copies of the user's own files.
+    ``out`` is the folder that it is written to, which gets copies of the user's own files; for ``made`` see
+    `self_contained`.
     """
-    extended = self_contained(tables, folder, out)
+    extended = self_contained(tables, folder, out, made)
     model = extended.setdefault("model", {})
     simulator = extended.setdefault("simulator", {})
     for step in answer.adopted:

@@ -140,7 +140,7 @@ def _episodes_for(
     """Lanes that show a policy what it was trained to see."""
     settings = Settings(
         actions=layout.kind,
-        observed=observed_of(layout),
+        observed=observed_of(layout, len(simulator.marker_names)),
         period=table.period,
         step=np.max(layout.moves, axis=0).tolist(),
         noise=table.noise,

@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.model.assembly import AnySimulator, build_robot_simulator, build_simulator, physical_values
+from rfdropo_bayes.model.assembly import (
+    AnySimulator,
+    build_robot_simulator,
+    build_simulator,
+    measured_parameters,
+    physical_values,
+)
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
@@ -30,7 +37,7 @@ from rfdropo_bayes.policies.randomisation import (
 from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
-from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord
 from rfdropo_bayes.prediction.day_spread import day_deviations
 from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
@@ -137,8 +144,8 @@ def randomisation_of(
     A task without a cube has no use for what the experiment says of one.
 
     Raises:
-        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant; or one that
-            was fitted with another integrator.
+        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant; a fixed
+            value of a parameter that is randomised; or a posterior that was fitted with another integrator.
     """
     stated = table.randomisation if "randomisation" in table.model_fields_set else None
     if posterior is not None and stated not in (None, "posterior"):
@@ -154,11 +161,19 @@ def randomisation_of(
         fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
         check_fitted_integrator(fitted, simulator.integrator, where="posterior")
         rows = drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot)
+        _check_parameters(posterior.record, simulator, where="posterior")
         parts.append(_beside_held(_on_its_day(rows, posterior.record, simulator), posterior.record.attrs, simulator))
     elif posterior is not None:
         parts.append(_of_run(Path(posterior), simulator))
     elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, spec.folder))
+    both = sorted(set(parts[0].names) & {name for part in parts[1:] for name in part.names})
+    if both:
+        raise InputError(
+            f"{both[0]} has a fixed value, and randomisation = {parts[-1].kind!r} gives it others",
+            where="[model.fixed]",
+            remedy="leave one of them out",
+        )
     if table.width != 1.0:
         parts[-1] = spread_out(parts[-1], table.width, simulator.parameters)
     kind = parts[-1].kind
@@ -194,30 +209,54 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     folder = source if source.is_dir() else source.parent
     file = source if source.is_file() and not phi else folder / POSTERIOR
     found: Randomisation
+    record: PosteriorRecord | None
     if phi:
         found = read_phi(source, simulator.parameters, simulator.robot)
-        attributes = PosteriorRecord.load(file).attrs if file.is_file() else {}
+        record = PosteriorRecord.load(file) if file.is_file() else None
     else:
         rows, record = read_posterior(source, simulator.parameters, simulator.robot), PosteriorRecord.load(file)
-        found, attributes = _on_its_day(rows, record, simulator), record.attrs
+        found = _on_its_day(rows, record, simulator)
+    if record is not None:
+        _check_parameters(record, simulator, where=str(source))
+    attributes = {} if record is None else record.attrs
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
     return _beside_held(found, attributes, simulator)
 
 
+def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where: str) -> None:
+    """See that the simulator has what a posterior is of, laws and mechanisms of the user's own among it: noise is none,
+    nor what belongs to one recording, nor a cube that the task lacks.
+
+    Raises:
+        InputError: a parameter that the simulator lacks.
+    """
+    known = {spec.name for spec in simulator.parameters} | measured_parameters() | set(OBJECT)
+    of_all = [info.name for info in record.free if SEPARATOR not in info.name and not info.name.endswith(SPREAD)]
+    lacking = [name for name in of_all if name not in known]
+    if lacking:
+        raise InputError(
+            f"has {lacking[0]}, which the simulator lacks",
+            where=where,
+            remedy="use the experiment that was calibrated, with its laws and mechanisms, or calibrate without them",
+        )
+
+
 def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -> Randomisation:
     """A posterior's rows on the day it was adapted to, else each on a day that no fit has seen, as predictions are.
 
-    Policies meet neither the mean of the fitted days nor one of them, but the next day.
+    Policies meet neither the mean of the fitted days nor one of them, but the next day. The sum of a shared value and a
+    day's deviation ends at the hard bounds, as in the fit.
     """
     own = {name: each for name, each in day_deviations(record, simulator.parameters).items() if name in rows.names}
     if not own:
         return rows
     shifts = np.stack([own[name].shift if name in own else np.zeros(len(rows.rows)) for name in rows.names], axis=1)
-    moved = replace(rows, rows=rows.rows + shifts)
+    ends = {spec.name: (spec.low, spec.high) for spec in simulator.parameters if spec.name in own}
+    low, high = np.transpose([ends.get(name, (-np.inf, np.inf)) for name in rows.names])
+    moved = replace(rows, rows=np.clip(rows.rows + shifts, low, high))
     spreads = {name: each.spread for name, each in own.items() if each.spread.any()}
-    ends = {spec.name: (spec.low, spec.high) for spec in simulator.parameters if spec.name in spreads}
-    return Days(moved, spreads, ends) if spreads else moved
+    return Days(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
 
 
 def _beside_held(found: Randomisation, attributes: Mapping[str, Any], simulator: AnySimulator) -> Randomisation:

@@ -116,7 +116,7 @@ class SimulatedTrunk:
     ) -> None:
         self._session, self._values, self._period = Session(simulator, 1, period), values, period
         self._noise, self._random = marker_noise, np.random.default_rng(seed)
-        self._gain = np.array(robot.channels.gain)
+        self._matrix = np.asarray(simulator.robot.channel_matrix(values), dtype=float)
         radius = np.array([motor.drum_radius_m for motor in robot.motors])
         self._scale = radius if robot.command_unit == "rad" else np.ones(len(robot.motors))  # command unit -> m
         self._waiting, self._length, self._begun = 0.0, np.zeros(len(robot.motors)), False
@@ -159,7 +159,7 @@ class SimulatedTrunk:
         self._found = found
 
     def _seen(self) -> PlantState:
-        # By virtual work: a drum holds what its cables pull, each times its gain.
-        tension = self._gain.T @ np.asarray(self._found.tension, dtype=float)[0] / self._scale
+        # By virtual work: a drum holds what its cables pull, each times its way per command, at the drum's radius.
+        tension = self._matrix.T @ np.asarray(self._found.tension, dtype=float)[0] / self._scale
         position = np.asarray(self._found.position, dtype=float)[0]
         return PlantState(tension, position + self._noise * self._random.standard_normal(position.shape))

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import group_repeats, noise_floor, read_asl_csv, read_optitrack_csv
+from rfdropo_bayes.data import (
+    command_openings,
+    group_repeats,
+    noise_floor,
+    read_asl_csv,
+    read_optitrack_csv,
+    same_opening,
+)
 
 
 def test_identical_commands_are_repeats(build):
@@ -46,11 +53,22 @@ def test_recordings_at_another_speed_or_rate_are_no_noise(build, stretched):
     sent = {"command": build(rows=20).command, "command_time": 0.1 * np.arange(19), "time": 0.1 * np.arange(20)}
     first = build(rows=20, **sent)
     other = build(rows=20, position=first.position + 0.02, **sent | {stretched: 2.0 * sent[stretched]})
-    assert group_repeats([first, other]) == [[0, 1]]
+    assert group_repeats([first, other]) == ([[0, 1]] if stretched == "time" else [[0], [1]])
     assert noise_floor([first, other]) is None
     floor = noise_floor([first, other, build(rows=20, **sent)])
     assert floor is not None
     assert max(floor.values()) < 1e-12
+
+
+def test_an_opening_at_another_speed_is_another_one(build):
+    """Clocks jitter, and what earlier versions kept says nothing of the speed."""
+    sent = {"command": build(rows=20).command, "time": 0.1 * np.arange(20)}
+    first, slow, late = (
+        command_openings(build(rows=20, **sent, command_time=step * np.arange(19))) for step in (0.1, 0.2, 0.101)
+    )
+    assert same_opening(first, late)
+    assert not same_opening(first, slow)
+    assert same_opening({count: opening.split()[0] for count, opening in slow.items()}, first)
 
 
 def test_masked_rows_do_not_count(build):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -107,6 +108,26 @@ def test_a_killed_writer_loses_less_than_a_second(tmp_path: Path) -> None:
     instants = read_journal(folder)[1]["time"]
     assert len(instants) > 200
     np.testing.assert_array_equal(instants, np.arange(len(instants)))
+
+
+@pytest.mark.parametrize("room", [True, False])
+def test_a_disk_without_room_for_a_while_costs_no_cycle(robot: Robot, tmp_path: Path, room: bool) -> None:
+    """It takes ten records and a half; the log goes on when there is room again, or says at its end what is missing."""
+    log = SessionLog(tmp_path / "s", robot, {})
+    limits, journal = resource.getrlimit(resource.RLIMIT_FSIZE), tmp_path / "s" / JOURNAL
+    most = journal.stat().st_size + 10 * log.record.dtype.itemsize + log.record.dtype.itemsize // 2
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+    try:
+        write(log, robot)
+        time.sleep(0.1)
+        if not room:
+            with pytest.raises(InputError, match="its last 20 cycles could not be written"):
+                log.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    if room:
+        log.close()
+    np.testing.assert_allclose(read_journal(tmp_path / "s")[1]["time"], 0.01 * np.arange(30 if room else 10))
 
 
 def test_a_folder_is_used_once(robot: Robot, tmp_path: Path) -> None:

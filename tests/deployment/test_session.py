@@ -113,6 +113,17 @@ def test_increments_follow_the_policy(dry_run, robot: Robot) -> None:
     np.testing.assert_allclose(rows["command"], rows["asked"], atol=1e-6)  # nothing was near a limit
 
 
+def test_a_tension_above_its_limit_is_brought_to_rest_slowly_and_held(dry_run, tmp_path: Path) -> None:
+    """It does not fall while the set-points slow down, and is no second cause, which would brake."""
+    stiff = SimulationSettings(settings={"stiffness": 8000.0, "pretension": 3.0})
+    outcome = deploy(dry_run[1].model_copy(update={"simulation": stiff}), "dry-run", tmp_path / "s")
+    assert outcome.cause is Cause.TENSION, outcome.detail
+    assert "while stopping" not in (tmp_path / "s" / "log.jsonl").read_text()
+    rows = read_journal(tmp_path / "s")[1]
+    assert np.count_nonzero(rows["phase"] == Phase.HOLDING) > 10
+    assert rows["tension"][rows["phase"] == Phase.HOLDING].max() > 25.0
+
+
 def test_a_session_is_recovered_from_its_journal(dry_run) -> None:
     folder, _ = dry_run
     phases = (Phase.RUNNING, Phase.STOPPING, Phase.HOLDING, Phase.BRAKED)

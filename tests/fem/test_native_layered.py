@@ -12,6 +12,7 @@ import pytest
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.native.layered_engine import NativeLayered
+from rfdropo_bayes.fem.native.layered_session import LayeredSession
 
 TIME_STEP = 0.01
 STEPS = 25
@@ -66,6 +67,9 @@ def random_displacements(system: fem.System, batch: int, seed: int, scale: float
     """Pulling and slackening at random, (batch, STEPS, cables)."""
     moves = np.random.default_rng(seed).normal(size=(batch, STEPS, len(system.cables.anchor)))
     return np.cumsum(scale * moves, axis=1)
+
+
+VARIED = tuple(name for name in fem.Material._fields if name != "effects")
 
 
 @functools.cache
@@ -175,6 +179,25 @@ def test_number_of_lanes_does_not_matter():
     narrow = engine(2, "float64", lanes=2).rollout(material, displacement)
     for one, two in zip(jax.tree.leaves(wide), jax.tree.leaves(narrow), strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+def test_a_command_that_is_no_number_is_a_lost_rollout_as_in_the_reference_engine():
+    """It would be a slack cable: of the way, of its beginning, and of a session, whose other lanes go on."""
+    system, _ = body_with_cables(2)
+    material, displacement = random_materials(system, 4, 10), random_displacements(system, 4, 11)
+    lost = displacement.copy()
+    lost[1, 3, 0] = np.nan
+    start = np.zeros_like(displacement[:, 0])
+    start[2, 1] = np.nan
+    found = engine(2, "float64").rollout(material, lost, before=start)
+    np.testing.assert_array_equal(found.diverged, [False, True, True, False])
+    assert not engine(2, "float64").rollout(material, lost, steps=3).diverged.any()  # it comes later
+    session = LayeredSession(engine(2, "float64"), 4)
+    session.reset(np.arange(4), material)
+    np.testing.assert_array_equal(session.advance(lost).diverged, [False, True, False, False])
+    both = material._replace(**{name: getattr(material, name)[1:3] for name in VARIED})
+    again = session.reset(np.array([1, 2]), both, start=start[1:3])
+    np.testing.assert_array_equal(again.diverged, [False, True])
 
 
 def test_lost_rollout_leaves_its_neighbours_alone():

@@ -213,6 +213,10 @@ def test_results_do_not_depend_on_batch_lane_or_threads():
     engine = TetrahedralEngine(body, cables, FREE, points, threads=2)
     together = engine.rollouts(parameters, commands, time_step=0.01)
     np.testing.assert_array_equal(together.diverged, np.arange(samples) == 4)
+    unknown = np.tile(commands, (samples, 1, 1))
+    unknown[7, 3, 1] = np.nan  # nor is a command that is no number a slack cable
+    lost = engine.rollouts(parameters, unknown, time_step=0.01)
+    np.testing.assert_array_equal(np.flatnonzero(lost.diverged), [4, 7])
     single = TetrahedralEngine(body, cables, FREE, points, threads=1)
     for sample in (0, 3, 5, 10):
         alone = single.rollouts(

@@ -12,6 +12,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary, gauges_of, motion_dictionary, own_dictionary
+from rfdropo_bayes.mechanisms.laws import unit_of
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.experiment import Experiment
@@ -237,6 +238,22 @@ def test_an_effect_on_commands_of_another_unit_is_measured_by_their_size(unit, s
     assert (port.size, port.unit) == (pytest.approx(size), unit)
 
 
+@pytest.mark.parametrize(
+    ("port", "command", "kind", "unit"),
+    [
+        ("rad", "rad", "product", "1/rad"),
+        ("m", "m", "rate", "s"),
+        ("-", "-", "command", "-"),
+        ("s", "-", "product", "s"),
+        ("N", "-", "rate", "N s"),
+        ("s", "N m", "product", "s/N2 m2"),
+    ],
+)
+def test_a_coefficient_has_the_unit_of_its_port_over_that_of_its_feature(port, command, kind, unit):
+    feature = Feature(kind, (0,) * KINDS[kind].channels)
+    assert unit_of(port, feature, command) == unit
+
+
 def test_what_a_law_cannot_be_is_said():
     for wrong, match in (
         (law("cable left", "position", motion=["tip x"]), "cannot follow the motion here"),
@@ -254,7 +271,7 @@ def test_what_a_law_cannot_be_is_said():
         with pytest.raises(InputError, match=match):
             build_robot_simulator(spec(wrong))
     body = build_robot_simulator(spec(law("stiffness")))
-    with pytest.raises(InputError, match="whole rollout"):
+    with pytest.raises(InputError, match=r"whole rollout.*laws at cables, and laws of time"):
         body.session(1, 0.1)
 
 

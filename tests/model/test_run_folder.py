@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError, Interrupted
-from rfdropo_bayes.files import append_line, whole, write_text
+from rfdropo_bayes.files import append_line, read_lines, whole, write_text
 from rfdropo_bayes.inference import Checkpoint
 from rfdropo_bayes.model.experiment import load_experiment
-from rfdropo_bayes.model.experiment_file import look_through, self_contained
+from rfdropo_bayes.model.experiment_file import look_through, read_tables, self_contained
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import COMMANDS, check_folder, run_folder
+from rfdropo_bayes.robots import Robot
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEMO = REPOSITORY / "experiments" / "demo.toml"
@@ -37,8 +39,8 @@ def press_control_c(folder: Path, checkpoint: str) -> None:
     raise KeyboardInterrupt
 
 
-def interrupt(out: Path, command: str = "calibrate", checkpoint: str = "smc_0.npz") -> None:
-    with pytest.raises(Interrupted) as stopped, run_folder(out, command, **SETTINGS) as folder:
+def interrupt(out: Path, command: str = "calibrate", checkpoint: str = "smc_0.npz", **options) -> None:
+    with pytest.raises(Interrupted) as stopped, run_folder(out, command, **{**SETTINGS, **options}) as folder:
         press_control_c(folder, checkpoint)
     assert stopped.value.going_on == "--resume"
     assert stopped.value.folder == str(out)
@@ -128,6 +130,39 @@ def test_a_run_does_not_go_on_with_other_settings(change, message, tmp_path):
     interrupt(tmp_path)
     with pytest.raises(InputError, match=message):
         finish(tmp_path, resume=True, **change)
+
+
+def test_a_resume_that_is_refused_leaves_the_robot_that_the_run_began_with(tmp_path):
+    (tmp_path / "arm.toml").write_text("time_step_s = 0.01")
+    record = {"tables": {"robot": "arm.toml"}, "folder": tmp_path}
+    interrupt(tmp_path / "run", **record)
+    (tmp_path / "arm.toml").write_text("time_step_s = 0.02")
+    with pytest.raises(InputError, match="other settings: robot was"):
+        finish(tmp_path / "run", resume=True, **record)
+    assert (tmp_path / "run" / "robot.toml").read_text() == "time_step_s = 0.01"
+    finish(tmp_path / "run", resume=True, tables={"robot": "robot.toml"}, folder=tmp_path / "run")
+
+
+def test_a_run_goes_on_where_its_folder_was_moved_with_its_recordings(tmp_path, monkeypatch):
+    """The recordings' hashes say that they are the same; others of their names are not."""
+    monkeypatch.delenv("RFDROPO_DATA", raising=False)
+    path = own_experiment(tmp_path / "here")
+    interrupt(path.parent / "run", tables=read_tables(path), folder=path.parent, data={"one": "abc"})
+    path.parent.rename(tmp_path / "there")
+    path = tmp_path / "there" / path.name
+    moved = {"tables": read_tables(path), "folder": path.parent}
+    with pytest.raises(InputError, match=r"data\.fit was"):
+        finish(path.parent / "run", resume=True, **moved, data={"one": "abd"})
+    finish(path.parent / "run", resume=True, **moved, data={"one": "abc"})
+
+
+def test_a_robot_of_a_program_is_kept_where_another_file_of_its_name_lies_about(tmp_path, monkeypatch):
+    """What is run from a folder with the robot's file, changed in Python, is read back as it was run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.toml").write_text((REPOSITORY / "models" / "robots" / "smooth_arm.toml").read_text())
+    model = Model(Robot.load("robot.toml").with_changes(time_step_s=0.02), priors={"young_modulus": {}})
+    finish(tmp_path / "run", tables=model.tables(), folder=model.folder, texts=model.texts())
+    assert Model.read(tmp_path / "run" / "config.toml").robot.time_step_s == 0.02
 
 
 def test_a_run_that_failed_early_may_be_repeated(tmp_path):
@@ -243,6 +278,17 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(kind, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "\n" not in str(raised.value)
     assert [path.name for path in tmp_path.iterdir()] == (["file"] if kind == "line" else [])
+
+
+@pytest.mark.parametrize(("cut", "kept"), [(3, [0, 1]), (1, [0, 1, 2])])
+def test_a_ledger_whose_last_line_a_kill_has_cut_is_gone_on_with(cut, kept, tmp_path):
+    path = tmp_path / "ledger.jsonl"
+    for index in range(3):
+        append_line(path, json.dumps({"index": index}))
+    os.truncate(path, path.stat().st_size - cut)  # of one byte: the newline alone is missing
+    for index in range(3, 6):
+        append_line(path, json.dumps({"index": index}))
+    assert [line["index"] for line in read_lines(path)] == [*kept, 3, 4, 5]
 
 
 def test_a_file_is_replaced_whole_or_stays(tmp_path):

@@ -27,7 +27,7 @@ from rfdropo_bayes.policies.randomisation import (
     read_posterior,
     spread_out,
 )
-from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, potential, reward
+from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, observed_of, potential, reward
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.robots import Robot
@@ -218,6 +218,16 @@ def test_a_wider_posterior_ends_at_hard_bounds_and_a_point_has_no_width() -> Non
     assert np.array_equal(spread_out(draws, 5.0, SPECS).rows, [[1e-4], [10.0]])
     with pytest.raises(InputError, match=r"width = 2 beside a randomisation that is no posterior"):
         spread_out(Point({}), 2.0, SPECS)
+
+
+@pytest.mark.parametrize("robot", ["trunk_sofa", "trunk_physical", "asl_trunk"])
+@pytest.mark.parametrize("observed", ["full", "paper", "markers"])
+def test_a_layout_tells_what_is_observed_of_a_robot(robot, observed) -> None:
+    """Of 21 markers, of the four that are tracked themselves, and of three, of which two stand for the four."""
+    described = Robot.load(robot)
+    layout = layout_of(TASKS[REACH], described, "continuous", observed)
+    found = observed_of(layout, len(described.marker_names))
+    assert layout_of(TASKS[REACH], described, "continuous", found) == layout
 
 
 def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:

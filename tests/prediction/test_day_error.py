@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import (
     FREEDOM,
     TIMES,
@@ -17,7 +17,7 @@ from rfdropo_bayes.prediction.day_error import (
     prior_day_error,
     reach_of,
 )
-from rfdropo_bayes.prediction.model_error import ModelError, error_memory
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, error_memory, recorded_model_error
 from rfdropo_bayes.prediction.predictive import with_day_error
 
 TIME = 0.1 * np.arange(100)
@@ -132,3 +132,20 @@ def test_the_lasting_part_of_an_error_is_told_from_one_that_is_forgotten():
         correlation = left.lasting(0.1, 50).autocorrelation
         assert correlation[-1] == pytest.approx(constant, abs=0.06)
         assert LEFT.lasting(0.1, 50).order == 1
+
+
+def test_an_earlier_posterior_of_recordings_of_two_rates_says_how_long_errors_last():
+    """Half of the rows are 10 ms apart and half 20 ms: none are 15 ms apart, their median."""
+    rng, found = np.random.default_rng(0), []
+    for name, step in (("fast", 0.01), ("slow", 0.02)):
+        error = np.cumsum(1e-4 * rng.normal(size=(101, 1, 3)), axis=0)
+        time, mask = step * np.arange(101), np.ones((101, 1), bool)
+        found.append(RecordingPrediction(name, "fit", time, ("tip",), error, mask, np.zeros((2, 101, 1, 3))))
+    info = ParameterInfo("young_modulus", "Pa", 1e6, 5e7)
+    earlier = {MODEL_ERROR: {"markers": ["tip"], "scale": [1e-3, 1e-3, 1e-3], "correlation_time": 1.0}}
+    record = PosteriorRecord((info,), {"young_modulus": np.full((1, 2), 4e6)}, {}, tuple(found), attrs=earlier)
+    left = recorded_model_error(record)
+    assert left is not None
+    assert left.step == pytest.approx(0.01)
+    assert left.memory[0] == 1.0
+    assert left.memory[1] > 0.9

@@ -1,8 +1,11 @@
 """Days that no fit has seen deviate by the fitted spread, in episodes of policies as in predictions."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.pooling import DEVIATION
@@ -83,6 +86,18 @@ def test_an_adapted_posterior_is_for_its_day() -> None:
     values = {name: fit.record.flat(name) for name in fit.record.posterior}
     wanted = values["young_modulus"] + values[f"young_modulus{DEVIATION}@tuesday"]
     assert np.isin(episodes_of(fit)["young_modulus"], wanted).all()
+
+
+def test_sums_end_at_the_hard_bounds_as_in_the_fit_on_the_adapted_day_and_on_others() -> None:
+    """Of a parameter that is near its bound the deviations of half of the days lead beyond it: these days are at it."""
+    low = next(spec.low for spec in SIMULATOR.parameters if spec.name == "young_modulus")
+    fit = pooled_posterior(np.full(ROWS, 1e9), **{ADAPTED_TO: "tuesday"})
+    beyond = dict(fit.record.posterior)
+    beyond[f"young_modulus{DEVIATION}@tuesday"] = np.where(np.arange(ROWS) % 2, -1e7, 1e5)[None]
+    adapted = episodes_of(Calibration(replace(fit.record, posterior=beyond), {}, ""))["young_modulus"]
+    assert np.mean(adapted == low) == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / DRAWN))
+    unseen = episodes_of(pooled_posterior(np.full(ROWS, 1e7)))["young_modulus"]
+    assert np.mean(unseen == low) == pytest.approx(norm.cdf((low - CENTRE) / 1e7), abs=4 * np.sqrt(0.25 / DRAWN))
 
 
 def test_a_posterior_of_one_day_is_drawn_as_it_is() -> None:

@@ -94,7 +94,11 @@ def test_the_mean_of_repeats_is_that_of_the_same_commands_alone(run: Any) -> Non
     np.testing.assert_allclose(predicted[21:, 1], np.broadcast_to(last, b.position[21:, 1].shape), atol=1e-12)
     with pytest.raises(InputError, match="no other fit recording has its commands"):
         repeated_mean([a, b])(other)
-    assert with_fitted_commands([short], [b, other]) == [b.name]
+    slow = Trajectory(a.dataset.assign_coords(command_time=2.0 * a.dataset["command_time"]))
+    slow = slow.with_attributes(name="slow")
+    with pytest.raises(InputError, match="no other fit recording has its commands"):  # at the same speed
+        repeated_mean([a, b])(slow)
+    assert with_fitted_commands([short], [b, other, slow]) == [b.name]
 
 
 def test_repeats_of_the_paper_s_trunk_are_predicted_by_their_mean(datasets: Path) -> None:

@@ -101,6 +101,22 @@ def test_clipped_commands_and_simulated_drives_are_named():
     assert any("were simulated" in step for step in session_steps(session(simulated=True)))
 
 
+def test_commands_that_bring_drives_to_rest_or_home_them_are_no_actions_held_back():
+    """Nobody has asked for them."""
+    made = session(clipped=True)
+    assert made.recording is not None
+    phase = made.recording.dataset["phase"]
+    row = np.searchsorted(made.recording.time, made.recording.command_time[-1])
+    asked = made.recording.dataset["asked_command"].copy()
+    asked[:-1] = made.recording.command[:-1]
+    stopping = {"phase": phase.copy(data=np.where(np.arange(len(phase)) < row, 5, 6)), "asked_command": asked}
+    homing = {"phase": phase.copy(data=np.where(np.arange(len(phase)) < 2, 1, 2))}
+    homing["asked_command"] = asked.copy(data=np.zeros(asked.shape))
+    for changed in (stopping, homing):
+        kept = made._replace(recording=Trajectory(made.recording.dataset.assign(changed)))
+        assert not any("held back" in step for step in session_steps(kept))
+
+
 def test_a_session_without_a_recording_has_a_page():
     bare = session()._replace(recording=None)
     bare.summary["figures"].clear()

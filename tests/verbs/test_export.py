@@ -10,10 +10,11 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import build_summary, write_summary
-from rfdropo_bayes.verbs.export import KEPT_DRAWS, export_phi, export_posterior, millimetre_factor
+from rfdropo_bayes.verbs.export import KEPT_DRAWS, export_model, export_phi, export_posterior, millimetre_factor
 
 
 @pytest.mark.parametrize(
@@ -88,3 +89,31 @@ def test_a_small_posterior_keeps_draws_that_belong_together(tmp_path):
     np.testing.assert_array_equal(draws["young_modulus"][rows], kept["young_modulus"])
     with pytest.raises(InputError, match="would replace"):
         export_posterior(tmp_path, tmp_path)
+
+
+ARM = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/><geom size="0.01" mass="0.05"/>
+<body name="lower" pos="0 0 -0.1"><joint name="b" axis="0 1 0"/><geom size="0.01" mass="0.03"/><site name="tip"/>
+</body></body></worldbody><actuator><motor joint="a"/></actuator></mujoco>"""
+EXPERIMENT = """robot = "arm.xml"
+[adapter.parameters]
+damping_a = "joint/a/damping"
+damping_b = "joint/b/damping"
+mass = "body/lower/mass"
+stiffness = "joint/b/stiffness"
+[model]
+priors = { mass = {} }
+fixed = { damping = 0.02 }
+"""
+
+
+def test_a_model_is_written_with_what_was_fixed_for_several_elements_and_what_the_method_held(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(ARM)
+    (tmp_path / "config.toml").write_text(EXPERIMENT)
+    info = ParameterInfo("mass", "kg", 0.01, 10.0)
+    draws = {"mass": np.full((1, 4), 0.06)}
+    PosteriorRecord((info,), draws, attrs={HELD: {"stiffness": 0.3}}).save(tmp_path / POSTERIOR)
+    written = mujoco.MjModel.from_xml_path(str(export_model(tmp_path)))
+    np.testing.assert_allclose(written.dof_damping, 0.02)
+    assert written.jnt_stiffness[1] == pytest.approx(0.3)
+    assert written.body_mass[2] == pytest.approx(0.06)

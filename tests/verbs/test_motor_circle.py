@@ -20,6 +20,8 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.robots.robot import CommandTiming
 from rfdropo_bayes.verbs.audit import audit
 from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.random_commands import random_walk
@@ -112,6 +114,27 @@ def experiment(folder: Path, fit: list[str], test: list[str]) -> Path:
         text = text.replace(key, ", ".join(f'"{name}.nc"' for name in names))
     (folder / "experiment.toml").write_text(text)
     return folder / "experiment.toml"
+
+
+def test_drums_that_are_commanded_in_angles_pull_as_those_in_lengths() -> None:
+    """The same arm, whose spools have the drums' radius or half as much: half the way of the cables, half the pull of
+    the drums."""
+    arm = Robot.load("motor_arm")
+    drum = arm.motors[0].drum_radius_m
+    length = np.array([0.004, 0.0, -0.002, 0.001])
+    wanted = trunk(arm).advance(length, 0.0).tension
+    radius = Parameter(
+        unit="m", nominal=drum, low=1e-4, high=0.1, prior={"distribution": "Normal", "loc": drum, "scale": 1e-3},
+        description="radius of the spools",
+    )  # fmt: skip
+    turned = arm.with_changes(
+        command=CommandTiming(unit="rad", ramp_s=0.1, dead_time_s=0.001),
+        channels=arm.channels.model_copy(update={"radius_parameter": "spool_radius"}),
+        parameters={**arm.parameters, "spool_radius": radius},
+    )
+    np.testing.assert_allclose(trunk(turned).advance(length, 0.0).tension, wanted, rtol=1e-6)
+    found = trunk(turned, spool_radius=0.5 * drum).advance(2.0 * length, 0.0).tension
+    np.testing.assert_allclose(found, 0.5 * wanted, rtol=1e-6)
 
 
 @pytest.mark.slow

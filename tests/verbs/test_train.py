@@ -239,6 +239,42 @@ def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
             assert drawn == {"trunk_mass": 0.31, "poisson_ratio": 0.4}
 
 
+@pytest.mark.parametrize("given", ["posterior", "uniform"])
+def test_a_fixed_value_of_what_is_randomised_is_refused(given) -> None:
+    """It would be left out without a word: an evaluation of another stiffness would be one of the posterior's."""
+    modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
+    fit = Calibration(PosteriorRecord((modulus,), {"young_modulus": np.full((1, 3), 2e6)}), {}, "")
+    ranges = {"ranges": {"young_modulus": [1e6, 3e6]}} if given == "uniform" else {}
+    model = rb.Model("trunk_sofa", fixed={"young_modulus": 4e6})
+    table, _, simulator = training_of(with_training(model, {"task": "TrunkReach-v0", "randomisation": given, **ranges}))
+    with pytest.raises(InputError, match=f"young_modulus has a fixed value, and randomisation = '{given}'"):
+        randomisation_of(table, model.spec, simulator, fit if given == "posterior" else None)
+
+
+def test_a_posterior_whose_law_the_simulator_lacks_is_refused(tmp_path) -> None:
+    """A law is no mechanism of the library, and its effect would be left out without a word."""
+    term = {"coefficient": "creep", "feature": "low_pass", "commands": ["own"], "shape": 0.3, "scale": 0.1}
+    law = {"port": "every cable", "terms": [{**term, "shape_parameter": "creep_time"}]}
+    names = ("young_modulus", "creep", "creep_time", "observation_noise", "offset_x@monday", "cube_mass")
+    draws = {name: np.full((1, 3), 0.4) for name in names} | {"young_modulus": np.full((1, 3), 2e6)}
+    record = PosteriorRecord(tuple(ParameterInfo(name, "-") for name in names), draws)
+    record.save(tmp_path / "posterior.nc")
+    normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
+    (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"young_modulus": normal}}))
+    asked = {"task": "TrunkReach-v0"}
+    plain = with_training(rb.Model("trunk_sofa"), asked)
+    table, _, simulator = training_of(plain)
+    for given in (tmp_path, Calibration(record, {}, "")):
+        with pytest.raises(InputError, match="has creep, which the simulator lacks"):
+            randomisation_of(table, plain.spec, simulator, given)
+    stated = with_training(plain, {"randomisation": "phi", "source": str(tmp_path)}).settings.training
+    with pytest.raises(InputError, match="has creep, which the simulator lacks"):
+        randomisation_of(stated, plain.spec, simulator)
+    whole = with_training(rb.Model("trunk_sofa", laws=[law]), asked)
+    table, _, simulator = training_of(whole)
+    assert "creep_time" in randomisation_of(table, whole.spec, simulator, tmp_path).names
+
+
 def test_one_episode_is_an_evaluation_and_none_is_not(tmp_path) -> None:
     found = rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "one", episodes=1, film=False)
     (policy,) = found["policies"].values()

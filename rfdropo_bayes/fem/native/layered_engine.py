@@ -15,7 +15,7 @@ from itertools import count as counting
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
@@ -77,8 +77,18 @@ class Run(NamedTuple):
         output = self.output
         assert output is not None
         pose = None if self.poses is None else self.poses.pose
-        codes = output.diverged.view(bool), output.imbalance, output.converged.view(bool)
-        return Motion(output.position, output.tension, *codes, pose)
+        diverged = output.diverged.view(bool) | ~self.commanded
+        return Motion(output.position, output.tension, diverged, output.imbalance, output.converged.view(bool), pose)
+
+    @property
+    def commanded(self) -> Bool[np.ndarray, " batch"]:
+        """Whether all commands are numbers: a cable whose displacement is none would count as slack."""
+        batch, schedule = self.batch, self.schedule
+        known = np.ones(batch.count, dtype=bool)
+        moved = batch.displacement[: batch.count, : schedule.steps * batch.start.shape[1]]
+        for part in (moved,) if schedule.resumed else (moved, batch.start):
+            known &= np.isfinite(part.sum(axis=1))
+        return known
 
 
 class Records(NamedTuple):

@@ -136,6 +136,8 @@ class TetrahedralEngine:
             result.converged[kept] = ~(work.unsolved[0, :count] > 0.0)
 
         in_blocks(run, samples, self.lanes, self.threads)
+        # A cable whose displacement is no number would count as slack.
+        result.diverged[...] |= ~np.isfinite(commands.sum(axis=(1, 2)))
         return result
 
     def _constraints(self) -> tuple[ContactRecords | None, Rows, ConstraintProblem, Int[np.ndarray, " free"]]:
