@@ -10,13 +10,14 @@ that of what it leaves (see `inadequacy`), taken anew after each term.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.deadline import OutOfTime
+from rfdropo_bayes.audit.differences import Groups
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.audit.inadequacy import judged_anew
 from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
@@ -29,10 +30,12 @@ from rfdropo_bayes.audit.port_responses import (
     with_exact_columns,
 )
 from rfdropo_bayes.audit.port_rollouts import (
+    EVERYWHERE,
     PREFIX,
     FeatureTable,
     PlacedTerm,
     PortedForward,
+    Scope,
     coefficient_name,
     placed,
 )
@@ -57,7 +60,7 @@ class TermGain:
     """One feature at one port, fitted linearly together with the base parameters.
 
     Attributes:
-        port, feature: which.
+        port, feature, scope: which, and in which recordings.
         gain: of log density of left-out recordings [nat].
         share: of what is left beyond the noise there.
         size: of the coefficient; sd: its deviation.
@@ -71,6 +74,12 @@ class TermGain:
     size: float
     sd: float
     typical: float
+    scope: Scope = EVERYWHERE
+
+    @property
+    def place(self) -> tuple[Port, Feature, str]:
+        """See `PlacedTerm.place`."""
+        return self.port, self.feature, self.scope.group
 
 
 @dataclass(frozen=True)
@@ -254,6 +263,7 @@ class LawSearch:
         report: called with a line of words.
         most: terms that a law may have; None leaves their number to the recordings.
         taken: names of coefficients that the model has, of laws that an earlier audit found.
+        scopes: recordings in which a law may act: all, and those of each group.
     """
 
     ports: PortMap
@@ -265,6 +275,7 @@ class LawSearch:
     report: Callable[[str], None] = lambda line: None
     most: int | None = None
     taken: frozenset[str] = frozenset()
+    scopes: tuple[Scope, ...] = (EVERYWHERE,)
 
     def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
         """Where something acts that the model lacks, and by what law.
@@ -330,9 +341,9 @@ class LawSearch:
         values = self.table.over(found.levels)
         return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
 
-    def _has(self, port: Port, feature: Feature) -> bool:
+    def _has(self, port: Port, feature: Feature, group: str) -> bool:
         """Whether a law of the model has this term."""
-        return bool(self.taken) and coefficient_name(port, feature, self.units[0]) in self.taken
+        return bool(self.taken) and coefficient_name(port, feature, self.units[0], group) in self.taken
 
     def _features(self, port: Port) -> Sequence[Feature]:
         """What a law at a port may be made of: on a body of the motion, too."""
@@ -350,7 +361,7 @@ class LawSearch:
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
-        law = f"{best.term.port.words}: {best.feature.formula(names)}"
+        law = f"{best.term.port.words}: {best.feature.formula(names)}{in_words(best.term.scope)}"
         self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
@@ -365,8 +376,8 @@ class LawSearch:
         series = np.moveaxis(null.reshape(-1, *found.residual.shape), 0, 2)
         most = np.full(len(null), -np.inf)
         for port in self.ports.ports:
-            columns = feature_columns(found, port, self._offered(port, values)[1])
-            most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
+            for _, columns in self._scoped(found, feature_columns(found, port, self._offered(port, values)[1])):
+                most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
         return float(np.quantile(most, 1.0 - self.family, method="higher"))
 
     def _ranked(
@@ -379,19 +390,25 @@ class LawSearch:
         from linear, they would bring something again. A term whose shape is inferred has every shape.
         """
         rows = []
-        had = {(refit.term.port, refit.term.feature) for refit in terms}
-        had |= {(refit.term.port, refit.term.feature._replace(shape=None)) for refit in terms if refit.term.shape}
-        had |= {(port, f) for port in self.ports.ports for f in self._features(port) if self._has(port, f)}
+        had = {refit.term.place for refit in terms}
+        had |= {_of_any_shape(refit.term.place) for refit in terms if refit.term.shape}
         for port in self.ports.ports:
             features, (sizes, signals) = self._features(port), self._offered(port, values)
-            columns = feature_columns(found, port, signals)
-            gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
-            gain = gains[:, 0]
-            passed = np.flatnonzero((gain > gate) & (share >= LEAST)).tolist()
-            for k in (k for k in passed if not had & {(port, features[k]), (port, features[k]._replace(shape=None))}):
-                parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
-                rows.append(TermGain(port, features[k], float(gain[k]), float(share[k]), *parts))
+            for scope, columns in self._scoped(found, feature_columns(found, port, signals)):
+                gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
+                for k in np.flatnonzero((gains[:, 0] > gate) & (share >= LEAST)).tolist():
+                    parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
+                    row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
+                    if not had & {row.place, _of_any_shape(row.place)} and not self._has(*row.place):
+                        rows.append(row)
         return sorted(rows, key=lambda row: -row.gain)
+
+    def _scoped(
+        self, found: Responses, columns: Float[np.ndarray, "group value feature"]
+    ) -> Iterator[tuple[Scope, Float[np.ndarray, "group value feature"]]]:
+        """What features do where they act in the recordings of each scope alone."""
+        for scope in self.scopes:
+            yield scope, columns * scope.has(found.recordings)[:, None, None] if scope.group else columns
 
     def _exchanged(
         self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
@@ -405,7 +422,7 @@ class LawSearch:
         that lead by evidence, where the linear model may have preferred another one: a delay is far from linear.
         """
         chosen, every = refits[0], list(refits)
-        best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
+        best, tried = self._climbed(chosen), {chosen.term.place}
         for _ in range(EXCHANGES):
             fit = best.fit
             without = fit.x.copy()
@@ -415,14 +432,15 @@ class LawSearch:
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
             linear = _relinearised(known, found, bare)
             ranked = self._ranked(linear, values, gate, _precision(known, bare), terms)
-            fresh = fresh_terms([row for row in ranked if (row.port, row.feature) not in tried], best.term, where)
-            tried |= {(row.port, row.feature) for row in fresh}
+            fresh = fresh_terms([row for row in ranked if row.place not in tried], best.term, where)
+            tried |= {row.place for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             every += others
             better = max(others, key=lambda refit: refit.score, default=best)
             if better.square >= best.square - 2.0:
                 break
-            self.report(f"instead: {better.term.port.words}: {better.term.feature.formula(self.units[0])}")
+            words = f"{better.term.port.words}: {better.term.feature.formula(self.units[0])}"
+            self.report(f"instead: {words}{in_words(better.term.scope)}")
             best = self._climbed(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
         best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
@@ -431,7 +449,8 @@ class LawSearch:
     def _cost(self, known: FitTarget) -> float:
         """Nats that a term costs: its parameter, and the choice among all features at all ports."""
         count = max(float(np.sum(known.measurements.valid)), 2.0)
-        return float(0.5 * np.log(count) + np.log(sum(len(self._features(port)) for port in self.ports.ports)))
+        choices = len(self.scopes) * sum(len(self._features(port)) for port in self.ports.ports)
+        return float(0.5 * np.log(count) + np.log(choices))
 
     def _refits(
         self, known: FitTarget, terms: Sequence[Refit], fit: Fit, where: Sequence[PortEvidence], ranked: list[TermGain]
@@ -447,14 +466,14 @@ class LawSearch:
         for row in dict.fromkeys(chosen):
             found = self._refit(known, terms, fit, row)
             refits.append(found)
-            words = f"{row.port.words}: {row.feature.formula(self.units[0])}"
+            words = f"{row.port.words}: {row.feature.formula(self.units[0])}{in_words(row.scope)}"
             self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
         return sorted(refits, key=lambda refit: -refit.score)
 
     def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
         """The model with one more term, climbed a few steps from where the linear model has it."""
         names, unit = self.units
-        term = placed(row.port, row.feature, row.typical, names, unit)
+        term = placed(row.port, row.feature, row.typical, names, unit, row.scope)
         placed_terms = [*(refit.term for refit in terms), term]
         forward = PortedForward(known.forward, self.ports, self.table, placed_terms)
         scale = float(term.spec.prior["scale"])
@@ -490,10 +509,23 @@ class LawSearch:
 
 
 def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:
-    """Terms that may take the place of the best one: those of most gain, and its feature at the leading ports."""
+    """Terms that may take the place of the best one: those of most gain, its feature at the leading ports, and the term
+    itself in other recordings."""
     leading = [row.port for row in where[:BY_EVIDENCE]]
-    alike = [row for row in ranked if row.port in leading and row.feature == best.feature]
+    same = [row for row in ranked if row.feature == best.feature]
+    alike = [row for row in same if row.port == best.port or (row.port in leading and row.scope == best.scope)]
     return list(dict.fromkeys([*ranked[:FRESH], *alike]))
+
+
+def _of_any_shape(place: tuple[Port, Feature, str]) -> tuple[Port, Feature, str]:
+    """The place of a term whose shape may be any."""
+    port, feature, group = place
+    return port, feature._replace(shape=None), group
+
+
+def in_words(scope: Scope) -> str:
+    """Where a law acts in one group of recordings alone, the group."""
+    return f" in {scope.group} alone" if scope.group else ""
 
 
 FARTHEST = 100.0  # prior deviations within which a refit starts
@@ -501,10 +533,10 @@ FARTHEST = 100.0  # prior deviations within which a refit starts
 
 def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
     """Refits of other terms that leave as little as the best one, within `TIED`; each term once, the best first."""
-    found: dict[tuple[Port, Feature], Refit] = {}
+    found: dict[tuple[Port, Feature, str], Refit] = {}
     for refit in sorted(others, key=lambda refit: -refit.score):
-        found.setdefault((refit.term.port, refit.term.feature), refit)
-    found.pop((best.term.port, best.term.feature), None)
+        found.setdefault(refit.term.place, refit)
+    found.pop(best.term.place, None)
     return [refit for refit in found.values() if refit.score > best.score - TIED]
 
 
@@ -539,9 +571,9 @@ def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
 
 def law_search(
     target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, family: float,
-    report: Callable[[str], None],
+    report: Callable[[str], None], groups: Groups | None = None,
 ) -> LawSearch:  # fmt: skip
-    """The search on a simulator with these ports and commands."""
+    """The search on a simulator with these ports and commands, for laws of all recordings and of single groups."""
     commands = target.forward.commands
     stroke = float(np.ptp(np.concatenate([np.asarray(commands.step), np.asarray(commands.initial)[:, None]], axis=1)))
     stroke = max(stroke, 1e-12)
@@ -549,4 +581,7 @@ def law_search(
     table = FeatureTable(target.forward.lanes, features)
     own, names = own_dictionary(stroke), target.forward.coordinates.names
     taken = frozenset(name for name in names if name.startswith(PREFIX))
-    return LawSearch(ports, table, own, (tuple(channels), unit), seed, family, report, taken=taken)
+    members = {} if groups is None else groups.members
+    scopes = (EVERYWHERE, *(Scope(name, recordings) for name, recordings in members.items()))
+    units = (tuple(channels), unit)
+    return LawSearch(ports, table, own, units, seed, family, report, taken=taken, scopes=scopes)

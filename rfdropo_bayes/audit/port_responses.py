@@ -73,6 +73,7 @@ class Responses:
         levels: commands that reach the ports, by group.
         begun: when the recordings' first rows are [s] on the simulator's clock, which begins with their commands.
         noise: mean square of the measurement's noise in these deviations; less than 1 where the model is far off.
+        recordings: the first one of each group.
         of_motion: features of the motion, by group, where the body carries signals that follow it.
         exact: by port: what each feature does, where it was asked for; see `with_exact_columns`.
     """
@@ -85,6 +86,7 @@ class Responses:
     levels: Float[np.ndarray, "group row channel"]
     begun: float
     noise: float = 1.0
+    recordings: tuple[str, ...] = ()
     of_motion: Float[np.ndarray, "group feature row"] | None = None
     exact: dict[Port, Float[np.ndarray, "group value feature"]] = field(default_factory=dict)
 
@@ -129,7 +131,8 @@ def responses(
     first = forward.commands.sample_step[:, 0] + forward.commands.sample_fraction[:, 0]
     begun = float(np.median(table.time_step * np.asarray(first)))
     moving = table.over_motion(theta, forward.commands, forward.deadline.check) if table.of_motion else None
-    return Responses(ports, basis, found, white, jacobian, levels, begun, noise_share(target), moving)
+    names = forward.recordings
+    return Responses(ports, basis, found, white, jacobian, levels, begun, noise_share(target), names, moving)
 
 
 def _response(
