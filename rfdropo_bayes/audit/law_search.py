@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -171,7 +172,8 @@ class FoundLaw:
 
 @dataclass(frozen=True)
 class _Sums:
-    """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data."""
+    """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data; the
+    pull of the priors is that of the first data set."""
 
     jj: Float[np.ndarray, "piece d d"]
     jx: Float[np.ndarray, "piece d feature"]
@@ -180,6 +182,7 @@ class _Sums:
     xy: Float[np.ndarray, "piece feature data"]
     yy: Float[np.ndarray, "piece data"]
     count: Float[np.ndarray, " piece"]
+    pull: Float[np.ndarray, " d"]
 
 
 def _pieces(array: Float[np.ndarray, "group value *rest"]) -> Float[np.ndarray, "piece value *rest"]:
@@ -208,6 +211,7 @@ def _sums(
         np.swapaxes(x, 1, 2) @ y,
         np.sum(y**2, axis=1),
         count,
+        np.zeros(j.shape[2]) if found.pull is None else found.pull,
     )
 
 
@@ -217,22 +221,30 @@ def left_out_gains(
     """Gain [nat] of every feature in every data set, each alone beside the base parameters; of the first data set also
     share, size and deviation.
 
-    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, unless
-    more is known of them.
+    A piece that is left out is predicted by base parameters of which the other pieces leave some unknown: r ~ N(0, S),
+    S = 1 + J A^-1 J' with A the precision that the others give. A gain is half of what a feature takes from r' S^-1 r.
+    Counted as r'r, it would mostly be what a feature happens to take from the error of base parameters that this piece
+    alone determines, and no refit brings it.
+
+    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, and it
+    pulls at the parameters where they are not at its centre, unless more is known of them.
     """
     before, gain = 0.0, np.zeros(sums.xy.shape[1:])
     held = np.eye(sums.jj.shape[1]) if precision is None else precision
-    for p in range(len(sums.yy)):
-        others = [part.sum(axis=0) - part[p] for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
-        b, u, c, _ = _solved(others, held)
-        left_j = sums.jy[p] - sums.jj[p] @ b
-        left_x = sums.xy[p] - sums.jx[p].T @ b
-        along = left_x - u.T @ left_j
-        square = sums.xx[p] - 2.0 * np.sum(u * sums.jx[p], axis=0) + np.sum(u * (sums.jj[p] @ u), axis=0)
-        gain += 2.0 * c * along - c**2 * square[:, None]
-        own, b = sums.jy[p, :, 0], b[:, 0]
-        before += sums.yy[p, 0] - 2.0 * float(b @ own) + float(b @ sums.jj[p] @ b) - sums.count[p]
     whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
+    if precision is None:
+        whole[3][:, 0] -= sums.pull
+    inverse = np.linalg.inv(whole[0] + held)
+    for p in range(len(sums.yy)):
+        own = (sums.jj[p], sums.jx[p], sums.xx[p], sums.jy[p], sums.xy[p])
+        others = [every - part for every, part in zip(whole, own, strict=True)]
+        b, u, c, _ = _solved(others, held)
+        left_j, left_jx = sums.jy[p] - sums.jj[p] @ b, sums.jx[p] - sums.jj[p] @ u
+        along = sums.xy[p] - sums.jx[p].T @ b - u.T @ left_j - left_jx.T @ inverse @ left_j
+        square = sums.xx[p] - np.sum(u * (sums.jx[p] + left_jx), axis=0) - np.sum(left_jx * (inverse @ left_jx), axis=0)
+        gain += 2.0 * c * along - c**2 * square[:, None]
+        first, own_j = left_j[:, 0], sums.jy[p, :, 0]
+        before += sums.yy[p, 0] - float(b[:, 0] @ (own_j + first)) - float(first @ inverse @ first) - sums.count[p]
     _, _, size, sd = _solved(whole, held)
     return 0.5 * gain, gain[:, 0] / max(before, 1e-300), size[:, 0], sd
 
@@ -247,6 +259,24 @@ def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarr
     safe = np.where(seen, left, 1.0)
     c = np.where(seen[:, None], (xy - u.T @ jy) / safe[:, None], 0.0)
     return b, u, c, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
+
+
+class LinearModel(NamedTuple):
+    """A model, linear around its fit, beside which further terms are ranked.
+
+    Attributes:
+        known: target of the simulator without a law.
+        terms: of the law that the model has.
+        fit: the model.
+        found: responses, with the residual and the slopes of the fit.
+        precision: of the base parameters, see `left_out_gains`.
+    """
+
+    known: FitTarget
+    terms: Sequence[Refit]
+    fit: Fit
+    found: Responses
+    precision: Float[np.ndarray, "d d"] | None = None
 
 
 @dataclass
@@ -300,7 +330,9 @@ class LawSearch:
                     offered = next((row.gain for row in self._ranked(found, values, 0.0)), 0.0)
                 gates.append(self._gate(found, values, null))
                 ranked = self._ranked(found, values, gates[-1], terms=terms)
-                refits = self._refits(known, terms, fit, where, ranked)
+                model = LinearModel(known, terms, fit, found)
+                chosen = self._confirmed(model, ranked, gates[-1], lambda rows, where=where: leading_terms(rows, where))
+                refits = self._refits(known, terms, fit, chosen)
                 if not refits or refits[0].score <= 0.0:
                     break
                 best, others = self._exchanged(known, terms, found, values, refits, gates[-1], where)
@@ -430,9 +462,10 @@ class LawSearch:
             residual = best.target.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
-            linear = _relinearised(known, found, bare)
-            ranked = self._ranked(linear, values, gate, _precision(known, bare), terms)
-            fresh = fresh_terms([row for row in ranked if row.place not in tried], best.term, where)
+            model = LinearModel(known, terms, bare, _relinearised(known, found, bare), _precision(known, bare))
+            ranked = self._ranked(model.found, values, gate, model.precision, terms)
+            ranked = [row for row in ranked if row.place not in tried]
+            fresh = self._confirmed(model, ranked, gate, lambda rows, term=best.term: fresh_terms(rows, term, where))
             tried |= {row.place for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             every += others
@@ -452,18 +485,51 @@ class LawSearch:
         choices = len(self.scopes) * sum(len(self._features(port)) for port in self.ports.ports)
         return float(0.5 * np.log(count) + np.log(choices))
 
-    def _refits(
-        self, known: FitTarget, terms: Sequence[Refit], fit: Fit, where: Sequence[PortEvidence], ranked: list[TermGain]
-    ) -> list[Refit]:
-        """The best terms by evidence of their ports and by gain, refitted; the best first."""
-        by_port: dict[Port, TermGain] = {}
-        for row in ranked:
-            by_port.setdefault(row.port, row)
-        chosen = list(by_port.values())[: BY_GAIN + 1]
-        chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
-        chosen += ranked[:BY_GAIN]
+    def _confirmed(
+        self, model: LinearModel, ranked: Sequence[TermGain], gate: float,
+        chosen: Callable[[Sequence[TermGain]], list[TermGain]],
+    ) -> list[TermGain]:  # fmt: skip
+        """The terms to refit, each with the gain that it has beside the model as it is now.
+
+        Responses are those of the first model, and splines miss what is fast. A law and the base parameters beside it
+        move the model far enough that gains are found which no refit brings. So what a chosen term does is found anew
+        by rollouts, and terms are chosen again until all of them have been seen so.
+        """
+        rows, seen = list(ranked), dict[tuple[Port, Feature, str], TermGain]()
+        while fresh := [row for row in chosen(rows) if row.place not in seen]:
+            seen |= {row.place: row for row in self._beside(model, fresh)}
+            rows = [seen.get(row.place, row) for row in rows]
+            rows = sorted((r for r in rows if r.gain > gate and r.share >= LEAST), key=lambda row: -row.gain)
+        return chosen(rows)
+
+    def _beside(self, model: LinearModel, rows: Sequence[TermGain]) -> list[TermGain]:
+        """Terms with their gains beside a model, by what rollouts of it say that each does."""
+        placed_terms = [self._placed(row) for row in rows]
+        target = model.known.on(self._with(model.known, model.terms, placed_terms))
+        x = np.append(model.fit.x, np.zeros(len(rows)))
+        directions = np.eye(len(x))[-len(rows) :]
+
+        def compute() -> dict[str, np.ndarray]:
+            return {"slopes": target.slopes(np.repeat(x[None], len(rows), axis=0), directions)[0]}
+
+        series = target.measurements.series(target.recall("terms", [x], compute)["slopes"])
+        columns = np.moveaxis(series.reshape(len(rows), len(model.found.residual), -1), 0, 2)
+        gains, share, size, sd = left_out_gains(_sums(model.found, columns), model.precision)
+        scales = [float(term.spec.prior["scale"]) for term in placed_terms]
+        numbers = zip(rows, gains[:, 0].tolist(), share.tolist(), size * scales, sd * scales, strict=True)
+        return [replace(row, gain=g, share=s, size=float(c), sd=float(d)) for row, g, s, c, d in numbers]
+
+    def _placed(self, row: TermGain) -> PlacedTerm:
+        return placed(row.port, row.feature, row.typical, *self.units, row.scope)
+
+    def _with(self, known: FitTarget, terms: Sequence[Refit], added: Sequence[PlacedTerm]) -> PortedForward:
+        """Rollouts with terms after those that the law has."""
+        return PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), *added])
+
+    def _refits(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, chosen: Sequence[TermGain]) -> list[Refit]:
+        """Terms, each refitted; the best first."""
         refits = []
-        for row in dict.fromkeys(chosen):
+        for row in chosen:
             found = self._refit(known, terms, fit, row)
             refits.append(found)
             words = f"{row.port.words}: {row.feature.formula(self.units[0])}{in_words(row.scope)}"
@@ -472,14 +538,11 @@ class LawSearch:
 
     def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
         """The model with one more term, climbed a few steps from where the linear model has it."""
-        names, unit = self.units
-        term = placed(row.port, row.feature, row.typical, names, unit, row.scope)
-        placed_terms = [*(refit.term for refit in terms), term]
-        forward = PortedForward(known.forward, self.ports, self.table, placed_terms)
+        term = self._placed(row)
         scale = float(term.spec.prior["scale"])
         start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
         free = np.append(fit.free, len(start) - 1)
-        target = known.on(forward)
+        target = known.on(self._with(known, terms, [term]))
         found = climb(target, start, free, evaluations=GLANCE)
         gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
         return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
@@ -496,8 +559,7 @@ class LawSearch:
         if best.term.feature.shape is None:
             return best
         term = best.term.with_shape(self.units[1])
-        forward = PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), term])
-        target, start = known.on(forward), np.append(best.fit.x, 0.0)
+        target, start = known.on(self._with(known, terms, [term])), np.append(best.fit.x, 0.0)
         fit = climb(target, start, np.append(best.fit.free, len(best.fit.x)))
         found = replace(best, term=term, target=target, fit=fit)
         cost = 0.5 * float(np.log(max(float(np.sum(known.measurements.valid)), 2.0)))
@@ -506,6 +568,16 @@ class LawSearch:
             return best
         self.report(f"its shape is {found.feature.shape:.3g}, {gained:.1f} nats better than {best.feature.shape:.3g}")
         return replace(found, score=best.score + gained)
+
+
+def leading_terms(ranked: Sequence[TermGain], where: Sequence[PortEvidence]) -> list[TermGain]:
+    """The best terms by evidence of their ports and by gain."""
+    by_port: dict[Port, TermGain] = {}
+    for row in ranked:
+        by_port.setdefault(row.port, row)
+    chosen = list(by_port.values())[: BY_GAIN + 1]
+    chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
+    return list(dict.fromkeys([*chosen, *ranked[:BY_GAIN]]))
 
 
 def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:
@@ -566,7 +638,10 @@ def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
     white = known.measurements.series(fit.residual).reshape(groups, -1)
     slopes = known.measurements.series(fit.jacobian.T).reshape(len(fit.free), groups, -1)
     scale = _scale(known, fit)
-    return replace(found, residual=white, jacobian=np.moveaxis(slopes * scale[:, None, None], 0, 2))
+    own = known.forward.coordinates
+    pulls = np.append(own.prior_slopes(fit.x[: len(own.names)])[0], -fit.x[len(own.names) :])  # laws have unit normals
+    jacobian = np.moveaxis(slopes * scale[:, None, None], 0, 2)
+    return replace(found, residual=white, jacobian=jacobian, pull=-pulls[fit.free] * scale)
 
 
 def law_search(
