@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -331,7 +332,7 @@ class LawSearch:
                 gates.append(self._gate(found, values, null))
                 ranked = self._ranked(found, values, gates[-1], terms=terms)
                 model = LinearModel(known, terms, fit, found)
-                chosen = self._confirmed(model, ranked, gates[-1], lambda rows, where=where: leading_terms(rows, where))
+                chosen = self._confirmed(model, ranked, gates[-1], partial(leading_terms, where=where))
                 refits = self._refits(known, terms, fit, chosen)
                 if not refits or refits[0].score <= 0.0:
                     break
@@ -465,7 +466,7 @@ class LawSearch:
             model = LinearModel(known, terms, bare, _relinearised(known, found, bare), _precision(known, bare))
             ranked = self._ranked(model.found, values, gate, model.precision, terms)
             ranked = [row for row in ranked if row.place not in tried]
-            fresh = self._confirmed(model, ranked, gate, lambda rows, term=best.term: fresh_terms(rows, term, where))
+            fresh = self._confirmed(model, ranked, gate, partial(fresh_terms, best=best.term, where=where))
             tried |= {row.place for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             every += others
