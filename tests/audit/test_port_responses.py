@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rfdropo_bayes.audit.extension import Rules
-from rfdropo_bayes.audit.law_search import PIECES, LawSearch, TermGain, _pieces, _sums, fresh_terms, left_out_gains
+from rfdropo_bayes.audit.law_search import (
+    PIECES,
+    LawSearch,
+    TermGain,
+    _pieces,
+    _sums,
+    fresh_terms,
+    leading_terms,
+    left_out_gains,
+)
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
 from rfdropo_bayes.audit.port_rollouts import PlacedTerm, Scope, coefficient_name, placed
@@ -135,6 +145,26 @@ def test_a_term_is_tried_at_all_leading_ports():
     # So is the term itself in other recordings.
     april = replace(ranked[4], scope=Scope("april", ("r1",)))
     assert fresh_terms([*ranked[:4], april], PlacedTerm(PORTS[1], time, spec), where) == [*ranked[:3], april]
+
+
+def test_terms_are_chosen_by_what_they_bring_beside_the_model_as_it_is():
+    """Responses of the first model say 90 nats of a term that brings none; of the others the last one is the best, and
+    a term that follows the one that went is looked at in its place."""
+    found = responses(3)
+    told = {"time": 90.0, "rate": 50.0, "command": 40.0, "magnitude": 30.0, "direction": 20.0}
+    true = {"time": 1.0, "rate": 35.0, "command": 45.0, "magnitude": 30.0, "direction": 15.0}
+    looked = []
+
+    class Looking(LawSearch):
+        def _beside(self, model, rows):
+            looked.append([row.feature.kind for row in rows])
+            return [replace(row, gain=true[row.feature.kind]) for row in rows]
+
+    search = Looking(found.ports, SimpleNamespace(features=[], of_motion=()), [], ((), "m"), 0, 0.1)
+    ranked = [TermGain(PORTS[0], Feature(kind), gain, 0.5, 1.0, 0.1, 1.0) for kind, gain in told.items()]
+    chosen = search._confirmed(None, ranked, 9.0, partial(leading_terms, where=[]))
+    assert [row.feature.kind for row in chosen] == ["command", "rate"]
+    assert looked == [["time", "rate"], ["command"]]
 
 
 def brute(found: Responses, column: np.ndarray) -> float:
