@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rfdropo_bayes.audit.candidates import Candidate
@@ -62,11 +62,17 @@ class AuditProblem:
         """A candidate by its name; None for the mesh and time step, which are none of the library's."""
         return next((candidate for candidate in self.candidates if candidate.name == name), None)
 
+    def kinds(self, names: Sequence[str]) -> list[Hashable]:
+        """What tells recordings apart beside their commands: the parameters that they have, and their group, in which a
+        mechanism or a law may act alone. Recordings of one kind may be repeats of each other."""
+        groups = [""] * len(names) if self.groups is None else [self.groups.group_of(name) for name in names]
+        return [(*slots, group) for slots, group in zip(self.coordinates.slots(names), groups, strict=True)]
+
 
 def measurements_of(problem: AuditProblem, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
     """Some of the recordings, no more rows than the longest of them has; repeats are joined where they are given."""
     index = list(chosen)
-    kinds = [tuple(slots) for slots in problem.coordinates.slots([problem.model.recordings.names[i] for i in index])]
+    kinds = problem.kinds([problem.model.recordings.names[i] for i in index])
     rows = int(problem.model.recordings.rows[index].max())
     channels = [c.of_recordings(index, rows) if isinstance(c, Series) else c for c in problem.model.channels]
     return gather_measurements(problem.model.recordings.of(index, rows), channels, repeats, kinds)

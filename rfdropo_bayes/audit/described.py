@@ -177,7 +177,7 @@ def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], No
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
     target, fit = model.last
-    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report)
+    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups)
     found = law_search(target, *options).find(target, fit)
     if not found.terms:
         return Described(found, model.steps)
@@ -223,6 +223,7 @@ def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
         rows.append(
             {
                 "port": refit.term.port.name,
+                "group": refit.term.scope.group,
                 "feature": refit.term.feature.kind,
                 "coefficient": refit.term.spec.name,
                 "mean": float(column.mean()),

@@ -57,6 +57,10 @@ class Groups:
         """Of a group, or of all groups but one."""
         return self.members[scope] if scope in self.members else self.complements[scope]
 
+    def group_of(self, recording: str) -> str:
+        """The group of a recording; empty if it belongs to none."""
+        return next((name for name, own in self.members.items() if recording in own), "")
+
 
 @dataclass
 class _Space:

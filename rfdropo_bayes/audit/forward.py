@@ -243,7 +243,8 @@ class Forward:
         self.lanes = lanes
         self.coordinates = coordinates
         self.commands = _cut(commands.of(list(chosen.values())), rows)
-        self.slots = coordinates.slots(list(chosen))
+        self.recordings = tuple(chosen)
+        self.slots = coordinates.slots(self.recordings)
         self.count = len(chosen)
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0

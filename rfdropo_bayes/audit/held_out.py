@@ -211,7 +211,7 @@ def _left_out(
     the later rows of all from the earlier ones."""
     measured = target.measurements
     groups = len(measured.members)
-    kinds = [tuple(slots) for slots in target.forward.slots]
+    kinds = problem.kinds(target.forward.recordings)
     if min(kinds.count(kind) for kind in kinds) > 1:
         held_out = "fitted recordings, each left out in turn"
         masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]

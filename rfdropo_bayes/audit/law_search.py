@@ -10,13 +10,16 @@ that of what it leaves (see `inadequacy`), taken anew after each term.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.deadline import OutOfTime
+from rfdropo_bayes.audit.differences import Groups
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.audit.inadequacy import judged_anew
 from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
@@ -29,10 +32,12 @@ from rfdropo_bayes.audit.port_responses import (
     with_exact_columns,
 )
 from rfdropo_bayes.audit.port_rollouts import (
+    EVERYWHERE,
     PREFIX,
     FeatureTable,
     PlacedTerm,
     PortedForward,
+    Scope,
     coefficient_name,
     placed,
 )
@@ -57,7 +62,7 @@ class TermGain:
     """One feature at one port, fitted linearly together with the base parameters.
 
     Attributes:
-        port, feature: which.
+        port, feature, scope: which, and in which recordings.
         gain: of log density of left-out recordings [nat].
         share: of what is left beyond the noise there.
         size: of the coefficient; sd: its deviation.
@@ -71,6 +76,12 @@ class TermGain:
     size: float
     sd: float
     typical: float
+    scope: Scope = EVERYWHERE
+
+    @property
+    def place(self) -> tuple[Port, Feature, str]:
+        """See `PlacedTerm.place`."""
+        return self.port, self.feature, self.scope.group
 
 
 @dataclass(frozen=True)
@@ -162,7 +173,8 @@ class FoundLaw:
 
 @dataclass(frozen=True)
 class _Sums:
-    """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data."""
+    """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data; the
+    pull of the priors is that of the first data set."""
 
     jj: Float[np.ndarray, "piece d d"]
     jx: Float[np.ndarray, "piece d feature"]
@@ -171,6 +183,7 @@ class _Sums:
     xy: Float[np.ndarray, "piece feature data"]
     yy: Float[np.ndarray, "piece data"]
     count: Float[np.ndarray, " piece"]
+    pull: Float[np.ndarray, " d"]
 
 
 def _pieces(array: Float[np.ndarray, "group value *rest"]) -> Float[np.ndarray, "piece value *rest"]:
@@ -199,6 +212,7 @@ def _sums(
         np.swapaxes(x, 1, 2) @ y,
         np.sum(y**2, axis=1),
         count,
+        np.zeros(j.shape[2]) if found.pull is None else found.pull,
     )
 
 
@@ -208,22 +222,30 @@ def left_out_gains(
     """Gain [nat] of every feature in every data set, each alone beside the base parameters; of the first data set also
     share, size and deviation.
 
-    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, unless
-    more is known of them.
+    A piece that is left out is predicted by base parameters of which the other pieces leave some unknown: r ~ N(0, S),
+    S = 1 + J A^-1 J' with A the precision that the others give. A gain is half of what a feature takes from r' S^-1 r.
+    Counted as r'r, it would mostly be what a feature happens to take from the error of base parameters that this piece
+    alone determines, and no refit brings it.
+
+    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, and it
+    pulls at the parameters where they are not at its centre, unless more is known of them.
     """
     before, gain = 0.0, np.zeros(sums.xy.shape[1:])
     held = np.eye(sums.jj.shape[1]) if precision is None else precision
-    for p in range(len(sums.yy)):
-        others = [part.sum(axis=0) - part[p] for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
-        b, u, c, _ = _solved(others, held)
-        left_j = sums.jy[p] - sums.jj[p] @ b
-        left_x = sums.xy[p] - sums.jx[p].T @ b
-        along = left_x - u.T @ left_j
-        square = sums.xx[p] - 2.0 * np.sum(u * sums.jx[p], axis=0) + np.sum(u * (sums.jj[p] @ u), axis=0)
-        gain += 2.0 * c * along - c**2 * square[:, None]
-        own, b = sums.jy[p, :, 0], b[:, 0]
-        before += sums.yy[p, 0] - 2.0 * float(b @ own) + float(b @ sums.jj[p] @ b) - sums.count[p]
     whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
+    if precision is None:
+        whole[3][:, 0] -= sums.pull
+    inverse = np.linalg.inv(whole[0] + held)
+    for p in range(len(sums.yy)):
+        own = (sums.jj[p], sums.jx[p], sums.xx[p], sums.jy[p], sums.xy[p])
+        others = [every - part for every, part in zip(whole, own, strict=True)]
+        b, u, c, _ = _solved(others, held)
+        left_j, left_jx = sums.jy[p] - sums.jj[p] @ b, sums.jx[p] - sums.jj[p] @ u
+        along = sums.xy[p] - sums.jx[p].T @ b - u.T @ left_j - left_jx.T @ inverse @ left_j
+        square = sums.xx[p] - np.sum(u * (sums.jx[p] + left_jx), axis=0) - np.sum(left_jx * (inverse @ left_jx), axis=0)
+        gain += 2.0 * c * along - c**2 * square[:, None]
+        first, own_j = left_j[:, 0], sums.jy[p, :, 0]
+        before += sums.yy[p, 0] - float(b[:, 0] @ (own_j + first)) - float(first @ inverse @ first) - sums.count[p]
     _, _, size, sd = _solved(whole, held)
     return 0.5 * gain, gain[:, 0] / max(before, 1e-300), size[:, 0], sd
 
@@ -240,6 +262,24 @@ def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarr
     return b, u, c, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
 
 
+class LinearModel(NamedTuple):
+    """A model, linear around its fit, beside which further terms are ranked.
+
+    Attributes:
+        known: target of the simulator without a law.
+        terms: of the law that the model has.
+        fit: the model.
+        found: responses, with the residual and the slopes of the fit.
+        precision: of the base parameters, see `left_out_gains`.
+    """
+
+    known: FitTarget
+    terms: Sequence[Refit]
+    fit: Fit
+    found: Responses
+    precision: Float[np.ndarray, "d d"] | None = None
+
+
 @dataclass
 class LawSearch:
     """The search for a law beside a fitted model.
@@ -254,6 +294,7 @@ class LawSearch:
         report: called with a line of words.
         most: terms that a law may have; None leaves their number to the recordings.
         taken: names of coefficients that the model has, of laws that an earlier audit found.
+        scopes: recordings in which a law may act: all, and those of each group.
     """
 
     ports: PortMap
@@ -265,6 +306,7 @@ class LawSearch:
     report: Callable[[str], None] = lambda line: None
     most: int | None = None
     taken: frozenset[str] = frozenset()
+    scopes: tuple[Scope, ...] = (EVERYWHERE,)
 
     def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
         """Where something acts that the model lacks, and by what law.
@@ -289,7 +331,9 @@ class LawSearch:
                     offered = next((row.gain for row in self._ranked(found, values, 0.0)), 0.0)
                 gates.append(self._gate(found, values, null))
                 ranked = self._ranked(found, values, gates[-1], terms=terms)
-                refits = self._refits(known, terms, fit, where, ranked)
+                model = LinearModel(known, terms, fit, found)
+                chosen = self._confirmed(model, ranked, gates[-1], partial(leading_terms, where=where))
+                refits = self._refits(known, terms, fit, chosen)
                 if not refits or refits[0].score <= 0.0:
                     break
                 best, others = self._exchanged(known, terms, found, values, refits, gates[-1], where)
@@ -330,9 +374,9 @@ class LawSearch:
         values = self.table.over(found.levels)
         return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
 
-    def _has(self, port: Port, feature: Feature) -> bool:
+    def _has(self, port: Port, feature: Feature, group: str) -> bool:
         """Whether a law of the model has this term."""
-        return bool(self.taken) and coefficient_name(port, feature, self.units[0]) in self.taken
+        return bool(self.taken) and coefficient_name(port, feature, self.units[0], group) in self.taken
 
     def _features(self, port: Port) -> Sequence[Feature]:
         """What a law at a port may be made of: on a body of the motion, too."""
@@ -350,7 +394,7 @@ class LawSearch:
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
-        law = f"{best.term.port.words}: {best.feature.formula(names)}"
+        law = f"{best.term.port.words}: {best.feature.formula(names)}{in_words(best.term.scope)}"
         self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
@@ -365,8 +409,8 @@ class LawSearch:
         series = np.moveaxis(null.reshape(-1, *found.residual.shape), 0, 2)
         most = np.full(len(null), -np.inf)
         for port in self.ports.ports:
-            columns = feature_columns(found, port, self._offered(port, values)[1])
-            most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
+            for _, columns in self._scoped(found, feature_columns(found, port, self._offered(port, values)[1])):
+                most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
         return float(np.quantile(most, 1.0 - self.family, method="higher"))
 
     def _ranked(
@@ -379,19 +423,25 @@ class LawSearch:
         from linear, they would bring something again. A term whose shape is inferred has every shape.
         """
         rows = []
-        had = {(refit.term.port, refit.term.feature) for refit in terms}
-        had |= {(refit.term.port, refit.term.feature._replace(shape=None)) for refit in terms if refit.term.shape}
-        had |= {(port, f) for port in self.ports.ports for f in self._features(port) if self._has(port, f)}
+        had = {refit.term.place for refit in terms}
+        had |= {_of_any_shape(refit.term.place) for refit in terms if refit.term.shape}
         for port in self.ports.ports:
             features, (sizes, signals) = self._features(port), self._offered(port, values)
-            columns = feature_columns(found, port, signals)
-            gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
-            gain = gains[:, 0]
-            passed = np.flatnonzero((gain > gate) & (share >= LEAST)).tolist()
-            for k in (k for k in passed if not had & {(port, features[k]), (port, features[k]._replace(shape=None))}):
-                parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
-                rows.append(TermGain(port, features[k], float(gain[k]), float(share[k]), *parts))
+            for scope, columns in self._scoped(found, feature_columns(found, port, signals)):
+                gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
+                for k in np.flatnonzero((gains[:, 0] > gate) & (share >= LEAST)).tolist():
+                    parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
+                    row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
+                    if not had & {row.place, _of_any_shape(row.place)} and not self._has(*row.place):
+                        rows.append(row)
         return sorted(rows, key=lambda row: -row.gain)
+
+    def _scoped(
+        self, found: Responses, columns: Float[np.ndarray, "group value feature"]
+    ) -> Iterator[tuple[Scope, Float[np.ndarray, "group value feature"]]]:
+        """What features do where they act in the recordings of each scope alone."""
+        for scope in self.scopes:
+            yield scope, columns * scope.has(found.recordings)[:, None, None] if scope.group else columns
 
     def _exchanged(
         self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
@@ -405,7 +455,7 @@ class LawSearch:
         that lead by evidence, where the linear model may have preferred another one: a delay is far from linear.
         """
         chosen, every = refits[0], list(refits)
-        best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
+        best, tried = self._climbed(chosen), {chosen.term.place}
         for _ in range(EXCHANGES):
             fit = best.fit
             without = fit.x.copy()
@@ -413,16 +463,18 @@ class LawSearch:
             residual = best.target.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
-            linear = _relinearised(known, found, bare)
-            ranked = self._ranked(linear, values, gate, _precision(known, bare), terms)
-            fresh = fresh_terms([row for row in ranked if (row.port, row.feature) not in tried], best.term, where)
-            tried |= {(row.port, row.feature) for row in fresh}
+            model = LinearModel(known, terms, bare, _relinearised(known, found, bare), _precision(known, bare))
+            ranked = self._ranked(model.found, values, gate, model.precision, terms)
+            ranked = [row for row in ranked if row.place not in tried]
+            fresh = self._confirmed(model, ranked, gate, partial(fresh_terms, best=best.term, where=where))
+            tried |= {row.place for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             every += others
             better = max(others, key=lambda refit: refit.score, default=best)
             if better.square >= best.square - 2.0:
                 break
-            self.report(f"instead: {better.term.port.words}: {better.term.feature.formula(self.units[0])}")
+            words = f"{better.term.port.words}: {better.term.feature.formula(self.units[0])}"
+            self.report(f"instead: {words}{in_words(better.term.scope)}")
             best = self._climbed(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
         best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
@@ -431,36 +483,67 @@ class LawSearch:
     def _cost(self, known: FitTarget) -> float:
         """Nats that a term costs: its parameter, and the choice among all features at all ports."""
         count = max(float(np.sum(known.measurements.valid)), 2.0)
-        return float(0.5 * np.log(count) + np.log(sum(len(self._features(port)) for port in self.ports.ports)))
+        choices = len(self.scopes) * sum(len(self._features(port)) for port in self.ports.ports)
+        return float(0.5 * np.log(count) + np.log(choices))
 
-    def _refits(
-        self, known: FitTarget, terms: Sequence[Refit], fit: Fit, where: Sequence[PortEvidence], ranked: list[TermGain]
-    ) -> list[Refit]:
-        """The best terms by evidence of their ports and by gain, refitted; the best first."""
-        by_port: dict[Port, TermGain] = {}
-        for row in ranked:
-            by_port.setdefault(row.port, row)
-        chosen = list(by_port.values())[: BY_GAIN + 1]
-        chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
-        chosen += ranked[:BY_GAIN]
+    def _confirmed(
+        self, model: LinearModel, ranked: Sequence[TermGain], gate: float,
+        chosen: Callable[[Sequence[TermGain]], list[TermGain]],
+    ) -> list[TermGain]:  # fmt: skip
+        """The terms to refit, each with the gain that it has beside the model as it is now.
+
+        Responses are those of the first model, and splines miss what is fast. A law and the base parameters beside it
+        move the model far enough that gains are found which no refit brings. So what a chosen term does is found anew
+        by rollouts, and terms are chosen again until all of them have been seen so.
+        """
+        rows, seen = list(ranked), dict[tuple[Port, Feature, str], TermGain]()
+        while fresh := [row for row in chosen(rows) if row.place not in seen]:
+            seen |= {row.place: row for row in self._beside(model, fresh)}
+            rows = [seen.get(row.place, row) for row in rows]
+            rows = sorted((r for r in rows if r.gain > gate and r.share >= LEAST), key=lambda row: -row.gain)
+        return chosen(rows)
+
+    def _beside(self, model: LinearModel, rows: Sequence[TermGain]) -> list[TermGain]:
+        """Terms with their gains beside a model, by what rollouts of it say that each does."""
+        placed_terms = [self._placed(row) for row in rows]
+        target = model.known.on(self._with(model.known, model.terms, placed_terms))
+        x = np.append(model.fit.x, np.zeros(len(rows)))
+        directions = np.eye(len(x))[-len(rows) :]
+
+        def compute() -> dict[str, np.ndarray]:
+            return {"slopes": target.slopes(np.repeat(x[None], len(rows), axis=0), directions)[0]}
+
+        series = target.measurements.series(target.recall("terms", [x], compute)["slopes"])
+        columns = np.moveaxis(series.reshape(len(rows), len(model.found.residual), -1), 0, 2)
+        gains, share, size, sd = left_out_gains(_sums(model.found, columns), model.precision)
+        scales = [float(term.spec.prior["scale"]) for term in placed_terms]
+        numbers = zip(rows, gains[:, 0].tolist(), share.tolist(), size * scales, sd * scales, strict=True)
+        return [replace(row, gain=g, share=s, size=float(c), sd=float(d)) for row, g, s, c, d in numbers]
+
+    def _placed(self, row: TermGain) -> PlacedTerm:
+        return placed(row.port, row.feature, row.typical, *self.units, row.scope)
+
+    def _with(self, known: FitTarget, terms: Sequence[Refit], added: Sequence[PlacedTerm]) -> PortedForward:
+        """Rollouts with terms after those that the law has."""
+        return PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), *added])
+
+    def _refits(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, chosen: Sequence[TermGain]) -> list[Refit]:
+        """Terms, each refitted; the best first."""
         refits = []
-        for row in dict.fromkeys(chosen):
+        for row in chosen:
             found = self._refit(known, terms, fit, row)
             refits.append(found)
-            words = f"{row.port.words}: {row.feature.formula(self.units[0])}"
+            words = f"{row.port.words}: {row.feature.formula(self.units[0])}{in_words(row.scope)}"
             self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
         return sorted(refits, key=lambda refit: -refit.score)
 
     def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
         """The model with one more term, climbed a few steps from where the linear model has it."""
-        names, unit = self.units
-        term = placed(row.port, row.feature, row.typical, names, unit)
-        placed_terms = [*(refit.term for refit in terms), term]
-        forward = PortedForward(known.forward, self.ports, self.table, placed_terms)
+        term = self._placed(row)
         scale = float(term.spec.prior["scale"])
         start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
         free = np.append(fit.free, len(start) - 1)
-        target = known.on(forward)
+        target = known.on(self._with(known, terms, [term]))
         found = climb(target, start, free, evaluations=GLANCE)
         gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
         return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
@@ -477,8 +560,7 @@ class LawSearch:
         if best.term.feature.shape is None:
             return best
         term = best.term.with_shape(self.units[1])
-        forward = PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), term])
-        target, start = known.on(forward), np.append(best.fit.x, 0.0)
+        target, start = known.on(self._with(known, terms, [term])), np.append(best.fit.x, 0.0)
         fit = climb(target, start, np.append(best.fit.free, len(best.fit.x)))
         found = replace(best, term=term, target=target, fit=fit)
         cost = 0.5 * float(np.log(max(float(np.sum(known.measurements.valid)), 2.0)))
@@ -489,11 +571,34 @@ class LawSearch:
         return replace(found, score=best.score + gained)
 
 
+def leading_terms(ranked: Sequence[TermGain], where: Sequence[PortEvidence]) -> list[TermGain]:
+    """The best terms by evidence of their ports and by gain."""
+    by_port: dict[Port, TermGain] = {}
+    for row in ranked:
+        by_port.setdefault(row.port, row)
+    chosen = list(by_port.values())[: BY_GAIN + 1]
+    chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
+    return list(dict.fromkeys([*chosen, *ranked[:BY_GAIN]]))
+
+
 def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:
-    """Terms that may take the place of the best one: those of most gain, and its feature at the leading ports."""
+    """Terms that may take the place of the best one: those of most gain, its feature at the leading ports, and the term
+    itself in other recordings."""
     leading = [row.port for row in where[:BY_EVIDENCE]]
-    alike = [row for row in ranked if row.port in leading and row.feature == best.feature]
+    same = [row for row in ranked if row.feature == best.feature]
+    alike = [row for row in same if row.port == best.port or (row.port in leading and row.scope == best.scope)]
     return list(dict.fromkeys([*ranked[:FRESH], *alike]))
+
+
+def _of_any_shape(place: tuple[Port, Feature, str]) -> tuple[Port, Feature, str]:
+    """The place of a term whose shape may be any."""
+    port, feature, group = place
+    return port, feature._replace(shape=None), group
+
+
+def in_words(scope: Scope) -> str:
+    """Where a law acts in one group of recordings alone, the group."""
+    return f" in {scope.group} alone" if scope.group else ""
 
 
 FARTHEST = 100.0  # prior deviations within which a refit starts
@@ -501,10 +606,10 @@ FARTHEST = 100.0  # prior deviations within which a refit starts
 
 def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
     """Refits of other terms that leave as little as the best one, within `TIED`; each term once, the best first."""
-    found: dict[tuple[Port, Feature], Refit] = {}
+    found: dict[tuple[Port, Feature, str], Refit] = {}
     for refit in sorted(others, key=lambda refit: -refit.score):
-        found.setdefault((refit.term.port, refit.term.feature), refit)
-    found.pop((best.term.port, best.term.feature), None)
+        found.setdefault(refit.term.place, refit)
+    found.pop(best.term.place, None)
     return [refit for refit in found.values() if refit.score > best.score - TIED]
 
 
@@ -534,14 +639,17 @@ def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
     white = known.measurements.series(fit.residual).reshape(groups, -1)
     slopes = known.measurements.series(fit.jacobian.T).reshape(len(fit.free), groups, -1)
     scale = _scale(known, fit)
-    return replace(found, residual=white, jacobian=np.moveaxis(slopes * scale[:, None, None], 0, 2))
+    own = known.forward.coordinates
+    pulls = np.append(own.prior_slopes(fit.x[: len(own.names)])[0], -fit.x[len(own.names) :])  # laws have unit normals
+    jacobian = np.moveaxis(slopes * scale[:, None, None], 0, 2)
+    return replace(found, residual=white, jacobian=jacobian, pull=-pulls[fit.free] * scale)
 
 
 def law_search(
     target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, family: float,
-    report: Callable[[str], None],
+    report: Callable[[str], None], groups: Groups | None = None,
 ) -> LawSearch:  # fmt: skip
-    """The search on a simulator with these ports and commands."""
+    """The search on a simulator with these ports and commands, for laws of all recordings and of single groups."""
     commands = target.forward.commands
     stroke = float(np.ptp(np.concatenate([np.asarray(commands.step), np.asarray(commands.initial)[:, None]], axis=1)))
     stroke = max(stroke, 1e-12)
@@ -549,4 +657,7 @@ def law_search(
     table = FeatureTable(target.forward.lanes, features)
     own, names = own_dictionary(stroke), target.forward.coordinates.names
     taken = frozenset(name for name in names if name.startswith(PREFIX))
-    return LawSearch(ports, table, own, (tuple(channels), unit), seed, family, report, taken=taken)
+    members = {} if groups is None else groups.members
+    scopes = (EVERYWHERE, *(Scope(name, recordings) for name, recordings in members.items()))
+    units = (tuple(channels), unit)
+    return LawSearch(ports, table, own, units, seed, family, report, taken=taken, scopes=scopes)

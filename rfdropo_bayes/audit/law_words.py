@@ -10,7 +10,7 @@ import numpy as np
 from rfdropo_bayes.audit.described import Described, coefficients
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.inadequacy import POOR
-from rfdropo_bayes.audit.law_search import Refit
+from rfdropo_bayes.audit.law_search import Refit, in_words
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.port_evidence import PortEvidence
 
@@ -79,8 +79,8 @@ def _port(row: PortEvidence) -> dict[str, Any]:
 
 
 def _tie(tie: Refit, names: Sequence[str]) -> dict[str, Any]:
-    formula = tie.feature.formula(names)
-    return {"port": tie.term.port.name, "feature": formula, "score": tie.score}
+    place = {"port": tie.term.port.name, "group": tie.term.scope.group}
+    return {**place, "feature": tie.feature.formula(names), "score": tie.score}
 
 
 def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
@@ -88,7 +88,8 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
     parts: dict[str, list[str]] = {}
     for refit in terms:
         own = parts.setdefault(refit.term.port.words, [])
-        own.append(f"c{sum(map(len, parts.values())) + 1} {refit.feature.formula(names)}")
+        number = sum(map(len, parts.values())) + 1
+        own.append(f"c{number} {refit.feature.formula(names)}{in_words(refit.term.scope)}")
     return "; ".join(f"w({port}) = {' + '.join(own)}" for port, own in parts.items())
 
 
@@ -115,7 +116,7 @@ def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:
     feature, unit = refit.feature, "" if row["unit"] == "-" else f" {row['unit']}"
     size = f"{row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
     found = f"{size} times {feature.formula(names)}{_shape(row)}"
-    return f"at {refit.term.port.words} it changes {feature.words(names)} ({found})"
+    return f"at {refit.term.port.words}{in_words(refit.term.scope)} it changes {feature.words(names)} ({found})"
 
 
 def _shape(row: dict[str, Any]) -> str:
@@ -155,7 +156,9 @@ def _ties(described: Described, names: Sequence[str]) -> str:
     ties = described.found.ties[:MOST_TIES]
     if not ties:
         return ""
-    found = ", ".join(f"{tie.feature.formula(names)} at {tie.term.port.words}" for tie in ties)
+    found = ", ".join(
+        f"{tie.feature.formula(names)} at {tie.term.port.words}{in_words(tie.term.scope)}" for tie in ties
+    )
     return f" Not to be told from it by these data: {found}."
 
 

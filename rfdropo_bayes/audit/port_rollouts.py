@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.forward import Fields, Forward, Lanes, Points
@@ -40,13 +40,34 @@ FINE = 1e-5
 """Relative steps of an engine's own differences, up to which it counts as smooth."""
 
 
+class Scope(NamedTuple):
+    """The recordings in which a law acts: those of one group, or all where ``group`` is empty."""
+
+    group: str = ""
+    recordings: tuple[str, ...] = ()
+
+    def has(self, recordings: Sequence[str]) -> Bool[np.ndarray, " recording"]:
+        """Which of these it contains."""
+        return np.array([not self.group or name in self.recordings for name in recordings])
+
+
+EVERYWHERE = Scope()
+
+
 class PlacedTerm(NamedTuple):
-    """A term of a law: the port, the feature, its coefficient, and its shape where that is a parameter, too."""
+    """A term of a law: the port, the feature, its coefficient, its shape where that is a parameter, too, and the
+    recordings in which it acts."""
 
     port: Port
     feature: Feature
     spec: ParameterSpec
     shape: ParameterSpec | None = None
+    scope: Scope = EVERYWHERE
+
+    @property
+    def place(self) -> tuple[Port, Feature, str]:
+        """The port, the feature and the group, which no two terms of a law share."""
+        return self.port, self.feature, self.scope.group
 
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
@@ -207,7 +228,8 @@ class PortedForward(Forward):
         """Digest of what rollouts depend on."""
         own = self.coordinates
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
-        return digest(self.plain.identity, repr([(t.port.name, t.feature, t.specs) for t in self.terms]), scale)
+        terms = [(t.port.name, t.feature, t.specs, t.scope.has(self.recordings).tolist()) for t in self.terms]
+        return digest(self.plain.identity, repr(terms), scale)
 
     def instead_of(self, forward: Forward, table: FeatureTable) -> PortedForward:
         """The same laws on other rollouts, as of other recordings or of a finer simulator."""
@@ -239,6 +261,8 @@ class PortedForward(Forward):
         """Signals of every lane at each port that has a law."""
         flat = theta.reshape(-1, theta.shape[-1])
         own = dict(zip(self._own, np.repeat(self._beside(points), self.count, axis=0).T, strict=True))
+        for term in self.terms:
+            own[term.spec.name] = own[term.spec.name] * np.tile(term.scope.has(self.recordings), len(points))
         parts = [(t, m) for t in self.terms if not t.feature.of_motion for m in self.ports.members(t.port)]
         found: dict[Port, Signals] = {}
         if parts:
@@ -293,23 +317,27 @@ def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordin
     return coordinates.with_further(added)
 
 
-def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str) -> PlacedTerm:
+def placed(
+    port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str, scope: Scope = EVERYWHERE
+) -> PlacedTerm:
     """A term whose coefficient has a prior of so many sizes of its port over the feature's own size."""
     scale = float(f"{SPREAD * port.size / max(size, 1e-300):.3g}")
-    name = coefficient_name(port, feature, channels)
+    name = coefficient_name(port, feature, channels, scope.group)
     words = f"of the law at {port.words}: it changes {feature.words(channels)}"
     return PlacedTerm(
         port,
         feature,
         ParameterSpec(name, unit_of(port.unit, feature, unit), -FAR * scale, FAR * scale, 0.0, normal(scale), words),
+        scope=scope,
     )
 
 
-def coefficient_name(port: Port, feature: Feature, channels: Sequence[str]) -> str:
-    """Name of the parameter that is the coefficient of a feature at a port."""
+def coefficient_name(port: Port, feature: Feature, channels: Sequence[str], group: str = "") -> str:
+    """Name of the parameter that is the coefficient of a feature at a port, in one group of recordings or in all."""
     at = f"{port.name} {feature.kind} {' '.join(feature.commands(channels))}".strip()
     shape = "" if feature.shape is None else f"_{feature.shape:.3g}"
-    return f"{PREFIX}{at.replace(' ', '_')}{shape}"
+    own = f"_in_{group}" if group else ""
+    return f"{PREFIX}{at.replace(' ', '_')}{shape}{own.replace(' ', '_')}"
 
 
 SPREAD = 3.0

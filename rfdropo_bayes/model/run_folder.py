@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -137,6 +136,11 @@ def _held(out: Path, *, shared: bool) -> Iterator[None]:
     Raises:
         InputError: another program holds it, and the two may not share it.
     """
+    try:
+        import fcntl
+    except ImportError:  # no locks of this kind on Windows
+        yield
+        return
     handle = os.open(out, os.O_RDONLY)
     try:
         fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

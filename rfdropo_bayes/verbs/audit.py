@@ -66,7 +66,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
-from rfdropo_bayes.verbs.between import Between, extend_groups, find_groups, groups_at_hand
+from rfdropo_bayes.verbs.between import Between, confine_laws, extend_groups, find_groups, groups_at_hand
 
 Workshop = dict[str, Lanes]
 
@@ -473,6 +473,7 @@ def extended_tables(
         model.setdefault("priors", {}).update(sized_priors(answer, candidate))
     if laws := law_tables(answer):
         model["laws"] = [*model.get("laws", []), *laws]
+        confine_laws(model, answer)
     audit = extended.get("audit", {})
     if "candidates" in audit:
         adopted = {step.name for step in answer.adopted}

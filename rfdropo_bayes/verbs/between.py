@@ -141,6 +141,16 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
             model.setdefault("priors", {}).setdefault(name, {})
 
 
+def confine_laws(model: dict[str, Any], answer: Answer) -> None:
+    """Say in the table [model] of an experiment file which groups have the terms of a law that act in one alone."""
+    groups, law = answer.problem.groups, answer.law
+    for refit in [] if law is None else law.found.terms:
+        group = refit.term.scope.group
+        if group and groups is not None:
+            model["groups"] = _naming({group: groups.members[group]}, model.get("groups", {}))
+            model.setdefault("only_in", {})[refit.term.spec.name] = [group]
+
+
 def _groups_of(scope: str, groups: Groups, patterns: Patterns) -> dict[str, tuple[str, ...]]:
     """A group alone, or the groups that all recordings but those of one belong to."""
     recordings = groups.recordings(scope)

@@ -19,7 +19,7 @@ from rfdropo_bayes.audit.extension import Added, ExtensionSearch
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.held_out import predicted, stages_of
 from rfdropo_bayes.audit.inadequacy import POOR, as_measured, noise_share
-from rfdropo_bayes.audit.law_search import TIED, law_search
+from rfdropo_bayes.audit.law_search import TIED, LinearModel, _relinearised, law_search
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.port_responses import responses, under
@@ -260,6 +260,26 @@ def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
     share = np.mean(1.0 / known.measurements.count) * float(np.mean((known.noise.scale / judge.noise.scale) ** 2))
     assert far.noise == noise_share(judge) == pytest.approx(share)
     assert under(near, known, known) is near
+
+
+@pytest.mark.slow
+def test_what_a_term_brings_beside_a_model_is_told_by_rollouts_of_that_model():
+    """At a port of sensing, which is linear, it is what the responses say; of a model that has the law it is little."""
+    question, target, base, found = searched(Pushed())
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    search = law_search(target, *options)
+    given = responses(target, base, question.ports, search.table)
+    values = search._values(given)
+    given = search._sharpened(target, base, given, values, found.ports)
+    told = search._ranked(given, values, 0.0)[:3]
+    seen = search._beside(LinearModel(target, [], base, given), told)
+    for one, other in zip(told, seen, strict=True):
+        for name in ("gain", "share", "size", "sd"):
+            assert getattr(other, name) == pytest.approx(getattr(one, name), rel=2e-3)
+    (term,) = found.terms
+    after = LinearModel(target, [term], term.fit, _relinearised(target, given, term.fit))
+    (again,) = search._beside(after, told[1:2])
+    assert again.gain < 0.1 * told[1].gain
 
 
 @pytest.mark.slow

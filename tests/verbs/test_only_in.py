@@ -15,17 +15,17 @@ from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
 DELAY = 0.1
 TRUTH = {"gain": 1.4, "time_constant": 0.25, "zero": 0.01}
+WALK = {"duration": 2.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
 GROUPS = {"april": "april_*", "june": "june_*"}
 
 
 def recorded(delays, seed):
     """A recording for each name, with its delay [s]."""
-    walk = {"duration": 2.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
     model, noise = rb.Model(BOX, mechanisms=["command_delay"]), {"standard_deviation": SIGMA}
     runs = []
     for k, (name, delay) in enumerate(delays.items()):
         truth = TRUTH | {"command_delay": delay}
-        runs += rb.simulate(model, walk | {"recordings": [name]}, parameters=truth, noise=noise, seed=seed + k)
+        runs += rb.simulate(model, WALK | {"recordings": [name]}, parameters=truth, noise=noise, seed=seed + k)
     return runs
 
 
@@ -133,6 +133,36 @@ def test_the_file_that_an_audit_writes_is_calibrated_with_the_mechanism_in_its_g
     assert names == ["command_delay@april"]
     assert fit.record.flat(names[0]).mean() == pytest.approx(DELAY, abs=0.003)
     for run in recorded({"april_new": DELAY, "june_new": 0.0}, 30):
+        assert off(rb.predict(fit, run), run) < 3.0 * SIGMA
+
+
+@pytest.mark.slow
+def test_the_law_of_one_group_that_an_audit_writes_is_calibrated_and_predicted_there_alone(tmp_path):
+    """The drive of April pulls further the further it has been told to, which no mechanism does."""
+    excess = {"coefficient": "excess", "feature": "product", "commands": ["pull", "pull"], "scale": 20.0}
+    bent = rb.Model(BOX, laws=[{"port": "cable pull", "terms": [excess]}])
+    noise = {"standard_deviation": SIGMA}
+
+    def shown(names, seed):
+        made = []
+        for k, name in enumerate(names):
+            truth = TRUTH | {"excess": 15.0 if name.startswith("april") else 0.0}
+            made += rb.simulate(bent, WALK | {"recordings": [name]}, parameters=truth, noise=noise, seed=seed + k)
+        return made
+
+    known = shown(["april_a", "april_b", "april_c", "june_a", "june_b", "june_c"], 0)
+    unseen = shown(["april_t", "april_u", "june_t", "june_u"], 20)
+    base = rb.Model(BOX, noise="white", priors=PRIORS, groups=GROUPS)
+    options = {"library": False, "bootstraps": 199}
+    found = rb.audit(base, known, test=unseen, noise=noise, out=tmp_path / "audit", **options)
+    assert (found.verdict, found.content["law"]["terms"][0]["group"]) == ("described", "april")
+    tables = tomllib.loads((tmp_path / "audit" / "extended.toml").read_text())["model"]
+    ((name, groups),) = tables["only_in"].items()
+    assert groups == ["april"]
+    fit = rb.calibrate(rb.Model(BOX, **tables), known, rb.Laplace(draws=60, starts=1, screen=16), show=False)
+    assert [info.name for info in fit.record.free if info.name.startswith("law")] == [f"{name}@april"]
+    assert fit.record.flat(f"{name}@april").mean() == pytest.approx(15.0, abs=1.0)
+    for run in shown(["april_new", "june_new"], 30):
         assert off(rb.predict(fit, run), run) < 3.0 * SIGMA
 
 
