@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import AwareDatetime, BaseModel, ConfigDict
 
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.loop import ControlLoop, Phase
@@ -46,7 +46,7 @@ class HomingResult(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     robot: str
-    date: datetime.datetime
+    date: AwareDatetime
     homes: tuple[Home, ...]
 
     def save(self, path: Path) -> None:

@@ -200,6 +200,7 @@ def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"date": "2020-01-01T00:00:00Z"}, "h old, valid for"),
+        ({"date": "2020-01-01T00:00:00"}, "timezone"),  # written by hand
         ({"robot": "other"}, "is of robot 'other'"),
         ({"homes": []}, "other channels"),
     ],
