@@ -36,9 +36,9 @@ designed = rb.simulate(model, [blank], parameters=TRUTH, noise=noise, seed=1)
 again = rb.simulate(model, {**walk, "recordings": ["again"]}, parameters=TRUTH, noise=noise, seed=2)
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
-axes[0].step(time, 1e3 * sent, where="post", label=channels)
-axes[0].set(xlabel="time [s]", ylabel="pull [mm]", title="proposed")
-axes[0].legend()
+axes[0].step(time, 1e3 * sent, where="post", label=first[0].cable_names)
+axes[0].set(xlabel="time [s]", ylabel="pull [mm]", title="proposed", ylim=(-0.1, 3.2))  # room for the legend
+axes[0].legend(ncols=4, fontsize="small", loc="upper center")
 spread = {}
 for words, second in (("another like it", again), ("the proposed one", designed)):
     fit = rb.calibrate(model, [*first, *second], rb.Laplace(starts=1), seed=0, show=False)

@@ -28,7 +28,7 @@ if __name__ == "__main__":  # the simulated drives are a process of their own
     axes[0].legend()
     axes[1].step(run.command_time, 1e3 * run.command, where="post", label=run.cable_names)
     axes[1].set(xlabel="time [s]", ylabel="pull that was sent [mm]")
-    axes[1].legend(ncols=2, fontsize="small")
+    axes[1].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "run_a_motor_session.png")
     end = 1e3 * float(np.linalg.norm(run.position[-10:, -1].mean(axis=0) - GOAL))
     print(f"{len(run.time)} rows; the tip ends {end:.1f} mm from the goal")

@@ -83,9 +83,14 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     if as_json or quiet:
         say({**{key: found[key] for key in AUDITED if key in found}, **files}, quiet=quiet, as_json=as_json)
         return
+    from rfdropo_bayes.report.sentences import sentences
+
     console = _console()
     verdict = Text(found["verdict"], style=f"bold {COLOURS.get(found['verdict'], '')}")
-    console.print(verdict + Text(f": {found['sentence']}", style="not bold"), soft_wrap=True)
+    first, *further = sentences(found["sentence"])
+    console.print(verdict + Text(f": {first}", style="not bold"), soft_wrap=True)
+    for sentence in further:
+        console.print(Text(sentence), soft_wrap=True)
     rows = [
         (name, row, finding["mechanism"].replace("_", " "))
         for finding in found["findings"]

@@ -285,7 +285,7 @@ class TravelStop(InCommandUnit, SteppedActuation):
     name = "travel_stop"
     stage = "actuation"
     inside_drive = True
-    cause = "a drive that ignores commands beyond its stop, or beyond a limit of its controller"
+    cause = "a drive that moves from where it is, and ignores moves beyond its stop or a limit of its controller"
     remedy = "record the positions of the drives beside their commands; command absolute positions"
     in_metres = (
         ParameterSpec(

@@ -21,6 +21,7 @@ from rfdropo_bayes.report.headline import best_baseline
 from rfdropo_bayes.report.replay import replay, tracks_of
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
+from rfdropo_bayes.report.sentences import sentences
 from rfdropo_bayes.report.style import Picture, embed
 from rfdropo_bayes.report.units import display_name, display_unit
 
@@ -69,7 +70,7 @@ def render(template: str, **content: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
-    environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value, "spoken": spoken}
+    environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value, "sentences": sentences, "spoken": spoken}
     environment.globals["interval"] = interval
     assets = {}
     for name, file in (("stylesheet", "page.css"), ("script", "replay.js"), ("sort", "sort.js")):

@@ -21,6 +21,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import RunSettings, Workpiece, spec_of
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.audit_figures import Shown
+from rfdropo_bayes.report.sentences import sentences
 from rfdropo_bayes.report.trajectory_figures import AXES
 from rfdropo_bayes.results.calibrated import axes_or_new
 from rfdropo_bayes.results.named_entries import entry_number
@@ -179,7 +180,8 @@ class Audit:
 
     def _repr_html_(self) -> str:
         table = self.findings.to_html(float_format=lambda x: f"{x:.3g}") if len(self.findings) else ""
-        return f"<p><b>{escape(self.verdict.replace('_', ' '))}</b>: {escape(self.sentence)}</p>{table}"
+        said = "</p><p>".join(escape(sentence) for sentence in sentences(self.sentence))
+        return f"<p><b>{escape(self.verdict.replace('_', ' '))}</b>: {said}</p>{table}"
 
     def __repr__(self) -> str:
         return f"{self.verdict}: {self.sentence}"
