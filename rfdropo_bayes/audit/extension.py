@@ -50,7 +50,8 @@ class Rules:
         classes: leading classes that are refitted; members: candidates refitted in all.
         effects: most mechanisms that are added to a model that is not far off.
         evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
-            the number of candidates more, since with so many to choose from a few together imitate most things.
+            the number of candidates more, since with so many to choose from a few together imitate most things. One
+            that brings so much less than the best is no longer its equal.
         bootstraps: simulated data sets behind every p-value.
         minutes: for the whole audit; when they are up it finishes with what it knows.
         base_passes, extended_passes: p-values of the joint test from which a model is let pass.
@@ -79,7 +80,8 @@ class Added:
 
     Attributes:
         name: of the mechanism.
-        members: its equivalence class, itself first.
+        members: its equivalence class, itself first: what looks the same and explains as much, and what has as much
+            evidence once it is refitted, but for `Rules.evidence`.
         before: the screen of the model without it.
         fit: of the model with it.
         log_bayes_factor: of the model with against that without it, by Laplace.
@@ -281,6 +283,8 @@ class ExtensionSearch:
         # What looks the same near null may be another thing at the size that it has.
         able = [row for row in able if refits.get(row.name, np.inf) > refits[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
+        # What brings nearly as much, whatever it looks like, is no less likely a cause.
+        members += tuple(n for n in worth if n not in members and refits[n] > refits[best] - self.rules.evidence)
         judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
         return Added(best, members, found, fits[best], refits[best], refits, judge)
 

@@ -437,6 +437,24 @@ def test_an_effect_is_found_between_a_point_that_does_nothing_and_one_that_does_
     assert asked.coordinates.named(search.refit(base, row).x)["play"] == pytest.approx(1.02, abs=0.003)
 
 
+def test_a_candidate_that_brings_nearly_as_much_is_named_beside_the_best(monkeypatch):
+    """However little its signature is like that of the best: within three nats these data do not tell the two apart."""
+    asked = problem({**TRUTH, "play": 1.0}, 1)
+    target, base = base_model(asked, 0)
+    search = ExtensionSearch(target, asked.candidates, replace(asked.rules, family=1.0), 0)
+    screen, _ = search.screened(base)
+    brings = {"play": 20.0, "creep": 18.0, "wall": 16.0}
+    monkeypatch.setattr(ExtensionSearch, "_leading", lambda *given: [screen.row(name) for name in brings])
+    monkeypatch.setattr(ExtensionSearch, "_from_afar", lambda self, name, fit: fit)
+
+    def refit(self, fit, row, start):
+        return replace(fit, log_evidence=fit.log_evidence + brings[row.name])
+
+    monkeypatch.setattr(ExtensionSearch, "_refit", refit)
+    step = search._extend(screen, [])
+    assert (step.name, step.members) == ("play", ("play", "creep"))
+
+
 @pytest.mark.slow
 def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it():
     asked = problem({**TRUTH, "play": 1.0}, 1)
