@@ -121,8 +121,10 @@ def append_line(path: Path, line: str) -> None:
 def _end_last_line(file: BinaryIO) -> None:
     """Take away the last line of a file of JSON lines where it was cut; end it where its newline alone is missing."""
     size = file.seek(0, os.SEEK_END)
-    file.seek(max(size - 1, 0))
-    if file.read(1) in (b"", b"\n"):
+    if size == 0:  # or a device, which ends nowhere
+        return
+    file.seek(size - 1)
+    if file.read(1) == b"\n":
         return
     file.seek(0)
     content = file.read()

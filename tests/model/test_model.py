@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
@@ -49,7 +50,12 @@ def test_a_changed_model_is_no_longer_that_of_the_file(model: rb.Model) -> None:
 
 
 def test_recordings_come_from_the_call_or_from_the_file(model: rb.Model) -> None:
-    given = ["a recording"]
+    rest = np.zeros((3, 1, 3))
+    given = [
+        rb.Trajectory.from_arrays(
+            time=np.arange(3.0), position=rest, command=np.zeros((3, 1)), markers=["tip"], channels=["a"]
+        )
+    ]
     assert model.runs(given) == (given, ())  # the file's are then not read for a test either
     assert model.runs(given, given) == (given, given)
     with pytest.raises(rb.InputError, match=r"\[data\]"):
