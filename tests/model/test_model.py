@@ -50,10 +50,10 @@ def test_a_changed_model_is_no_longer_that_of_the_file(model: rb.Model) -> None:
 
 
 def test_recordings_come_from_the_call_or_from_the_file(model: rb.Model) -> None:
-    rest = np.zeros((3, 1, 3))
+    path = np.linspace(0.0, 0.1, 9).reshape(3, 1, 3)
     given = [
         rb.Trajectory.from_arrays(
-            time=np.arange(3.0), position=rest, command=np.zeros((3, 1)), markers=["tip"], channels=["a"]
+            time=np.arange(3.0), position=path, command=np.zeros((3, 1)), markers=["tip"], channels=["a"]
         )
     ]
     assert model.runs(given) == (given, ())  # the file's are then not read for a test either
