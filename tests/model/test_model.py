@@ -56,7 +56,7 @@ def test_recordings_come_from_the_call_or_from_the_file(model: rb.Model) -> None
             time=np.arange(3.0), position=path, command=np.zeros((3, 1)), markers=["tip"], channels=["a"]
         )
     ]
-    assert model.runs(given) == (given, ())  # the file's are then not read for a test either
+    assert model.runs(given) == (given, [])  # the file's are then not read for a test either
     assert model.runs(given, given) == (given, given)
     with pytest.raises(rb.InputError, match=r"\[data\]"):
         model.runs(None)
