@@ -92,7 +92,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         *(f"{mm:g} mm" for mm in WITHIN),
         "15.25 mm by training",
         "median [mm]",
-        "at home: medians [mm]",
+        "medians at home [mm]",
     ]
     lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
     for variant in VARIANTS:
