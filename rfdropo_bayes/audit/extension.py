@@ -194,7 +194,7 @@ class ExtensionSearch:
             found = self._name_causes(bases, steps)
         except OutOfTime:
             found = self.tested(steps[-1].fit if steps else bases[-1], len(steps))
-        return bases[-1], steps, found
+        return bases[-1], without_each_other(steps), found
 
     def _name_causes(self, bases: list[Fit], steps: list[Added]) -> Screen:
         """Append steps until no more are called for, and better base models; the screen of the final model."""
@@ -517,6 +517,13 @@ class ExtensionSearch:
         gained = alone.log_evidence - plain.log_evidence
         renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=gained)
         return [renewed, again]
+
+
+def without_each_other(steps: Sequence[Added]) -> list[Added]:
+    """Steps whose classes do not have mechanisms that are steps themselves: both are in the model, which tells them
+    apart."""
+    named = {step.name for step in steps}
+    return [replace(s, members=tuple(n for n in s.members if n == s.name or n not in named)) for s in steps]
 
 
 def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None:

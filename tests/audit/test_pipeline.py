@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.audit_record import _doubt, next_experiment, record
 from rfdropo_bayes.audit.candidates import lead
 from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
-from rfdropo_bayes.audit.extension import Added, ExtensionSearch, Rules
+from rfdropo_bayes.audit.extension import Added, ExtensionSearch, Rules, without_each_other
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.gain import Difference, Gain
@@ -453,6 +453,12 @@ def test_a_candidate_that_brings_nearly_as_much_is_named_beside_the_best(monkeyp
     monkeypatch.setattr(ExtensionSearch, "_refit", refit)
     step = search._extend(screen, [])
     assert (step.name, step.members) == ("play", ("play", "creep"))
+
+
+def test_a_rival_that_joins_the_model_later_is_no_rival_any_more():
+    rest = {"before": None, "fit": None, "log_bayes_factor": 5.0, "refits": {}, "judge": None}
+    steps = [Added("play", ("play", "creep", "wall"), **rest), Added("creep", ("creep", "lag"), **rest)]
+    assert [step.members for step in without_each_other(steps)] == [("play", "wall"), ("creep", "lag")]
 
 
 @pytest.mark.slow
