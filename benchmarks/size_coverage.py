@@ -47,7 +47,7 @@ def one(name: str, number: int, given: argparse.Namespace, workshop: Workshop) -
     place = given.out / "data" / f"{name.replace(' ', '_')}_{number}"
     hidden = hide(setting, [name], given.rho, number, place, workshop=workshop)
     if hidden is None:
-        return {"verdict": "no size reaches this rho"}
+        return {"verdict": "no size reaches this rho, or the truth does not roll out"}
     model = rb.Model.read(hidden.experiment)
     runs, test = model.runs(None, ())
     problem = build_problem(model.spec, AuditTable(), runs, test, number, workshop=workshop)

@@ -171,8 +171,28 @@ class DelayLaw(Law):
         return read_late(levels, self.signal(values, levels, time_step) / time_step)[1:]
 
 
-class BodyLaw(Law):
-    """Acts on a layered body; in whole rollouts only."""
+class SignalLaw(Law):
+    """A law whose signal a session takes step by step, see `SignallingMechanism`."""
+
+    @property
+    def whole_only(self) -> str:
+        """See `SignallingMechanism`."""
+        return ""
+
+    def signal_before(self, values: Values, first: Float[Array, " channel"]) -> tuple[Any, Float[Array, ""]]:
+        """See `SignallingMechanism`."""
+        parts = (values[term.spec.name] * term.shaped(values).at_rest(first) for term in self.terms)
+        return tuple(term.feature.begin(first) for term in self.terms), sum(parts, jnp.zeros(()))
+
+    def signal_after(
+        self, values: Values, memory: Any, given: Float[Array, " channel"], time_step: float
+    ) -> tuple[Any, Float[Array, ""]]:
+        """See `SignallingMechanism`."""
+        return _advanced(self.terms, values, memory, given, time_step)
+
+
+class BodyLaw(SignalLaw):
+    """Acts on a layered body; one that follows the motion in whole rollouts only."""
 
     stage = "body"
     bodies = ("layered",)
@@ -181,6 +201,15 @@ class BodyLaw(Law):
     def follows_motion(self) -> bool:
         """See `PushingMechanism`."""
         return any(term.feature.of_motion for term in self.terms)
+
+    @property
+    def whole_only(self) -> str:
+        """See `SignallingMechanism`."""
+        return "it follows the motion of a whole rollout" if self.follows_motion else ""
+
+    def carried(self, w: Float[Array, " row"]) -> BodySignals:
+        """See `SignallingMechanism`."""
+        return self._ports.push(self.port, w)
 
     def push(
         self,
@@ -193,13 +222,24 @@ class BodyLaw(Law):
         w = _summed([t for t in self.terms if not t.feature.of_motion], values, command, time_step)
         if path is not None:
             w = w + _summed([t for t in self.terms if t.feature.of_motion], values, gauges_of(path), time_step)
-        return self._ports.push(self.port, w)
+        return self.carried(w)
 
 
-class SensingLaw(Law):
-    """Acts on the measured markers, by time and commands; in whole rollouts only."""
+class SensingLaw(SignalLaw):
+    """Acts on the measured markers, by time and commands; on when they are seen in whole rollouts only."""
 
     stage = "sensing"
+
+    @property
+    def whole_only(self) -> str:
+        """See `SignallingMechanism`."""
+        return "it says when markers are seen" if self.port.kind == "observation" else ""
+
+    def carried(
+        self, w: Float[Array, " time"], position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+    ) -> Float[Array, "time marker 3"]:
+        """See `SignallingMechanism`."""
+        return sensed(self.port, w, position, time)
 
     def sense_with_commands(
         self,
@@ -210,7 +250,7 @@ class SensingLaw(Law):
     ) -> Float[Array, "time marker 3"]:
         """See `CommandedSensingMechanism`."""
         w = sample(self.signal(values, meanwhile.levels, meanwhile.time_step), meanwhile.commands)
-        return sensed(self.port, w, position, time)
+        return self.carried(w, position, time)
 
 
 class ClockedSensingLaw(Law):

@@ -223,8 +223,9 @@ class Engine:
         limit = jnp.asarray(displacement.shape[0] if steps is None else steps, jnp.float64)
         return self._differentiable(inputs, limit)
 
-    def _section_loads(self, loads: BodySignals) -> SectionLoads:
-        return SectionLoads(*loads, station=self.load_stations)
+    def section_loads(self, loads: BodySignals | None) -> SectionLoads | None:
+        """Signals on the body as the engine takes them, with the stations that forces act on; None for none."""
+        return None if loads is None else SectionLoads(*loads, station=self.load_stations)
 
     def initial(
         self, material: Material, start: Float[Array, " cable"], loads: BodySignals | None = None
@@ -234,8 +235,9 @@ class Engine:
         prepared, state, residual = prepare(system, material), state_at_rest(system), jnp.zeros(())
         if self.from_equilibrium:
             under, force = prepared, jnp.zeros((len(state.position), 3))
-            if loads is not None:
-                under, force = loaded(system, prepared, self._section_loads(loads), 0)
+            acting = self.section_loads(loads)
+            if acting is not None:
+                under, force = loaded(system, prepared, acting, 0)
             state, found = find_equilibrium(system, under, start, force)
             residual = found.residual
         if self.integrator != "euler":
@@ -251,7 +253,7 @@ class Engine:
         material: Any = inputs.material
         if self.layered:
             prepared, state, imbalance = self.initial(material, inputs.start, inputs.loads)
-            acting = None if inputs.loads is None else self._section_loads(inputs.loads)
+            acting = self.section_loads(inputs.loads)
             run: Any = partial(simulate, system, prepared, loads=acting)
         else:
             state = tetrahedral_dynamics.state_at_rest(system)  # type: ignore[assignment]
@@ -304,8 +306,7 @@ class Engine:
         cube = None if inputs.cube is None else cube_arrays(inputs.cube)
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
-            acting = None if inputs.loads is None else self._section_loads(inputs.loads)
-            options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": acting}
+            options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": self.section_loads(inputs.loads)}
             return self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
         commands = inputs.displacement[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)

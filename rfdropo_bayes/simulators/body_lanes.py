@@ -20,7 +20,9 @@ from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rollouts import Motion
+from rfdropo_bayes.fem.section_loads import loaded
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine, cube_arrays
+from rfdropo_bayes.simulators.port_signals import BodySignals
 
 TOUCHING = 0.001
 """[m] A body that overlaps the cube by less starts in contact. The first step then moves the cube by as much."""
@@ -32,6 +34,7 @@ class LaneStart(NamedTuple):
     material: Any  # fem.Material; of a black box its parameters by name
     start: Float[Any, "*row cable"]  # displacements that the initial state belongs to [m]
     cube: CubeInputs | None
+    loads: BodySignals | None = None  # that act on the initial state, in one row
 
 
 class BodyLanes(Protocol):
@@ -40,8 +43,9 @@ class BodyLanes(Protocol):
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """Start some lanes anew, with one entry per row; returns the motion of these rows."""
 
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
-        """Take steps to the cable displacements [m] at their ends."""
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
+        """Take steps to the cable displacements [m] at their ends, under what acts on the body in each step; those that
+        carry no loads are given none."""
 
     def save(self) -> Float[np.ndarray, "lane values"]:
         """A copy of the state, one row a lane."""
@@ -92,9 +96,9 @@ class LanesBeforeCube:
         gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (given.cube, spheres))))[rows]
         return self._markers(found._replace(imbalance=np.where(gap < -TOUCHING, np.inf, found.imbalance)))
 
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
-        return self._markers(self._bodies.advance(displacement))
+        return self._markers(self._bodies.advance(displacement, loads))
 
     def _markers(self, found: Motion) -> Motion:
         return found._replace(position=found.position[:, : self._shown])
@@ -105,17 +109,18 @@ class CompiledLanes:
 
     def __init__(self, engine: Engine, count: int) -> None:
         self._session, self._from_equilibrium = LayeredSession(engine.native, count), engine.from_equilibrium
+        self._acting = engine.section_loads
         self.save, self.restore = self._session.save, self._session.restore
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
         cube = None if given.cube is None else cube_arrays(given.cube)
         begin = {"start" if self._from_equilibrium else "before": given.start}
-        return _last(self._session.reset(rows, given.material, **begin, cube=cube))
+        return _last(self._session.reset(rows, given.material, **begin, cube=cube, loads=self._acting(given.loads)))
 
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
-        return _last(self._session.advance(displacement, stride=displacement.shape[1]))
+        return _last(self._session.advance(displacement, stride=displacement.shape[1], loads=self._acting(loads)))
 
 
 def _last(found: Motion) -> Motion:
@@ -155,9 +160,9 @@ class ReferenceLanes:
         self._lanes = jax.tree.map(lambda new, old: old.at[rows].set(new[rows]), fresh, self._lanes)
         return Motion(*(None if part is None else part[rows] for part in self._shown()))
 
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
-        self._lanes = self._moved(self._lanes, jnp.asarray(displacement))
+        self._lanes = self._moved(self._lanes, jnp.asarray(displacement), loads)
         return self._shown()
 
     def save(self) -> Float[np.ndarray, "lane values"]:
@@ -186,7 +191,7 @@ class ReferenceLanes:
         engine = self._engine
 
         def first(given: LaneStart) -> _Lane:
-            prepared, state, imbalance = engine.initial(given.material, given.start)
+            prepared, state, imbalance = engine.initial(given.material, given.start, given.loads)
             state = remembering(self._system, prepared, state, engine.scene, engine.integrator)
             solid, place = (None, None) if given.cube is None else given.cube
             return _Lane(prepared, state._replace(cube=place), jnp.array(False), imbalance, jnp.array(True), solid)
@@ -194,17 +199,22 @@ class ReferenceLanes:
         return jax.jit(jax.vmap(first))
 
     @cached_property
-    def _moved(self) -> Callable[[_Lane | None, Array], _Lane]:
-        system, time_step, integrator = self._system, self._engine.time_step, self._engine.integrator
+    def _moved(self) -> Callable[[_Lane | None, Array, BodySignals | None], _Lane]:
+        system, time_step, engine = self._system, self._engine.time_step, self._engine
 
-        def moved(lane: _Lane, displacement: Float[Array, "step cable"]) -> _Lane:
-            def one(before: _Lane, command: Float[Array, " cable"]) -> tuple[_Lane, None]:
-                around = 0.0, self._engine.scene, before.cube
-                state, info = step(system, before.prepared, before.state, command, time_step, *around, integrator)
+        def moved(lane: _Lane, displacement: Float[Array, "step cable"], loads: BodySignals | None) -> _Lane:
+            acting = engine.section_loads(loads)
+
+            def one(before: _Lane, given: tuple[Float[Array, " cable"], Int[Array, ""]]) -> tuple[_Lane, None]:
+                under, force = before.prepared, jnp.zeros(())
+                if acting is not None:
+                    under, force = loaded(system, under, acting, given[1])
+                around = force, engine.scene, before.cube
+                state, info = step(system, under, before.state, given[0], time_step, *around, engine.integrator)
                 codes = before.diverged | info.diverged, before.converged & info.converged
                 return before._replace(state=state, diverged=codes[0], converged=codes[1]), None
 
-            return jax.lax.scan(one, lane, displacement)[0]
+            return jax.lax.scan(one, lane, (displacement, jnp.arange(len(displacement))))[0]
 
         return jax.jit(jax.vmap(moved))
 

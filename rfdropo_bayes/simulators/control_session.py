@@ -29,6 +29,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     Mechanism,
     PushingMechanism,
     SensingMechanism,
+    SignallingMechanism,
     SteppedMechanism,
     TimedSensingMechanism,
     Values,
@@ -36,6 +37,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     settled,
 )
 from rfdropo_bayes.simulators.parameters import check_names, check_value
+from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import status_of
 
@@ -49,6 +51,7 @@ class _Drives(NamedTuple):
     cables: tuple[Any, ...]  # memory of every mechanism between command and cables
     encoders: tuple[Any, ...]  # and of those that an encoder shows, again: other mechanisms may stand between them
     wound: Wound
+    signals: tuple[Any, ...]  # memory of what acts on the body or on the markers by what reaches the cables
 
 
 class _Past(NamedTuple):
@@ -95,9 +98,9 @@ class Session:
             self._travel = Travel(*(np.tile(part, (lanes, 1)) for part in astuple(self._travel)))
         self._forgotten = np.zeros((lanes, channels))
         self._started = np.zeros(lanes, bool)
-        self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))[0]
+        self._drives, _, signals = self._first_drives(self._values, np.zeros((lanes, channels)))
         nowhere = np.zeros((lanes, len(self.robot.marker_names), 3))
-        self._cameras = self._look(self._values, None, nowhere, np.zeros(lanes))[0]
+        self._cameras = self._look(self._values, None, nowhere, np.zeros(lanes), signals)[0]
 
     @property
     def time(self) -> Float[np.ndarray, " lane"]:
@@ -143,15 +146,15 @@ class Session:
         past = self._past
         past.given[rows], past.value[rows], past.periods[rows] = -np.inf, first[:, None], 0
         self._begin_travel(rows, first)
-        fresh, angle = self._first_drives(self._values, past.value[:, -1])
+        fresh, angle, signals = self._first_drives(self._values, past.value[:, -1])
         chosen = np.zeros(self.lanes, bool)
         chosen[rows] = True
         self._drives = _chosen(chosen, fresh, self._drives)
-        inputs = self._bodies_of(self._values, fresh.wound)
+        inputs = self._bodies_of(self._values, fresh.wound, signals)
         found = self.bodies.reset(rows, jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
         position = np.zeros((self.lanes, *found.position.shape[1:]))
         position[rows] = found.position
-        cameras, seen = self._look(self._values, None, position, np.zeros(self.lanes))
+        cameras, seen = self._look(self._values, None, position, np.zeros(self.lanes), signals)
         self._cameras = _chosen(chosen, cameras, self._cameras)
         self._started |= chosen
         return self._observation(found, np.asarray(seen)[rows], np.asarray(angle)[rows])
@@ -175,10 +178,12 @@ class Session:
                 where="act",
                 remedy=f"give finite numbers of shape {expected}",
             )
-        self._drives, displacement, angle = self._move_drives(self._values, self._drives, self._sent(commands))
-        found = self.bodies.advance(np.asarray(displacement))
+        sent = self._sent(commands)
+        self._drives, displacement, angle, signals, loads = self._move_drives(self._values, self._drives, sent)
+        acting = {} if loads is None else {"loads": jax.tree.map(np.asarray, loads)}
+        found = self.bodies.advance(np.asarray(displacement), **acting)
         now = self.simulator.time_step * (self.steps * self._past.periods)
-        self._cameras, seen = self._look(self._values, self._cameras, found.position, now)
+        self._cameras, seen = self._look(self._values, self._cameras, found.position, now, signals)
         return self._observation(found, np.asarray(seen), np.asarray(angle))
 
     def save(self) -> dict[str, np.ndarray]:
@@ -235,13 +240,17 @@ class Session:
             self._travel.low[row], self._travel.high[row] = travel.low, travel.high
 
     def _check_mechanisms(self, mechanisms: tuple[Mechanism, ...]) -> None:
-        for mechanism in mechanisms:
-            if isinstance(mechanism, PushingMechanism | CommandedSensingMechanism):
+        for mechanism in self._signalling:
+            why = mechanism.whole_only if isinstance(mechanism, SignallingMechanism) else "it is not written by steps"
+            if isinstance(mechanism, PushingMechanism) and not self.simulator.engine.carries_loads:
+                why = "it acts on layers without a cube only"
+            if why:
                 raise InputError(
-                    f"{mechanism.name} needs a whole rollout: it acts on the body, or on the markers by the commands",
+                    f"{mechanism.name} does not step: {why}",
                     where="a session",
-                    remedy="train without it; laws at cables, and laws of time on what is measured, do step",
+                    remedy="train without it; laws at cables and on the body, and laws on what is measured, do step",
                 )
+        for mechanism in mechanisms:
             remembers = isinstance(mechanism, ActuationMechanism | TimedSensingMechanism)
             if remembers and not isinstance(mechanism, SteppedMechanism):
                 raise InputError(
@@ -292,9 +301,21 @@ class Session:
         chain = [m for m in self.simulator.mechanisms if isinstance(m, ActuationMechanism)]
         return chain, [m for m in chain if inside_drive(m)]
 
+    @property
+    def _signalling(self) -> list[Any]:
+        """Mechanisms that act on the body, or on the markers by what is commanded."""
+        kinds = PushingMechanism | CommandedSensingMechanism
+        return [m for m in self.simulator.mechanisms if isinstance(m, kinds)]
+
+    def _loads(self, signals: Float[Array, "row signal"]) -> BodySignals | None:
+        """What acts on the body under the signals of the mechanisms of `_signalling`; None for nothing."""
+        acts = [(m.carried, w) for m, w in zip(self._signalling, signals.T, strict=True) if hasattr(m, "push")]
+        found = [carried(w) for carried, w in acts]
+        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
+
     @cached_property
     def _first_drives(self) -> Any:
-        """Drives of all lanes before the first step, given the command before it, and where encoders stand."""
+        """Drives of all lanes before the first step, given the command before it, where encoders stand, and signals."""
         chains, interval = self._drive_chains, self.simulator.time_step
 
         def through(chain: list[Any], values: Values, held: Array) -> tuple[tuple, Array]:
@@ -304,16 +325,23 @@ class Session:
                 held = settled(mechanism, values, held)
             return tuple(memories), held
 
-        def first(values: Values, command: Float[Array, " channel"]) -> tuple[_Drives, Float[Array, " channel"]]:
+        def first(values: Values, command: Float[Array, " channel"]) -> tuple[_Drives, Array, Array]:
             cables, reached = through(chains[0], values, command)
             encoders, angle = through(chains[1], values, command)
-            return _Drives(cables, encoders, self.simulator.unwound(values, reached)), angle
+            begun = [mechanism.signal_before(values, reached) for mechanism in self._signalling]
+            memories = tuple(memory for memory, _ in begun)
+            return (
+                _Drives(cables, encoders, self.simulator.unwound(values, reached), memories),
+                angle,
+                jnp.array([w for _, w in begun], float),
+            )
 
         return self._by_lane(first)
 
     @cached_property
     def _move_drives(self) -> Any:
-        """Drives of all lanes after a period, cable displacements [m] in its steps, and where encoders stand."""
+        """Drives of all lanes after a period, cable displacements [m] in its steps, where encoders stand, the last
+        signals, and what acts on the body in the steps."""
         chains, time_step = self._drive_chains, self.simulator.time_step
 
         def through(chain: list[Any], values: Values, memory: tuple[Any, ...], sent: Array) -> tuple[tuple, Array]:
@@ -323,15 +351,18 @@ class Session:
                 after.append(kept)
             return tuple(after), sent
 
-        def move(values: Values, drives: _Drives, commands: Float[Array, "step channel"]) -> tuple[_Drives, Any, Any]:
-            def one(before: _Drives, command: Float[Array, " channel"]) -> tuple[_Drives, tuple[Array, Array]]:
+        def move(values: Values, drives: _Drives, commands: Float[Array, "step channel"]) -> tuple[Any, ...]:
+            def one(before: _Drives, command: Float[Array, " channel"]) -> tuple[_Drives, tuple[Array, ...]]:
                 cables, reached = through(chains[0], values, before.cables, command)
                 encoders, angle = through(chains[1], values, before.encoders, command)
                 wound, displacement = self.simulator.wind(values, before.wound, reached)
-                return _Drives(cables, encoders, wound), (displacement, angle)
+                pairs = zip(self._signalling, before.signals, strict=True)
+                given = [m.signal_after(values, memory, reached, time_step) for m, memory in pairs]
+                signals = jnp.array([w for _, w in given], float)
+                return _Drives(cables, encoders, wound, tuple(m for m, _ in given)), (displacement, angle, signals)
 
-            after, (displacement, angle) = jax.lax.scan(one, drives, commands)
-            return after, displacement, angle[-1]
+            after, (displacement, angle, signals) = jax.lax.scan(one, drives, commands)
+            return after, displacement, angle[-1], signals[-1], self._loads(signals)
 
         return self._by_lane(move)
 
@@ -339,25 +370,32 @@ class Session:
     def _bodies_of(self) -> Any:
         """What the bodies of all lanes start from."""
 
-        def of(values: Values, wound: Wound) -> LaneStart:
-            return self.simulator.lane_start(values, wound)
+        def of(values: Values, wound: Wound, signals: Float[Array, " signal"]) -> LaneStart:
+            return self.simulator.lane_start(values, wound)._replace(loads=self._loads(signals[None]))
 
         return self._by_lane(of)
 
     @cached_property
     def _look(self) -> Any:
-        """Cameras of all lanes after an observation, and the marker positions [m] that they see; None for the cameras
-        before makes it the first."""
-        cameras = SensingMechanism | TimedSensingMechanism
+        """Cameras of all lanes after an observation, and the marker positions [m] that they see under the last signals;
+        None for the cameras before makes it the first."""
+        cameras = SensingMechanism | TimedSensingMechanism | CommandedSensingMechanism
         chain: list[Any] = [m for m in self.simulator.mechanisms if isinstance(m, cameras)]
 
         def look(
-            values: Values, before: tuple[Any, ...] | None, position: Float[Array, "marker 3"], now: Float[Array, ""]
+            values: Values,
+            before: tuple[Any, ...] | None,
+            position: Float[Array, "marker 3"],
+            now: Float[Array, ""],
+            signals: Float[Array, " signal"],
         ) -> tuple[tuple[Any, ...], Float[Array, "marker 3"]]:
             after = []
             for k, mechanism in enumerate(chain):
                 memory: Any = ()
-                if isinstance(mechanism, SteppedMechanism):
+                if mechanism in self._signalling:
+                    w = signals[self._signalling.index(mechanism)]
+                    position = mechanism.carried(w[None], position[None], jnp.asarray(now)[None])[0]
+                elif isinstance(mechanism, SteppedMechanism):
                     memory = mechanism.begin(values, position, self.period) if before is None else before[k]
                     memory, position = mechanism.advance(values, memory, position, now)
                 else:

@@ -148,6 +148,28 @@ class PushingMechanism(Mechanism, Protocol):
 
 
 @runtime_checkable
+class SignallingMechanism(Mechanism, Protocol):
+    """A mechanism that acts on the body, or on what is measured by what is commanded, as a session needs it: one signal
+    w(t) that is written as a step. Its steps give what its form for whole rollouts gives."""
+
+    @property
+    def whole_only(self) -> str:
+        """Why no session carries it; empty where one does."""
+
+    def signal_before(self, values: Values, first: Float[Array, " channel"]) -> tuple[Any, Float[Array, ""]]:
+        """Memory and signal before the first step, given the command that reaches the cables then."""
+
+    def signal_after(
+        self, values: Values, memory: Any, given: Float[Array, " channel"], time_step: float
+    ) -> tuple[Any, Float[Array, ""]]:
+        """Memory and signal at the end of a step [s], given the command that has reached the cables."""
+
+    def carried(self, w: Float[Array, " row"], *seen: Any) -> Any:
+        """What acts on the body under a signal; of what is measured the positions of the markers [m], given ``seen``,
+        those without it (row, marker, 3), and when they are seen [s]."""
+
+
+@runtime_checkable
 class SteppedMechanism(Mechanism, Protocol):
     """A mechanism of actuation or sensing that can also act step by step, as a session needs it.
 

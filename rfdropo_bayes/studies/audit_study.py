@@ -232,8 +232,8 @@ def _hidden(
     place: Path,
     workshop: Workshop,
 ) -> tuple[Hidden, list[str], list[str]]:
-    """A data set with the mechanisms whose turn it is, or with others at random where these cannot reach the size; what
-    is hidden; and what could not be."""
+    """A data set with the mechanisms whose turn it is, or with others at random where these cannot reach the size or
+    their truth does not roll out; what is hidden; and what could not be."""
     rng = np.random.default_rng(seed)
     chosen, unreached = list(turn), list[str]()
     for _ in range(TRIES):

@@ -10,6 +10,8 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.laws import Law, LawChoice, make_law
+from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.simulators.body_engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.control_session import Session
@@ -273,3 +275,124 @@ def test_a_body_that_would_overlap_the_cube_has_no_initial_state():
     found = session.reset(np.arange(4), values)
     assert found.status.tolist() == [Result.OK, Result.OK, Result.NOT_IN_EQUILIBRIUM, Result.OK]
     assert found.position.shape == (4, len(model.robot.marker_names), 3)
+
+
+LAWS = (
+    ("force x at the tip", [("command", ("left",), 5.0)]),
+    ("stiffness", [("time", (), 0.3), ("magnitude", ("left",), 8.0)]),
+    ("damping", [("rate", ("up",), 3.0)]),
+    ("base tilt x", [("largest", ("up",), 30.0)]),
+    ("camera y", [("command", ("left",), 0.1), ("time", (), 2e-3)]),
+)
+
+
+@functools.cache
+def lawful(engine: str, precision: str = "float64", state: str = "rest"):
+    """The smooth arm with laws on its body and on what its camera sees, each of what reaches the cables."""
+    robot = Robot.load("smooth_arm").model_copy(update={"initial_state": state})
+    assembly, discretisation = assemble(robot, Discretisation(0.01)), Discretisation(0.01)
+    computed = Engine(assembly, 0.01, Backend(engine, precision), state == "equilibrium", integrator="sdirk2")
+    bare = TrunkSimulator(robot, computed, assembly, discretisation, mechanisms_named(("actuator_lag",), robot))
+    ports = port_map(bare, robot.marker_names)
+    laws = []
+    for port, terms in LAWS:
+        tables = tuple(
+            {"coefficient": f"{port} {kind}", "feature": kind, "commands": names, "scale": scale}
+            for kind, names, scale in terms
+        )
+        laws.append(make_law(LawChoice(port, tables), ports, robot.channel_names, "m"))
+    return TrunkSimulator(robot, computed, assembly, discretisation, (*bare.mechanisms, *laws))
+
+
+def lawful_rollouts(model, parameters, commands):
+    grid = [
+        model.commands(PERIOD * np.arange(PERIODS), sent, np.zeros(4), PERIOD * np.arange(PERIODS + 1))
+        for sent in commands
+    ]
+    return jax.jit(jax.vmap(model.rollout))(parameters, jax.tree.map(lambda *parts: np.stack(parts), *grid))
+
+
+def lawful_draw(model, seed=3):
+    random = np.random.default_rng(seed)
+    parameters = {"young_modulus": 2e6 * random.uniform(0.7, 1.3, LANES), "actuator_lag": np.full(LANES, 0.03)}
+    for law in (mechanism for mechanism in model.mechanisms if isinstance(mechanism, Law)):
+        for term in law.terms:
+            scale = term.spec.prior["scale"]
+            parameters[term.spec.name] = scale * random.uniform(0.5, 1.5, LANES)
+    return parameters, np.cumsum(0.003 * random.integers(0, 3, (LANES, PERIODS, 4)), axis=1)
+
+
+@pytest.mark.parametrize(
+    ("engine", "precision", "state", "tolerance"),
+    [
+        ("numba", "float64", "equilibrium", 1e-12),
+        pytest.param("numba", "float32", "rest", 1e-6, marks=pytest.mark.slow),
+        pytest.param("jax", "float64", "rest", 1e-9, marks=pytest.mark.slow),
+    ],
+)
+def test_laws_on_the_body_and_on_what_is_seen_act_as_in_a_rollout(engine, precision, state, tolerance):
+    """Lanes start at different times, each with sizes of its own."""
+    model = lawful(engine, precision, state)
+    parameters, commands = lawful_draw(model)
+    whole = lawful_rollouts(lawful("numba", precision, state), parameters, commands)
+    for port in ("force", "stiffness", "damping", "base tilt", "camera"):
+        less = parameters | {name: np.zeros(LANES) for name in parameters if name.startswith(port)}
+        moved = np.abs(lawful_rollouts(model, less, commands).position - whole.position).max()
+        assert moved > 2e-4, f"the law of {port} does nothing"
+    session = Session(model, LANES, PERIOD)
+    early, late = np.array([0, 2, 4]), np.array([1, 3])
+    everyone = np.arange(LANES)
+    session.reset(everyone, {"young_modulus": 3e6})
+    session.act(np.full((LANES, 4), 0.01))
+    first = session.reset(early, {name: value[early] for name, value in parameters.items()})
+    np.testing.assert_allclose(first.position, whole.position[early, 0], rtol=0.0, atol=tolerance)
+    session.act(commands[:, 0])
+    session.reset(late, {name: value[late] for name, value in parameters.items()})
+    for period in range(PERIODS - 1):
+        age = np.where(np.isin(everyone, late), period, period + 1)
+        now = session.act(commands[everyone, age])
+        np.testing.assert_allclose(now.position, whole.position[everyone, age + 1], rtol=0.0, atol=tolerance)
+        np.testing.assert_array_equal(now.status, Result.OK)
+
+
+def test_a_state_under_laws_is_restored_with_its_own_gravity_and_memory():
+    model = lawful("numba", "float64", "equilibrium")
+    parameters, commands = lawful_draw(model)
+    session, other = Session(model, LANES, PERIOD), Session(model, LANES, PERIOD)
+    session.reset(np.arange(LANES), parameters)
+    for period in range(3):
+        session.act(commands[:, period])
+    kept = session.save()
+    expected = [session.act(commands[:, period]).position for period in range(3, 6)]
+    other.reset(np.arange(LANES), {name: value[::-1] for name, value in parameters.items()})
+    other.act(commands[:, 7])
+    other.restore({name: part[[2, 4]] for name, part in kept.items()}, np.array([4, 0]))
+    for period, position in enumerate(expected, start=3):
+        found = other.act(commands[[4, 1, 2, 3, 2], period]).position
+        np.testing.assert_array_equal(found[[4, 0]], position[[2, 4]])
+
+
+def test_laws_that_need_a_whole_rollout_are_refused():
+    robot = Robot.load("smooth_arm")
+    model = lawful("numba")
+    ports = port_map(model, robot.marker_names)
+    follows = {"coefficient": "c", "feature": "position", "motion": ["tip x"], "scale": 1.0}
+    late = {"coefficient": "c", "feature": "command", "commands": ["left"], "scale": 1.0}
+    for port, table, why in (
+        ("stiffness", follows, "follows the motion"),
+        ("observation", late, "when markers are seen"),
+        ("command delay", late, "written for whole rollouts only"),
+    ):
+        if ports.named(port) is None:
+            port = next(each.name for each in ports.ports if each.kind == port)
+        law = make_law(LawChoice(port, (table,)), ports, robot.channel_names, "m")
+        with pytest.raises(InputError, match=why):
+            TrunkSimulator(robot, model.engine, model.assembly, model.discretisation, (law,)).session(1, PERIOD)
+
+    trunk = simulator("numba")
+    ports = port_map(trunk, trunk.robot.marker_names)
+    terms = ({"coefficient": "c", "feature": "time", "scale": 1.0},)
+    law = make_law(LawChoice("stiffness", terms), ports, trunk.robot.channel_names, "m")
+    pushing = TrunkSimulator(trunk.robot, trunk.engine, trunk.assembly, trunk.discretisation, (law,)).pushing()
+    with pytest.raises(InputError, match="without a cube only"):
+        pushing.session(1, PERIOD)

@@ -18,10 +18,13 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
+from rfdropo_bayes.fem.native.effect_rows import load_rows
+from rfdropo_bayes.fem.native.layered_effects import LOADED
 from rfdropo_bayes.fem.native.layered_engine import NativeLayered, Records, Run, in_blocks
 from rfdropo_bayes.fem.native.layered_records import LayeredSamples
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
+from rfdropo_bayes.fem.section_loads import SectionLoads
 
 KEPT = {
     "samples": tuple(name for name in LayeredSamples._fields if name != "present"),
@@ -30,8 +33,10 @@ KEPT = {
     "touch": ("cube", "values", "memory"),
 }
 """Fields of the kernels' records that outlive a step."""
-GIVEN = ("moduli", "density", "damping", "gravity", "layer_scale", "point_mass", "law", "effects", "start")
+GIVEN = ("moduli", "density", "damping", "gravity", "layer_scale", "point_mass", "law", "effects", "start", "loads")
 """Fields of a batch that an initial state depends on."""
+PITCHED = ("start", "loads")
+"""Those of them of which one row may serve all."""
 REMEMBERED = 2**26
 """Most memory for equilibria that were found before [bytes]."""
 
@@ -43,6 +48,10 @@ class _Place(NamedTuple):
     name: str
     first: int
     last: int
+
+
+GRAVITY = 3
+"""Last values of a lane's memory: gravity without what is added to it from step to step [m/s2]."""
 
 
 def _places(records: Records) -> list[_Place]:
@@ -88,6 +97,7 @@ class LayeredSession:
         start: Float[np.ndarray, "row cables"] | None = None,
         before: Float[np.ndarray, "row cables"] | None = None,
         cube: tuple[Float[np.ndarray, "row 13"], Float[np.ndarray, "row 4"]] | None = None,
+        loads: SectionLoads | None = None,
     ) -> Motion:
         """Start some lanes anew; the others do not notice.
 
@@ -98,6 +108,7 @@ class LayeredSession:
                 equilibrium that was found before is not computed again.
             before: as in `NativeLayered.rollout`.
             cube: of an engine with a scene, as in `NativeLayered.rollout`.
+            loads: that act on the initial state, in one row. Lanes are always given some, or never.
 
         Returns:
             The initial state, as a rollout of one row.
@@ -107,7 +118,7 @@ class LayeredSession:
         """
         rows = np.asarray(rows, dtype=np.intp)
         still = np.zeros((len(rows), 1, self.engine.tables.cables))
-        run = self.engine.run_of(material, still, start, before, 0, 1, cube)
+        run = self.engine.run_of(material, still, start, before, 0, 1, cube, loads)
         self._admit(run, material.effects.rubs)
         settles = run.schedule.static_iterations > 0
         keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in range(len(rows))]
@@ -124,11 +135,19 @@ class LayeredSession:
         self.memory[rows // self.engine.lanes, :, rows % self.engine.lanes] = lanes.state
         return lanes.motion._replace(pose=pose)
 
-    def advance(self, displacement: Float[np.ndarray, "lane steps cables"], *, stride: int = 1) -> Motion:
-        """Take steps to the cable displacements [m] at their ends; recorded before the first, and every ``stride``.
+    def advance(
+        self,
+        displacement: Float[np.ndarray, "lane steps cables"],
+        *,
+        stride: int = 1,
+        loads: SectionLoads | None = None,
+    ) -> Motion:
+        """Take steps to the cable displacements [m] at their ends, under what acts on the body in each; recorded before
+        the first, and every ``stride``.
 
         Raises:
-            InputError: a session that was not started, or displacements of another shape.
+            InputError: a session that was not started, displacements of another shape, or loads where its lanes started
+                without, or the other way round.
         """
         engine = self.engine
         if self._run is None:
@@ -138,6 +157,13 @@ class LayeredSession:
             raise InputError(f"displacement has shape {displacement.shape}, expected {expected}", where="advance")
         moves = np.ascontiguousarray(displacement, dtype=engine.dtype).reshape(self.count, -1)
         batch = self._run.batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
+        if bool(batch.present[LOADED]) != (loads is not None):
+            raise InputError("loads in some calls only", where="advance", remedy="give them to reset, too")
+        if loads is not None:
+            rows = load_rows(loads)[0].astype(engine.dtype)
+            acting = np.concatenate([rows[:, : rows.shape[1] // displacement.shape[1]], rows], axis=1)
+            gravity = np.ascontiguousarray(self.memory[:, -GRAVITY:].transpose(0, 2, 1)).reshape(-1, GRAVITY)
+            batch = batch._replace(loads=acting, loads_pitch=acting.shape[1], gravity=gravity[: self.count])
         schedule = self._run.schedule._replace(steps=displacement.shape[1], stride=stride, resumed=1)
         run = engine.with_output(self._run._replace(batch=batch, schedule=schedule))
 
@@ -170,7 +196,8 @@ class LayeredSession:
         if self._run is None:
             self._places, self._rubs = _places(self.engine.records(rubs)), rubs
             blocks = -(-self.count // self.engine.lanes)
-            self.memory = aligned_zeros((blocks, self._places[-1].last, self.engine.lanes), self.engine.dtype)
+            values = self._places[-1].last + GRAVITY
+            self.memory = aligned_zeros((blocks, values, self.engine.lanes), self.engine.dtype)
             self._run = _taken(run, [0])
         elif rubs != self._rubs or not np.array_equal(run.batch.present, self._run.batch.present):
             raise InputError(
@@ -192,6 +219,7 @@ class LayeredSession:
             for place in self._places:
                 part = getattr(getattr(records, place.record), place.name)
                 there[:, place.first : place.last] = part.T[: len(there)]
+            there[:, -GRAVITY:] = run.batch.gravity[first : first + engine.lanes]
 
         in_blocks(block, count, engine.lanes, engine.threads)
         return _SessionLane(state, run.motion._replace(pose=None))
@@ -248,6 +276,6 @@ def _taken(run: Run, rows: list[int]) -> Run:
     fields = {
         name: value[rows] for name, value in batch._asdict().items() if name in GIVEN and len(value) == batch.count
     }
-    pitch = batch.start.shape[1] if len(fields.get("start", ())) > 1 else 0
+    pitches = {f"{name}_pitch": fields[name].shape[1] if len(rows) > 1 else 0 for name in PITCHED if name in fields}
     cubes = None if cubes is None else Cubes(*(part[rows] for part in cubes))
-    return run._replace(batch=batch._replace(**fields, start_pitch=pitch, count=len(rows)), cubes=cubes)
+    return run._replace(batch=batch._replace(**fields, **pitches, count=len(rows)), cubes=cubes)
