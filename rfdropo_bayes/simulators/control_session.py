@@ -242,7 +242,8 @@ class Session:
     def _check_mechanisms(self, mechanisms: tuple[Mechanism, ...]) -> None:
         for mechanism in self._signalling:
             why = mechanism.whole_only if isinstance(mechanism, SignallingMechanism) else "it is not written by steps"
-            if isinstance(mechanism, PushingMechanism) and not self.simulator.engine.carries_loads:
+            carries = getattr(getattr(self.simulator, "engine", None), "carries_loads", False)
+            if isinstance(mechanism, PushingMechanism) and not carries:
                 why = "it acts on layers without a cube only"
             if why:
                 raise InputError(
