@@ -32,7 +32,6 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.verbs.simulate import simulate_all
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
-BEFORE_CONTACT = "{observations='sofa_trunk/push_1.csv', rows=[0, 10]}"
 YOUNG, DENSITY, GRAVITY = 0.45e6, 1000.0, 9.81
 LENGTH, SIDE, LAYERS = 0.195, 0.02, 20
 

@@ -77,11 +77,10 @@ class LevenbergState(NamedTuple):
 
 
 class ClimbStep(NamedTuple):
-    """One step: the gain in log posterior, the gain the quadratic model promised, and the tries it took."""
+    """One step: the gain in log posterior, and the gain the quadratic model promised."""
 
     gain: float
     promised: float
-    tries: int
 
 
 class Laplace(NamedTuple):
@@ -141,7 +140,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     newton = _solved(curvature + 1e-12 * diagonal, gradient)
     promised = 0.5 * float(gradient @ newton)
     if promised < tolerance:
-        return state._replace(converged=True), ClimbStep(0.0, promised, 0)
+        return state._replace(converged=True), ClimbStep(0.0, promised)
     tried = np.clip(state.position + moves, low, high)
     densities = target.density(tried)
     best = int(np.argmax(densities))
@@ -154,7 +153,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
         moved = LevenbergState(position, density, state.damping * 1e5, stuck)
     else:
         moved = LevenbergState(position, density, float(np.clip(dampings[best], 1e-9, 1e9)), False)
-    return moved, ClimbStep(gain, promised, len(dampings))
+    return moved, ClimbStep(gain, promised)
 
 
 def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
