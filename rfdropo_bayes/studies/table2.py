@@ -29,7 +29,7 @@ from rfdropo_bayes.files import output_folder, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.experiment_file import describe, read_tables, self_contained
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.model.run_folder import CHECKPOINTS, LOG, run_ended, run_folder
+from rfdropo_bayes.model.run_folder import CHECKPOINTS, LOG, RUN, run_ended, run_folder
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
 from rfdropo_bayes.results.audited import AUDIT, EXTENDED
@@ -290,7 +290,11 @@ def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
     out, minutes = study.out / "audit", f"audit.minutes={study.size.minutes}"
     asked = f"# {minutes}\n{study.audit.read_text(encoding='utf-8')}"
     if not _ran(out, asked):
-        audit(Model.read(study.audit, [minutes]), out=out, resume=(out / CHECKPOINTS).exists())
+        begun = (out / CHECKPOINTS).exists()
+        # A verdict alone, as a repository keeps it, is no run that could be gone on with.
+        audit(
+            Model.read(study.audit, [minutes]), out=out, resume=begun, overwrite=not begun and not (out / RUN).exists()
+        )
         write_text(out / ASKED, asked)
     found = json.loads((out / AUDIT).read_text(encoding="utf-8"))
     if found["out_of_time"]:  # what it says so far depends on the machine

@@ -129,6 +129,29 @@ def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_pat
             table2._with_causes(study, table2._tables(study, "push"))
 
 
+@pytest.mark.parametrize(
+    ("there", "asked"),
+    [(["audit.json"], (False, True)), (["run.json", "checkpoints/round"], (True, False)), ([], (False, True))],
+)
+def test_an_audit_is_gone_on_with_or_made_anew(tmp_path, monkeypatch, there, asked) -> None:
+    """A verdict alone, as a repository keeps it, is no run: it does not stop the study."""
+    for name in there:
+        (tmp_path / "audit" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "audit" / name).write_text("{}")
+
+    class Asked(Exception):
+        pass
+
+    def audit(model, *, out, resume, overwrite):
+        raise Asked(resume, overwrite)
+
+    monkeypatch.setattr(table2, "audit", audit)
+    study = Study({"push": PUSH}, TRUTH, AUDIT, tmp_path, SMALL)
+    with pytest.raises(Asked) as found:
+        table2._with_causes(study, table2._tables(study, "push"))
+    assert found.value.args == asked
+
+
 def test_what_cannot_be_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="unknown row 'RFDROPO'"):
         run_table2([PUSH], TRUTH, AUDIT, tmp_path, SMALL, rows=["RFDROPO"])
