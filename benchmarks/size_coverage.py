@@ -60,7 +60,8 @@ def one(name: str, number: int, given: argparse.Namespace, workshop: Workshop) -
     own = [i for c in problem.candidates if c.name == name for i in c.indices]
     free = np.array([*range(problem.coordinates.base), *own])
     fit = climb(target, problem.coordinates.encode(hidden.values), free)
-    rows = [row for i in own if (row := deviation(problem.coordinates, widened(fit, problem.coordinates), i, hidden))]
+    sizes = widened(target, fit)
+    rows = [row for i in own if (row := deviation(problem.coordinates, sizes, i, hidden))]
     done = {"converged": fit.converged, "discretisation": hidden.rho["discretisation"], "estimated": estimated}
     return {**done, "misfit": float(np.mean(fit.residual**2)), "sizes": rows, "cpu": time.process_time() - began}
 

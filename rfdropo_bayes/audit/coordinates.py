@@ -39,6 +39,8 @@ class Coordinates:
             where nothing else is said.
         fixed: values that stay, by name.
         limits: hard bounds of the simulator's parameters, at which sums of a shared value and a group's own end.
+        widening: by how much prior and unit of each coordinate are wider than its parameter's prior; empty where none
+            is.
     """
 
     space: ParameterSpace
@@ -47,6 +49,7 @@ class Coordinates:
     nominal: Mapping[str, float]
     fixed: Mapping[str, float]
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    widening: tuple[float, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,6 +66,12 @@ class Coordinates:
         fresh = added.sample(jax.random.key(len(self.names)), PRIOR_DRAWS)
         kept = {"_draws": self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}}
         found.__dict__.update(kept, _moved=self._moved)
+        return found
+
+    def widened(self, factors: Float[np.ndarray, " d"]) -> Coordinates:
+        """The same under priors of candidates' sizes that are so many times wider about null, and in such units."""
+        found = replace(self, widening=tuple(factors.tolist()))
+        found.__dict__.update(_draws=self._draws, _moved=self._moved)
         return found
 
     @cached_property
@@ -93,6 +102,11 @@ class Coordinates:
     def _scale(self) -> np.ndarray:
         return np.array([_spread(p, self._draws[p.name]) for p in self.space.parameters])
 
+    @property
+    def _unit(self) -> np.ndarray:
+        """Of each coordinate, for those that are measured from null."""
+        return self._scale * np.array(self.widening or 1.0)
+
     @cached_property
     def prior_mean(self) -> Float[np.ndarray, " d"]:
         """Centre of the prior in these coordinates: where searches start, no statement of its density."""
@@ -111,8 +125,8 @@ class Coordinates:
     def bounds(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
         """Lowest and highest value of each coordinate."""
         low, high = (np.array([getattr(p.spec, side) for p in self.space.parameters]) for side in ("low", "high"))
-        lower = np.where(self.affine, (low - self._null) / self._scale, self.prior_mean - FAR * self.prior_sd)
-        upper = np.where(self.affine, (high - self._null) / self._scale, self.prior_mean + FAR * self.prior_sd)
+        lower = np.where(self.affine, (low - self._null) / self._unit, self.prior_mean - FAR * self.prior_sd)
+        upper = np.where(self.affine, (high - self._null) / self._unit, self.prior_mean + FAR * self.prior_sd)
         return lower, upper
 
     @cached_property
@@ -128,7 +142,7 @@ class Coordinates:
     def encode_one(self, index: int, values: Any) -> np.ndarray:
         """Physical values of one parameter as coordinates."""
         if self.affine[index]:
-            return (np.asarray(values, dtype=float) - self._null[index]) / self._scale[index]
+            return (np.asarray(values, dtype=float) - self._null[index]) / self._unit[index]
         return np.asarray(self.space.parameters[index].transform.inv(np.asarray(values, dtype=float)))
 
     @cached_property
@@ -142,7 +156,7 @@ class Coordinates:
 
     def values(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Physical values."""
-        return self._with_moved(self._null + self._scale * x, x, 0)
+        return self._with_moved(self._null + self._unit * x, x, 0)
 
     def named(self, x: Float[np.ndarray, " d"]) -> dict[str, float]:
         """Physical values of one point by name."""
@@ -158,13 +172,15 @@ class Coordinates:
 
     def slopes(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Derivative of each physical value with respect to its coordinate."""
-        return self._with_moved(np.tile(self._scale, (len(x), 1)), x, 1)
+        return self._with_moved(np.tile(self._unit, (len(x), 1)), x, 1)
 
     def log_prior(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Log density of each coordinate's prior in these coordinates."""
-        own = zip(self.space.parameters, self.values(x).T, strict=True)
+        usual = self._with_moved(self._null + self._scale * x, x, 0)  # in a wider prior as far from null as usual there
+        slopes = self._with_moved(np.tile(self._scale, (len(x), 1)), x, 1)
+        own = zip(self.space.parameters, usual.T, strict=True)
         density = [log_density(p.spec, p.table or p.spec.prior, value) for p, value in own]
-        return np.stack(density, axis=1) + np.log(np.abs(self.slopes(x)))
+        return np.stack(density, axis=1) + np.log(np.abs(slopes))
 
     @cached_property
     def _moved(self) -> Callable[[Float[Any, "n moved"]], tuple[Float[Any, "n moved"], Float[Any, "n moved"]]]:

@@ -61,7 +61,7 @@ class Described:
     def sizes(self) -> tuple[Fit, FitTarget] | None:
         """The model's fit under priors that do not pull, and its target."""
         last = self.last
-        return None if last is None else (widened(last.fit, last.target.forward.coordinates), last.target)
+        return None if last is None else (widened(last.target, last.fit), last.target)
 
 
 @dataclass(frozen=True)

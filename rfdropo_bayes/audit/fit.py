@@ -448,21 +448,25 @@ def heights(target: FitTarget, points: Float[np.ndarray, "n d"], what: str) -> F
     return found["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
 
 
-def widened(fit: Fit, coordinates: Coordinates) -> Fit:
-    """A fit as it would be under priors no narrower than the sizes found, to first order.
+def widened(target: FitTarget, fit: Fit) -> Fit:
+    """A fit as it is under priors no narrower than the sizes found: its point and its covariance.
 
     The prior of a candidate's size says what is usual, and decides whether the candidate is believed. Once it is, a
     size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
-    prior deviation stay as they are.
+    prior deviation stay as they are. A first-order step would not do: where motion tells a ratio alone, such as that
+    of drag and modulus, the wider prior moves both far along a curve.
+
+    Args:
+        target: under which it was found.
+        fit: a mode.
     """
-    scale = 1.0 / coordinates.prior_sd[fit.free] ** 2
-    less = (1.0 - 1.0 / widening(fit, coordinates)[fit.free] ** 2) * scale
-    if not less.any():
+    own = target.forward.coordinates
+    factors = widening(fit, own)
+    if (factors == 1.0).all():
         return fit
-    covariance = np.linalg.inv(np.linalg.inv(fit.covariance) - np.diag(less))
-    x = fit.x.copy()
-    x[fit.free] += covariance @ (less * x[fit.free])
-    return replace(fit, x=np.clip(x, *coordinates.bounds), covariance=covariance)
+    found = climb(target.on(target.forward.with_coordinates(own.widened(factors))), fit.x / factors, fit.free)
+    unit = factors[fit.free]
+    return replace(fit, x=factors * found.x, covariance=found.covariance * np.outer(unit, unit))
 
 
 def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:

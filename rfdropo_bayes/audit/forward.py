@@ -271,9 +271,16 @@ class Forward:
 
     def with_difference(self, step: float) -> Forward:
         """The same with derivatives over another step."""
+        return self._with(lanes=self.lanes.with_difference(step))
+
+    def with_coordinates(self, coordinates: Coordinates) -> Forward:
+        """The same in other coordinates of the same parameters."""
+        return self._with(coordinates=coordinates)
+
+    def _with(self, **parts: Any) -> Forward:
         changed = copy.copy(self)
         changed.__dict__.pop("identity", None)
-        changed.lanes = self.lanes.with_difference(step)
+        changed.__dict__.update(parts)
         return changed
 
     def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:

@@ -267,7 +267,7 @@ def audit(
             extended, validation = steps[-1].fit if steps else base, _described_validation(described)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
-    sizes = widened(extended, problem.coordinates)
+    sizes = widened(steps[-1].judge, extended) if steps else extended
     shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
     remainder = _remainder(target, extended, described)
     if verdict in (PARTLY, UNEXPLAINED) and not steps:

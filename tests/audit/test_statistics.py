@@ -4,7 +4,6 @@ chance, the test says how often it would under another seed."""
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from scipy import stats
 
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
-from rfdropo_bayes.audit.fit import Fit, widened
 from rfdropo_bayes.audit.gain import (
     Difference,
     Gain,
@@ -304,33 +302,6 @@ def test_noise_guessed_from_residuals_gives_the_same_statistics_as_data_without_
         p.append([tail(float(v[0]), reference[k]) for k, v in statistics(residual).items() if k != "variance"])
     bound = 3.3 * np.sqrt(1 / 12 / 60)
     assert np.all(np.abs(np.mean(p, axis=0) - 0.5) < bound)
-
-
-def test_a_size_far_outside_its_prior_is_not_drawn_back_and_a_usual_one_is_left():
-    """Closed form of a linear model: base parameter, a size of 9 prior deviations, and a small one."""
-    rng = np.random.default_rng(4)
-    jacobian = rng.standard_normal((40, 3)) @ np.array([[1.0, 0.4, 0.2], [0.0, 0.5, 0.1], [0.0, 0.0, 0.3]])
-    data = jacobian @ np.array([2.0, 9.0, -0.3])
-    coordinates = SimpleNamespace(
-        affine=np.array([False, True, True]), prior_sd=np.ones(3), bounds=(np.full(3, -20.0), np.full(3, 20.0))
-    )
-
-    def posterior(scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        covariance = np.linalg.inv(jacobian.T @ jacobian + np.diag(1.0 / scale**2))
-        return covariance @ jacobian.T @ data, covariance
-
-    x, covariance = posterior(np.ones(3))
-    fit = Fit(x, np.arange(3), data - jacobian @ x, jacobian, covariance, 0.0, 0.0)
-    found = widened(fit, coordinates)
-    expected = posterior(np.maximum(np.abs(x), 1.0) ** np.array([0, 1, 0]))
-    assert abs(x[2]) < 1.0
-    np.testing.assert_allclose(found.x, expected[0])
-    np.testing.assert_allclose(found.covariance, expected[1])
-    deviation = np.sqrt(np.diag(covariance))[1]
-    assert x[1] < 9.0 - 1.645 * deviation  # without this, its 90 % interval would miss the truth
-    assert abs(found.x[1] - 9.0) < 0.2 * deviation
-    usual = replace(fit, x=np.array([2.0, 0.9, 0.5]))
-    assert widened(usual, coordinates) is usual
 
 
 def test_recordings_that_all_favour_one_model_support_it_however_much_they_differ():
