@@ -359,9 +359,9 @@ def cross_correlation_summary(
 def thinned_summary(features: Float[np.ndarray, "n time f"], most: int = 100) -> Float[np.ndarray, "n s"]:
     """NPDR's: the trajectory itself, every second row; rows are thinned further until at most ``most`` numbers remain.
 
-    More features than ``most`` in a single row are kept all.
+    Of more features than ``most`` in a single row, as several recordings have, the last row is kept.
     """
-    step = max(2, -(-features.shape[1] * features.shape[2] // most))
+    step = min(max(2, -(-features.shape[1] * features.shape[2] // most)), features.shape[1])
     return features[:, step - 1 :: step].reshape(len(features), -1)
 
 

@@ -57,6 +57,8 @@ def test_the_thinned_summary_keeps_the_last_of_every_few_rows():
     features = np.arange(40.0).reshape(1, 20, 2)
     np.testing.assert_allclose(thinned_summary(features)[0], features[0, 1::2].ravel())
     assert thinned_summary(np.zeros((3, 100, 63)), most=100).shape == (3, 63)
+    wide = np.random.default_rng(0).normal(size=(3, 61, 378))  # six recordings of 21 markers
+    np.testing.assert_array_equal(thinned_summary(wide), wide[:, -1])
 
 
 def test_masked_features_are_left_out():
