@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.bayes.noise import Timeline, timeline
 from rfdropo_bayes.bayes.noise.autoregression import steps_of
-from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
+from rfdropo_bayes.data import UNSENT, Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
@@ -64,13 +64,18 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     """Bring trajectories onto the simulator's clock and markers: those of the robot's that every recording has.
 
     Raises:
-        InputError: no trajectory, two of one name, no marker in common, or another number of channels.
+        InputError: no trajectory, two of one name, one whose commands no drive has carried out, no marker in common, or
+            another number of channels.
     """
     if not trajectories:
         raise InputError("no recordings", where="[data] fit", remedy="name at least one recording")
     names = tuple(trajectory.name for trajectory in trajectories)
     if len(set(names)) < len(names):
         raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
+    for trajectory in trajectories:
+        if trajectory.settings.get(UNSENT):
+            remedy = "leave it out: a session in the shadow shows what a policy would do"
+            raise InputError("no drive has carried its commands out", where=trajectory.name, remedy=remedy)
     length = max(len(trajectory.time) for trajectory in trajectories)
     markers = shared_markers(trajectories, simulator.marker_names)
     times, positions, valid, commands = [], [], [], []

@@ -24,13 +24,14 @@ from jaxtyping import Bool, Float, Shaped
 
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.deployment.bus import FrameLog
+from rfdropo_bayes.deployment.sensors import POSE
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import unwritten
 from rfdropo_bayes.robots import Robot
 
 JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
 FORMAT = "drive-session"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _WRITE = 0.02  # [s]: how often what is waiting is written
 _SYNC = 1.0  # [s]: how often the disk is told to keep what it has
 _HEADER = 4096  # [bytes]
@@ -56,7 +57,9 @@ def record_type(channels: int, markers: int) -> np.dtype[np.void]:
             ("controlword", "<u2", (channels,)),
             ("position", "<f8", (markers, 3)),
             ("seen", "?", (markers,)),
-            ("seen_at", "<f8"),  # when the markers were where this cycle saw them
+            ("object_pose", "<f8", (POSE,)),  # centre in m, quaternion x, y, z, w; where the object was last seen
+            ("object_seen", "?"),  # anew
+            ("seen_at", "<f8"),  # when markers and object were where this cycle saw them
         ]
     )
 
@@ -208,14 +211,19 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
 
 def _seen_when(
     rows: Shaped[np.ndarray, " cycle"],
-) -> tuple[Float[np.ndarray, "cycle marker 3"], Bool[np.ndarray, "cycle marker"]]:
-    """Markers [m] in the cycles nearest to when they were there, not when the loop heard of it; and which are new."""
-    heard = np.flatnonzero(rows["seen"].any(axis=1))
+) -> tuple[Float[np.ndarray, "cycle marker 3"], Bool[np.ndarray, "cycle marker"], Float[np.ndarray, "cycle 7"] | None]:
+    """Markers [m] in the cycles nearest to when they were there, not when the loop heard of it; which are new; and the
+    object's pose, not a number where it was not seen, None where it never was."""
+    heard = np.flatnonzero(rows["seen"].any(axis=1) | rows["object_seen"])
     edges = 0.5 * (rows["time"][1:] + rows["time"][:-1])
     place = np.searchsorted(edges, rows["seen_at"][heard])
     position, seen = rows["position"].copy(), np.zeros_like(rows["seen"])
     position[place], seen[place] = rows["position"][heard], rows["seen"][heard]
-    return position, seen
+    if not rows["object_seen"].any():
+        return position, seen, None
+    pose, found = np.full(rows["object_pose"].shape, np.nan), rows["object_seen"][heard]
+    pose[place[found]] = rows["object_pose"][heard[found]]
+    return position, seen, pose
 
 
 def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> Trajectory:
@@ -242,7 +250,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
         rows = rows[chosen]
     if len(rows) < 2:
         raise InputError(f"has {len(rows)} cycles", where=str(folder), remedy="there is nothing to make a recording of")
-    position, seen = _seen_when(rows)
+    position, seen, pose = _seen_when(rows)
     acted = np.flatnonzero(rows["acted"])
     first = acted if acted.size else np.array([0])
     radius = np.array([motor.drum_radius_m for motor in robot.motors])
@@ -270,6 +278,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
             position_mask=seen,
             tension=np.where(rows["fresh"], rows["tension"], np.nan),
             motor_angle=rows["length"] / radius,
+            object_pose=pose,
         ),
     )
     cycle, command = ("time", "cable"), ("command_time", "cable")

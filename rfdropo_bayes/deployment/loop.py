@@ -27,6 +27,7 @@ from rfdropo_bayes.deployment.watch import Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
+_AWAY = 1e-4  # [m]: a braked drive so far from the command in force holds another one
 _ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep
 
 
@@ -156,6 +157,7 @@ class ControlLoop:
             record["statusword"] = [drive.reading.statusword for drive in all_drives if drive.reading]
             record["controlword"] = [drive.controlword for drive in all_drives]
             record["position"], record["seen"] = self.markers.position, self.markers.fresh
+            record["object_pose"], record["object_seen"] = self.markers.object_pose, self.markers.object_fresh
             record["seen_at"] = self.markers.instant
             self.log.write()
         act_time = self.act_times[-1] if self.act_times else 0.0
@@ -248,7 +250,7 @@ class ControlLoop:
         simulator does, so that the log is calibrated as it stands.
 
         Raises:
-            Stop: if it commands what cannot be followed, or a marker it needs is lost.
+            Stop: if it commands what cannot be followed, or a marker or the object that it needs is lost.
         """
         cycles = round(1.0 / (source.rate_hz * self.period))
         steps = max(1, round(self.robot.command.ramp_s / self.period))
@@ -273,11 +275,13 @@ class ControlLoop:
             self.cycle(phase, acting, source.rehearse if (number + 1) % cycles == 0 else None)
             if source.sees_markers and (name := self.markers.lost(time.monotonic())):
                 raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
+            if source.sees_object and self.markers.object_lost(time.monotonic()):
+                raise Stop(Cause.MARKERS_LOST, "the object is lost")
 
     def _act(self, source: CommandSource, period: float) -> bool:
         self.markers.act()
-        unit = self.command / self.scale
-        scene = PolicyScene(self.markers.position, self.markers.moved, unit, self.lengths(), self.tensions())
+        unit, pose = self.command / self.scale, self.markers.object_pose
+        scene = PolicyScene(self.markers.position, self.markers.moved, unit, self.lengths(), self.tensions(), pose)
         began = time.monotonic()
         act = source.act(scene)
         self.act_times.append(time.monotonic() - began)
@@ -344,7 +348,7 @@ class ControlLoop:
         failed = False
         while time.monotonic() < end:
             try:
-                self.cycle(Phase.BRAKED)
+                self.cycle(Phase.BRAKED, self._hold_where_it_is())
             except Stop as error:
                 if not failed:
                     self._say(f"while braking: {error}; the drives' own guards stop them")
@@ -360,6 +364,16 @@ class ControlLoop:
             except can.CanError:
                 self._say("the bus is lost: the drives' heartbeat guards stop them")
         self.pulse = None
+
+    def _hold_where_it_is(self) -> bool:
+        """Let the command be where the drives have come to, as they no longer follow one; whether it is another now."""
+        if any(drive.reading is None for drive in self.drives.all):
+            return False
+        length = self.lengths()
+        if self._expected is None or np.all(np.abs(length - self.command) < _AWAY):
+            return False
+        self.command = length
+        return True
 
 
 def _stands(drive: Drive) -> bool:

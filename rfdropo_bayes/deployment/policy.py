@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
+from rfdropo_bayes.deployment.sensors import POSE
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EARLIER_COMMANDS, EARLIER_MOVED, Earlier, PolicyLayout
@@ -34,6 +35,7 @@ class PolicyScene(NamedTuple):
         command: in force [command unit].
         length: cable on each drum, measured [m].
         tension: of each cable [N].
+        object_pose: centre [m] and unit quaternion x, y, z, w of what the robot pushes; the newest known.
     """
 
     position: Float[np.ndarray, "marker 3"]
@@ -41,6 +43,7 @@ class PolicyScene(NamedTuple):
     command: Float[np.ndarray, " channel"]
     length: Float[np.ndarray, " channel"]
     tension: Float[np.ndarray, " channel"]
+    object_pose: Float[np.ndarray, "7"]
 
 
 class Act(NamedTuple):
@@ -57,6 +60,8 @@ class CommandSource(Protocol):
     start: Float[np.ndarray, " channel"]
     sees_markers: bool
     """Whether lost markers make its commands worthless."""
+    sees_object: bool
+    """Whether a lost object does."""
 
     def act(self, scene: PolicyScene) -> Act | None:
         """The next command [command unit]; None where there is no more.
@@ -111,6 +116,7 @@ class OnnxPolicy:
             raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
         self.rate_hz = 1.0 / self.layout.period_s
         self.sees_markers = bool({"markers", "moved", EARLIER_MOVED} & set(names))
+        self.sees_object = "object" in names
         self.start = np.zeros(len(robot.channel_names))
         moves = np.array(self.layout.moves)
         self._reach = np.abs(moves).max(axis=0)
@@ -121,7 +127,7 @@ class OnnxPolicy:
         self._earlier = Earlier(self.layout.history - 1, 1, len(self._reach), 3 * len(self._markers))
         self._begun = False
         nowhere, still = np.zeros((len(robot.marker_names), 3)), np.zeros(len(robot.channel_names))
-        self._last = PolicyScene(nowhere, nowhere, still, still, still)
+        self._last = PolicyScene(nowhere, nowhere, still, still, still, np.zeros(POSE))
 
     def rehearse(self) -> None:
         """Look at the last scene again; see `CommandSource.rehearse`."""
@@ -153,6 +159,7 @@ class OnnxPolicy:
             "markers": scene.position[self._markers].ravel(),
             "moved": scene.moved[self._markers].ravel(),
             "goal": self._goal,
+            "object": scene.object_pose,
             "commands": scene.command,
             "lengths": scene.length,
             "tensions": scene.tension,
@@ -230,7 +237,8 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
             f"acts in {layout.unit}, the robot's commands are in {robot.command_unit}", where=where, remedy=remedy
         )
     channels = len(robot.channel_names)
-    sizes = {"markers": seen, "moved": seen, "goal": 3, "commands": channels, "lengths": channels, "tensions": channels}
+    sizes = {"markers": seen, "moved": seen, "goal": 3, "object": POSE}
+    sizes |= {"commands": channels, "lengths": channels, "tensions": channels}
     before = layout.history - 1
     sizes |= {EARLIER_COMMANDS: before * channels, EARLIER_MOVED: before * seen}
     for part in layout.observation:
@@ -319,7 +327,7 @@ class RecordedCommands:
         InputError: if channels or unit do not fit.
     """
 
-    sees_markers = False
+    sees_markers = sees_object = False
 
     def __init__(self, recording: Trajectory, robot: Robot, rate_hz: float) -> None:
         if recording.cable_names != robot.channel_names or recording.command_unit != robot.command_unit:

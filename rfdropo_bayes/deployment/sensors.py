@@ -17,6 +17,8 @@ from rfdropo_bayes.deployment.bench.simulated_bus import DATAGRAM, MAGIC
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
+POSE = 7  # numbers: centre, and quaternion x, y, z, w
+
 
 class Sighting(NamedTuple):
     """The newest frame of markers.
@@ -26,12 +28,14 @@ class Sighting(NamedTuple):
         time: when it came [s, monotonic].
         position: of each marker in the robot's base frame [m].
         seen: False where the marker was lost; its position is then of no use.
+        object_pose: centre [m] and unit quaternion x, y, z, w of what the robot pushes; None where it was not seen.
     """
 
     number: int
     time: float
     position: Float[np.ndarray, "marker 3"]
     seen: Bool[np.ndarray, " marker"]
+    object_pose: Float[np.ndarray, "7"] | None = None
 
 
 class MarkerSensor(Protocol):
@@ -54,11 +58,13 @@ class SensorTable(BaseModel):
         server, local: addresses of Motive's machine and of this one (natnet).
         multicast: how Motive streams (natnet).
         rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
+        object_body: identifier of the rigid body that the robot pushes (natnet); its pivot is the object's centre.
+            Create it in Motive while the object is aligned with the robot's base.
         rotation: rows of the matrix from the sensor's frame to the robot's base frame.
         origin_m: origin of the base frame in the sensor's frame.
         port: that a simulation sends to (simulated).
         stale_s: older frames count as lost.
-        lost_s: a policy that sees markers ends where one is lost for so long.
+        lost_s: a policy that sees markers or the object ends where one of them is lost for so long.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -68,6 +74,7 @@ class SensorTable(BaseModel):
     local: str = "127.0.0.1"
     multicast: bool = True
     rigid_bodies: dict[str, int] = {}
+    object_body: int | None = None
     rotation: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     port: int = Field(default=0, ge=0, le=65535)
@@ -127,18 +134,22 @@ class SimulatedMarkers:
         return f"{host}:{port}"
 
     def latest(self) -> Sighting:
-        """Read what has come; a datagram of another size belongs to another robot and is left out."""
-        size = DATAGRAM.size + 24 * len(self._sighting.seen)
+        """Read what has come, markers with an object or without; a datagram of another size belongs to another robot
+        and is left out."""
+        markers = len(self._sighting.seen)
+        size = DATAGRAM.size + 24 * markers
         while True:
             try:
                 data = self._socket.recv(65536)
             except (BlockingIOError, OSError):
                 return self._sighting
-            if len(data) == size and data[:4] == MAGIC:
-                position = np.frombuffer(data, dtype="<f8", offset=DATAGRAM.size).reshape(-1, 3).copy()
+            if len(data) in (size, size + 8 * POSE) and data[:4] == MAGIC:
+                numbers = np.frombuffer(data, dtype="<f8", offset=DATAGRAM.size).copy()
+                position, pose = numbers[: 3 * markers].reshape(-1, 3), numbers[3 * markers :]
                 seen = np.all(np.isfinite(position), axis=1)
                 _, number, instant = DATAGRAM.unpack_from(data)  # of this machine's clock: the simulation runs here
-                self._sighting = Sighting(number, instant, position, seen)
+                known = pose.size and np.all(np.isfinite(pose))
+                self._sighting = Sighting(number, instant, position, seen, pose if known else None)
 
     def close(self) -> None:
         """Close the socket."""
@@ -166,8 +177,9 @@ class RecordedMarkers:
         now = time.monotonic()
         self._start = now if self._start is None else self._start
         row = int(np.searchsorted(self._recording.time, now - self._start, side="right")) - 1
-        at = self._start + float(self._recording.time[row])
-        return Sighting(row + 1, at, self._recording.position[row], self._recording.position_mask[row])
+        at, poses = self._start + float(self._recording.time[row]), self._recording.object_pose
+        pose = None if poses is None or not np.all(np.isfinite(poses[row])) else poses[row]
+        return Sighting(row + 1, at, self._recording.position[row], self._recording.position_mask[row], pose)
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -194,6 +206,10 @@ class NatNetMarkers:
         if len(self._identifiers) < len(robot.marker_names):
             remedy = "give each marker the identifier of its own"
             raise InputError("two markers have the same one", where="sensor.rigid_bodies", remedy=remedy)
+        if table.object_body in self._identifiers:
+            remedy = "give the identifier of the object's own"
+            raise InputError("a marker has the same one", where="sensor.object_body", remedy=remedy)
+        self._object = table.object_body
         self._rotation, self._origin = np.array(table.rotation), np.array(table.origin_m)
         self._lock = threading.Lock()
         self._sighting = _nothing(len(robot.marker_names))
@@ -221,15 +237,29 @@ class NatNetMarkers:
 
     def receive(self, frame: Any) -> None:
         """Take a frame of natnet's: rigid bodies that are not tracked count as lost."""
-        position = self._sighting.position.copy()
+        position, pose = self._sighting.position.copy(), None
         seen = np.zeros(len(position), dtype=bool)
         for body in frame.rigid_bodies:
+            if body.tracking_valid is False or not np.all(np.isfinite(body.pos)):
+                continue
             place = self._identifiers.get(body.id_num)
-            if place is not None and body.tracking_valid is not False and np.all(np.isfinite(body.pos)):
+            if place is not None:
                 position[place] = self._rotation @ (np.array(body.pos) - self._origin)
                 seen[place] = True
+            elif body.id_num == self._object:
+                pose = self._pose(body)
         with self._lock:
-            self._sighting = Sighting(self._sighting.number + 1, time.monotonic(), position, seen)
+            self._sighting = Sighting(self._sighting.number + 1, time.monotonic(), position, seen, pose)
+
+    def _pose(self, body: Any) -> Float[np.ndarray, "7"] | None:
+        """Centre, and the turn since the body was aligned with the base, both in the frame of the base."""
+        quaternion = np.array(body.rot, dtype=float)
+        if not np.all(np.isfinite(quaternion)) or not quaternion.any():
+            return None
+        # The same turn about an axis that is written in the frame of the base.
+        turned = np.append(self._rotation @ quaternion[:3], quaternion[3]) / np.linalg.norm(quaternion)
+        centre = self._rotation @ (np.array(body.pos) - self._origin)
+        return np.concatenate([centre, turned if turned[3] >= 0.0 else -turned])
 
     def latest(self) -> Sighting:
         """The newest frame."""
@@ -257,7 +287,7 @@ def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
 
 
 class MarkerView:
-    """What the loop sees of a sensor: each marker's last good position, how old it is, and how far it moved.
+    """What the loop sees of a sensor: each marker's last good position, its age, how far it moved; and the object.
 
     Args:
         sensor: that is asked.
@@ -270,8 +300,11 @@ class MarkerView:
         self.position = np.zeros((len(names), 3))
         self.moved = np.zeros((len(names), 3))  # between the last two acts
         self.fresh = np.zeros(len(names), dtype=bool)
+        self.object_pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])  # the last good one
+        self.object_fresh = False
         self.instant = 0.0  # of the newest frame [s, monotonic]
         self._last = np.full(len(names), -np.inf)  # time of the last good position
+        self._object_last = -np.inf
         self._number = 0
         self._acted: np.ndarray | None = None
 
@@ -283,11 +316,18 @@ class MarkerView:
         self.fresh = sighting.seen & new & np.all(np.isfinite(sighting.position), axis=1)
         self.position[self.fresh] = sighting.position[self.fresh]
         self._last[self.fresh] = sighting.time
+        self.object_fresh = new and sighting.object_pose is not None
+        if new and sighting.object_pose is not None:
+            self.object_pose, self._object_last = sighting.object_pose, sighting.time
 
     def lost(self, now: float) -> str:
         """Name of a marker that has been lost for too long; empty if none."""
         gone = np.flatnonzero(now - self._last > self._table.lost_s)
         return self._names[gone[0]] if gone.size else ""
+
+    def object_lost(self, now: float) -> bool:
+        """Whether the object has been lost for too long."""
+        return now - self._object_last > self._table.lost_s
 
     def act(self) -> None:
         """Note an act of the policy: markers have moved since the one before."""

@@ -18,7 +18,7 @@ import tomli_w
 from rich.live import Live
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import GOAL_AXES, UNSENT, Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
@@ -145,6 +145,8 @@ class _Session:
         self.simulated, self._stack = simulated, stack
         self.period = 1.0 / settings.rate_hz
         self._facts: dict[str, Any] = {"mode": mode.value, "simulated": simulated, "rate_hz": settings.rate_hz}
+        if mode is Mode.SHADOW:
+            self._facts[UNSENT] = True
         self.found: dict[str, dict[str, int]] = {}
         self.without: dict[str, list[str]] = {}
         self.source: CommandSource | None = None
@@ -164,6 +166,8 @@ class _Session:
                 Path(settings.policy.file), self.robot, settings.goal, settings.policy.sha256, settings.policy.markers
             )
             self._facts["policy_sha256"] = policy.sha256
+            if policy.sees_object:
+                self._facts[GOAL_AXES] = np.delete(np.arange(3), np.argmax(np.abs(self.robot.gravity))).tolist()
             self.source = policy
 
     def _offsets(self) -> list[float]:
@@ -245,6 +249,10 @@ class _Session:
                     where="rate_hz",
                     remedy="choose a multiple of the policy's rate",
                 )
+            seen = self.settings.sensor
+            if self.source.sees_object and seen.kind == "natnet" and seen.object_body is None and not self.simulated:
+                remedy = "give the identifier of its rigid body"
+                raise InputError("the policy sees an object", where="sensor.object_body", remedy=remedy)
         if self.mode is not Mode.CHECK:
             self.drives.configure(self.period, lambda text: self.log.event("note", text))
 

@@ -253,16 +253,23 @@ class Episodes:
         self.seen[rows] = self.marker[rows] + errors[:, :count].reshape(-1, *self.marker.shape[1:])
         if self.pose is not None:
             assert self.seen_pose is not None
-            turn = Rotation.from_rotvec(errors[:, count + 3 :] / LEVER) * Rotation.from_quat(self.pose[rows, 3:])
-            place = self.pose[rows, :3] + errors[:, count : count + 3]
             self.seen_pose = self.seen_pose.copy()
-            self.seen_pose[rows] = np.concatenate([place, turn.as_quat()], axis=1)
+            self.seen_pose[rows] = pose_with_errors(self.pose[rows], errors[:, count:])
 
     def _observe(self, rows: Int[np.ndarray, " row"]) -> Float[np.ndarray, "row size"]:
         seen, before = self.seen[rows], self.seen_before[rows]
         pose = None if self.seen_pose is None else self.seen_pose[rows]
         parts = parts_seen(self.shown, seen, before, self.goal[rows], self.commands[rows], pose)
         return self.layout.assemble(parts | self.earlier.parts(rows))
+
+
+def pose_with_errors(
+    pose: Float[np.ndarray, "row 7"], errors: Float[np.ndarray, "row 6"]
+) -> Float[np.ndarray, "row 7"]:
+    """Poses of a cube [m, quaternion x, y, z, w] as motion capture sees them: its errors [m] of the centre, then of
+    points `LEVER` away from it, which turn the cube."""
+    turn = Rotation.from_rotvec(errors[:, 3:] / LEVER) * Rotation.from_quat(pose[:, 3:])
+    return np.concatenate([pose[:, :3] + errors[:, :3], turn.as_quat()], axis=1)
 
 
 def _rows_of(found: Observation, chosen: Bool[np.ndarray, " row"]) -> Observation:

@@ -44,7 +44,7 @@ def commands_figure(session: Trajectory) -> Figure:
 
 @styled
 def goal_figure(time: Float[np.ndarray, " row"], distance: Float[np.ndarray, " row"]) -> Figure:
-    """Distance [m] of the last marker from the goal in the rows that saw it."""
+    """Distance [m] from the goal in the rows that saw what is to reach it."""
     figure = Figure(figsize=(WIDTH, 2.4))
     axes = figure.add_subplot()
     axes.plot(time, MILLIMETRES * distance, marker="." if len(time) < 2 else None)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import GOAL_AXES, UNSENT, Trajectory
 from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.session_figures import commands_figure, drives_figure, goal_figure, punctuality_figure
 from rfdropo_bayes.report.style import embed
@@ -71,7 +71,7 @@ def render_session(session: MotorSession) -> str:
         pictures["timing"] = embed(punctuality_figure(recording, figures["period_s"]), "How late the cycles began")
         time, distance = distance_to_goal(recording, session.goal)
         if len(distance):
-            pictures["goal"] = embed(goal_figure(time, distance), "Distance of the last marker from the goal")
+            pictures["goal"] = embed(goal_figure(time, distance), f"Distance of {_judged(recording)} from the goal")
     shown = [(anchor, words) for anchor, words in SECTIONS if anchor in (*pictures, "result", "events", "reproduce")]
     began = session.events[0]["monotonic"] if session.events else 0.0
     return render(
@@ -81,7 +81,7 @@ def render_session(session: MotorSession) -> str:
         pictures=pictures,
         drives=[] if recording is None else drive_rows(recording),
         ended_at=None if recording is None else _final_distance(recording, session.goal),
-        goal_marker=None if recording is None else recording.marker_names[-1],
+        judged=None if recording is None else _judged(recording),
         seconds=0.0 if recording is None else float(recording.time[-1]),
         events=[(each["monotonic"] - began, each) for each in session.events if each["event"] != ROUTINE],
         checked=sum(each["event"] == ROUTINE for each in session.events),
@@ -112,12 +112,27 @@ def drive_rows(recording: Trajectory) -> list[dict[str, Any]]:
 def distance_to_goal(
     recording: Trajectory, goal: Mapping[str, float]
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """Times [s] at which the last marker was seen, and its distance from a goal [m]; empty without a goal."""
-    seen = recording.position_mask[:, -1]
+    """Times [s] at which the last marker, or the object that is pushed, was seen, and its distance from a goal [m];
+    empty without a goal. An object's is that along its plate."""
+    axes, track, seen = [0, 1, 2], recording.position[:, -1], recording.position_mask[:, -1]
+    if _pushed(recording):
+        assert recording.object_pose is not None
+        axes, track = recording.settings[GOAL_AXES], recording.object_pose[:, :3]
+        seen = np.isfinite(track).all(axis=1)
     if set(goal) != set("xyz") or not seen.any():
         return np.empty(0), np.empty(0)
     place = np.array([goal[axis] for axis in "xyz"])
-    return recording.time[seen], np.linalg.norm(recording.position[seen, -1] - place, axis=1)
+    return recording.time[seen], np.linalg.norm((track[seen] - place)[:, axes], axis=1)
+
+
+def _pushed(recording: Trajectory) -> bool:
+    """Whether an object is to reach the goal."""
+    return GOAL_AXES in recording.settings and recording.object_pose is not None
+
+
+def _judged(recording: Trajectory) -> str:
+    """What is to reach the goal, in words."""
+    return "the object" if _pushed(recording) else f"the last marker, {recording.marker_names[-1]},"
 
 
 def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float | None:
@@ -157,6 +172,8 @@ def session_steps(session: MotorSession) -> list[str]:
         found.append(f"{words}: see the commands below.")
     if cause == PLANNED and summary["facts"].get("simulated"):
         found.append("The drives were simulated. On a robot, begin with --mode check, home and shadow.")
+    if UNSENT in recording.settings:
+        return [*found, "No drive has carried these commands out: this recording is no data. Go on with --mode run."]
     found.append(
         'The recording is data: put session.nc under fit in [data] with format = "netcdf", then rfdropo calibrate and '
         "rfdropo audit say how this robot differs from its model."

@@ -20,6 +20,8 @@ from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values,
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
 from rfdropo_bayes.model.experiment_file import override
 from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.policies.episodes import pose_with_errors
+from rfdropo_bayes.policies.tasks import resting_height
 from rfdropo_bayes.robots import OBJECT, Robot
 from rfdropo_bayes.robots.robot import CommandTiming
 from rfdropo_bayes.simulators.control_session import Session
@@ -38,7 +40,7 @@ def trunk(
     Args:
         robot: the robot with motors that is deployed.
         experiment: file whose robot, [simulator], mechanisms and [model.fixed] are the truth; by default ``robot``.
-        marker_noise: standard deviation of white noise on every coordinate of a marker [m].
+        marker_noise: standard deviation of white noise on every coordinate of a marker, and on points of a cube [m].
         seed: of the noise.
         changes: entries that replace the experiment's, as ``--set`` takes them: a parameter's name, or ``"table.key"``.
 
@@ -52,6 +54,10 @@ def trunk(
     timing = CommandTiming(unit=command.unit, ramp_s=period, dead_time_s=0.0)
     base = simulator.robot.with_changes(command=timing)
     simulator, values = true_simulator(robot, experiment, changes, base)
+    specs = {spec.name: spec for spec in simulator.parameters}
+    if "cube_side" in specs:  # as an episode of a task begins
+        up, side = int(np.argmax(np.abs(base.gravity))), values.get("cube_side", specs["cube_side"].nominal)
+        values |= {f"cube_{'xyz'[up]}": float(resting_height(base, np.array(side)))}
     return SimulatedTrunk(robot, simulator, period, values, marker_noise, seed)
 
 
@@ -162,4 +168,8 @@ class SimulatedTrunk:
         # By virtual work: a drum holds what its cables pull, each times its way per command, at the drum's radius.
         tension = self._matrix.T @ np.asarray(self._found.tension, dtype=float)[0] / self._scale
         position = np.asarray(self._found.position, dtype=float)[0]
-        return PlantState(tension, position + self._noise * self._random.standard_normal(position.shape))
+        position = position + self._noise * self._random.standard_normal(position.shape)
+        if self._found.object_pose is None:
+            return PlantState(tension, position)
+        errors = self._noise * self._random.standard_normal((1, 6))
+        return PlantState(tension, position, pose_with_errors(np.asarray(self._found.object_pose), errors)[0])

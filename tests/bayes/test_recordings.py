@@ -6,19 +6,28 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
+from rfdropo_bayes.data import UNSENT, Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 
 
-@pytest.mark.parametrize(("unit", "message"), [("m", None), ("rad", "commands are in rad, the robot's in m")])
-def test_commands_in_another_unit_than_the_robots_are_refused(unit: str, message: str | None) -> None:
+@pytest.mark.parametrize(
+    ("unit", "settings", "message"),
+    [
+        ("m", {}, None),
+        ("rad", {}, "commands are in rad, the robot's in m"),
+        ("m", {UNSENT: True}, "no drive has carried its commands out"),
+    ],
+)
+def test_commands_in_another_unit_or_that_nothing_followed_are_refused(
+    unit: str, settings: dict[str, bool], message: str | None
+) -> None:
     simulator = build_simulator(ModelSpec(Robot.load("smooth_arm")))
     channels, time = len(simulator.channel_names), 0.05 * np.arange(6)
     trajectory = Trajectory.build(
-        Origin(name="r", robot="smooth_arm", format="csv"),
+        Origin(name="r", robot="smooth_arm", format="csv", settings=settings),
         SentCommands(
             command_time=time,
             command=np.zeros((6, channels)),

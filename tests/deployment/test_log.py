@@ -78,6 +78,26 @@ def test_markers_stand_in_the_cycle_in_which_they_were_there(robot: Robot, tmp_p
     np.testing.assert_allclose(made.position[7], robot.marker_points() + 8e-3)
 
 
+def test_an_object_is_recorded_where_it_was_seen(robot: Robot, tmp_path: Path) -> None:
+    """Every third cycle, 12 ms late; a recording without one has no poses."""
+    log = SessionLog(tmp_path / "s", robot, {})
+    for number in range(30):
+        log.record["time"], log.record["seen_at"] = 0.01 * number, 0.01 * number - 0.012
+        log.record["object_seen"] = number % 3 == 0
+        log.record["object_pose"] = [1e-3 * number, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+        log.write()
+    log.close()
+    pose = session_trajectory(tmp_path / "s").object_pose
+    assert pose is not None
+    seen = np.flatnonzero(np.isfinite(pose).all(axis=1))
+    np.testing.assert_array_equal(seen, [0, *range(2, 27, 3)])
+    np.testing.assert_allclose(pose[seen[1:], 0], 1e-3 * (seen[1:] + 1))
+    log = SessionLog(tmp_path / "t", robot, {})
+    write(log, robot)
+    log.close()
+    assert session_trajectory(tmp_path / "t").object_pose is None
+
+
 def test_a_session_without_markers_is_a_recording_of_tensions(robot: Robot, tmp_path: Path) -> None:
     log = SessionLog(tmp_path / "s", robot, {})
     for number in range(5):

@@ -26,7 +26,7 @@ def scene(robot: Robot, seed: int = 0) -> PolicyScene:
     markers, channels = len(robot.marker_names), len(robot.channel_names)
     motion = [random.normal(size=(markers, 3)) for _ in range(2)]
     command, length, tension = (1e-3 * random.normal(size=channels) for _ in range(3))
-    return PolicyScene(*motion, command, length, tension)
+    return PolicyScene(*motion, command, length, tension, random.normal(size=7))
 
 
 def matrix(robot: Robot, seed: int = 1) -> np.ndarray:
@@ -45,8 +45,8 @@ def test_a_policy_acts_as_its_matrix_says(robot: Robot, tmp_path: Path) -> None:
 
 def test_every_part_finds_its_values(robot: Robot, tmp_path: Path) -> None:
     """One policy that copies a chosen input to its outputs, for every part; markers only those that are named."""
-    names = ("lengths", "goal", "moved", "tensions", "markers", "commands")
-    sizes = {"goal": 3, "moved": 6, "markers": 6}
+    names = ("lengths", "goal", "moved", "object", "tensions", "markers", "commands")
+    sizes = {"goal": 3, "moved": 6, "markers": 6, "object": 7}
     parts = tuple(ObservationPart(name, sizes.get(name, 4), "-") for name in names)
     seen = scene(robot)
     chosen = [3, 1]
@@ -55,6 +55,7 @@ def test_every_part_finds_its_values(robot: Robot, tmp_path: Path) -> None:
             seen.length,
             [0.1, 0.2, 0.3],
             seen.moved[chosen].ravel(),
+            seen.object_pose,
             seen.tension,
             seen.position[chosen].ravel(),
             seen.command,
@@ -67,6 +68,7 @@ def test_every_part_finds_its_values(robot: Robot, tmp_path: Path) -> None:
         goal = {"x": 0.1, "y": 0.2, "z": 0.3}
         policy = OnnxPolicy(path, robot, goal, markers=[robot.marker_names[k] for k in chosen])
         np.testing.assert_allclose(policy.act(seen).raw, 1e-3 * value, atol=1e-9)
+        assert policy.sees_object
 
 
 def test_a_history_is_what_was_seen_at_earlier_acts(robot: Robot, tmp_path: Path) -> None:
@@ -116,7 +118,7 @@ def test_outputs_that_cannot_be_meant_end_the_session(robot: Robot, tmp_path: Pa
         ({"channels": ("right", "down", "left", "up")}, "drives right, down, left, up"),
         ({"observation": (ObservationPart("commands", 16, "m"),)}, "wants 16 numbers of 'commands'"),
         ({"observation": (ObservationPart("markers", 16, "m"),)}, "wants 16 numbers of 'markers'; here there are 12"),
-        ({"observation": (ObservationPart("object", 16, "m"),)}, "wants 'object', which nothing here measures"),
+        ({"observation": (ObservationPart("wind", 16, "m"),)}, "wants 'wind', which nothing here measures"),
         ({"observation": (ObservationPart("goal", 3, "m"),)}, "wants a goal"),
         ({"observation": (ObservationPart("commands", 4, "m"),)}, "takes .* of width 16, its layout 4"),
     ],

@@ -34,8 +34,10 @@ class Scripted:
     def __init__(self) -> None:
         self.sighting = Sighting(0, 0.0, np.zeros((2, 3)), np.zeros(2, dtype=bool))
 
-    def show(self, now: float, position: float, seen: tuple[bool, bool] = (True, True)) -> None:
-        self.sighting = Sighting(self.sighting.number + 1, now, np.full((2, 3), position), np.array(seen))
+    def show(
+        self, now: float, position: float, seen: tuple[bool, bool] = (True, True), pose: np.ndarray | None = None
+    ) -> None:
+        self.sighting = Sighting(self.sighting.number + 1, now, np.full((2, 3), position), np.array(seen), pose)
 
     def latest(self) -> Sighting:
         return self.sighting
@@ -59,6 +61,22 @@ def test_a_marker_is_held_then_stale_then_lost() -> None:
     assert view.fresh.tolist() == [True, False]
     np.testing.assert_allclose(view.position[:, 0], [0.2, 0.1])
     assert view.lost(10.06) == "b"
+
+
+def test_an_object_is_held_then_lost() -> None:
+    sensor, pose = Scripted(), np.array([0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8])
+    view = MarkerView(sensor, SensorTable(stale_s=0.02, lost_s=0.05), NAMES)
+    assert view.object_lost(10.0)
+    sensor.show(10.0, 0.1, pose=pose)
+    view.update(10.0)
+    assert view.object_fresh
+    sensor.show(10.03, 0.1)  # markers alone
+    view.update(10.03)
+    assert not view.object_fresh
+    np.testing.assert_allclose(view.object_pose, pose)
+    assert not view.object_lost(10.04)
+    assert view.object_lost(10.06)
+    assert not view.lost(10.06)
 
 
 def test_a_frame_that_is_old_when_it_comes_does_not_count() -> None:
@@ -107,6 +125,12 @@ def test_simulated_markers_take_the_newest_of_their_size() -> None:
     sighting = sensor.latest()
     assert sighting.number == 2
     np.testing.assert_allclose(sighting.position, 0.2)
+    assert sighting.object_pose is None
+    numbers = np.append(np.full(6, 0.4), np.arange(7.0))
+    out.sendto(DATAGRAM.pack(MAGIC, 4, 0.0) + numbers.tobytes(), (host, int(port)))
+    time.sleep(0.05)
+    np.testing.assert_allclose(sensor.latest().position, 0.4)
+    np.testing.assert_allclose(sensor.latest().object_pose, np.arange(7.0))
     out.close()
     sensor.close()
 
@@ -118,8 +142,13 @@ def test_recorded_markers_come_at_their_own_pace(robot: Robot) -> None:
     assert 2 <= sensor.latest().number <= 11
 
 
-def body(number: int, position: tuple[float, float, float], valid: bool = True) -> SimpleNamespace:
-    return SimpleNamespace(id_num=number, pos=position, tracking_valid=valid)
+def body(
+    number: int,
+    position: tuple[float, float, float],
+    valid: bool = True,
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+) -> SimpleNamespace:
+    return SimpleNamespace(id_num=number, pos=position, tracking_valid=valid, rot=rotation)
 
 
 def test_rigid_bodies_are_turned_into_the_robots_frame(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,6 +165,28 @@ def test_rigid_bodies_are_turned_into_the_robots_frame(robot: Robot, monkeypatch
     sighting = sensor.latest()
     assert sighting.seen.tolist() == [False, False, True, False]
     np.testing.assert_allclose(sighting.position[2], [0.1, 0.2, 0.3])
+
+
+def test_a_turn_of_the_object_is_about_the_same_axis_in_the_robots_frame(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Motive's vertical, y, is the robot's -z: a turn of 0.2 rad about it is one of -0.2 rad about z, whatever the sign
+    of the quaternion."""
+    monkeypatch.setattr(NatNetMarkers, "_connect", lambda self, table: None)
+    table = SensorTable(
+        kind="natnet", rigid_bodies={"m1": 11, "m2": 12, "m3": 13, "m4": 14}, object_body=20,
+        rotation=((1, 0, 0), (0, 0, 1), (0, -1, 0)), origin_m=(0.0, 2.0, 0.0),
+    )  # fmt: skip
+    sensor = NatNetMarkers(table, robot)
+    half = np.array([0.0, np.sin(0.1), 0.0, np.cos(0.1)])
+    for sign in (1.0, -1.0):
+        sensor.receive(SimpleNamespace(rigid_bodies=[body(20, (0.1, 1.7, 0.2), rotation=tuple(sign * half))]))
+        expected = [0.1, 0.2, 0.3, 0.0, 0.0, -np.sin(0.1), np.cos(0.1)]
+        np.testing.assert_allclose(sensor.latest().object_pose, expected, atol=1e-12)
+    sensor.receive(SimpleNamespace(rigid_bodies=[body(20, (0.1, 1.7, 0.2), valid=False)]))
+    assert sensor.latest().object_pose is None
+    with pytest.raises(InputError, match=r"sensor.object_body: a marker has the same one"):
+        NatNetMarkers(table.model_copy(update={"object_body": 13}), robot)
 
 
 def test_a_marker_without_a_rigid_body_is_refused(robot: Robot) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import UNSENT, Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.causes import Cause
@@ -152,6 +152,29 @@ def test_nothing_moves_in_the_shadow(dry_run, tmp_path: Path) -> None:
     assert np.all(rows["length"] == 0.0)
     assert np.all(rows["statusword"] & 0x6F == 0x40)  # switch on disabled throughout
     assert np.abs(rows["command"]).max() > 1e-3  # the policy commanded, in vain
+    assert Trajectory.load(tmp_path / "s" / "session.nc").settings[UNSENT]
+
+
+def test_after_a_quick_stop_the_command_is_where_the_drives_hold(dry_run, tmp_path: Path) -> None:
+    """A button is pressed while cables move: the last command has not been reached, and is no longer in force."""
+    pressed = deploy(dry_run[1], "dry-run", tmp_path / "s", hooks=(lambda: _running(tmp_path / "s"),))
+    assert pressed.cause is Cause.EMERGENCY_STOP, pressed.detail
+    recording = Trajectory.load(tmp_path / "s" / "session.nc")
+    reached = recording.dataset["length"].to_numpy()[-1]
+    np.testing.assert_allclose(recording.command[-1], reached, atol=1.1e-4)
+    rows = read_journal(tmp_path / "s")[1]
+    last = rows[rows["phase"] == Phase.RUNNING]["command"][-1]
+    assert np.abs(last - reached).max() > 2e-4  # the button came in the middle of a ramp
+
+
+def _running(folder: Path) -> bool:
+    """Whether the policy has acted for a second and a half, and is in the middle of a ramp."""
+    try:
+        rows = read_journal(folder)[1]
+    except InputError:
+        return False
+    rows = rows[rows["phase"] == Phase.RUNNING]
+    return len(rows) > 150 and bool(rows["acted"][-4:-1].any())
 
 
 def test_a_check_writes_nothing(dry_run, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import GOAL_AXES, UNSENT, Trajectory
 from rfdropo_bayes.report.session_page import MotorSession, distance_to_goal, drive_rows, render_session, session_steps
 
 GOAL = {"x": 0.0, "y": 0.0, "z": 0.2}
@@ -76,6 +76,28 @@ def test_the_distance_is_that_where_the_policys_time_ended():
     before_rest = 1e3 * distance[-2]
     assert f"<strong>{before_rest:.3g} mm</strong>" in render_session(session())
     assert len(distance_to_goal(found, {})[0]) == 0
+
+
+def test_an_object_that_is_pushed_is_judged_along_its_plate():
+    """It ends 4 mm from the goal along the plate, of which x and z are the axes, and 30 mm below it."""
+    found = recording()
+    pose = np.tile([0.0, -0.03, 0.2, 0.0, 0.0, 0.0, 1.0], (len(found.time), 1))
+    pose[:, 0] = np.linspace(0.05, 0.004, len(found.time))
+    pose[3] = np.nan
+    dataset = found.dataset.assign(object_pose=(("time", "pose"), pose))
+    pushed = Trajectory(dataset).with_attributes(settings={GOAL_AXES: [0, 2]})
+    time, distance = distance_to_goal(pushed, GOAL)
+    assert len(time) == len(found.time) - 1
+    assert distance[-1] == pytest.approx(0.004)
+    assert "The object was <strong>" in render_session(session()._replace(recording=pushed))
+    assert "The last marker, tip, was <strong>" in render_session(session())
+
+
+def test_commands_that_no_drive_carried_out_are_no_data():
+    shadow = recording().with_attributes(settings={UNSENT: True})
+    steps = session_steps(session()._replace(recording=shadow))
+    assert "No drive has carried these commands out" in steps[-1]
+    assert not any("under fit" in step for step in steps)
 
 
 @pytest.mark.parametrize(("channels", "rows"), [(1, 20), (3, 20), (5, 20), (9, 20), (2, 6)])

@@ -27,10 +27,12 @@ class PlantState(NamedTuple):
     Attributes:
         tension: of each channel's cable [N].
         position: of each marker in the robot's base frame [m].
+        object_pose: centre [m] and unit quaternion x, y, z, w of what the robot pushes; None without.
     """
 
     tension: Float[np.ndarray, " channel"]
     position: Float[np.ndarray, "marker 3"]
+    object_pose: Float[np.ndarray, "7"] | None = None
 
 
 class Plant(Protocol):

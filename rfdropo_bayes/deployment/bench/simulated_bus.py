@@ -150,9 +150,10 @@ class SimulatedDrives:
         if self._markers is not None:
             self._frame += 1
             late = self._plant.late if isinstance(self._plant, PlantProcess) else 0.0
-            header = DATAGRAM.pack(MAGIC, self._frame, now - late)
+            header, pose = DATAGRAM.pack(MAGIC, self._frame, now - late), self.state.object_pose
+            seen = np.append(self.state.position, () if pose is None else pose)
             with contextlib.suppress(OSError):  # nobody listens
-                self._markers.send(header + np.asarray(self.state.position, dtype="<f8").tobytes())
+                self._markers.send(header + np.asarray(seen, dtype="<f8").tobytes())
 
 
 def _marker_socket(address: str) -> socket.socket | None:
