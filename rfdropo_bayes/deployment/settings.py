@@ -104,8 +104,8 @@ class SafetyTable(_Table):
         start_rate_m_s: of the ramp to the start pose; a fifth of each motor's own limit by default.
         settle_s: rest in the start pose before the policy begins.
         hold_s: the drives are watched for so long after a stop.
-        after: "hold" leaves the drives braked and holding; "release" goes back to the start pose and switches them off,
-            where the session ended as planned.
+        after: "hold" leaves the drives braked and holding; "release" switches them off where they stand, which lets the
+            cables go, where the session ended as planned.
         button_file, button_pressed: a file that shows a button, and its content while it is pressed.
     """
 
