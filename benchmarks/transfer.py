@@ -1,6 +1,6 @@
 """What makes a policy transfer: one training setting changed at a time, on a target of development; resumable.
 
-    python benchmarks/transfer.py [--trainings 2] [--steps 600000] [--only-done]
+    python benchmarks/transfer.py [--trainings 2] [--steps 600000] [--setting NAME ...] [--only-done]
 
 The target is the virtual trunk with a lag and a hysteresis on four cables each (`fresh_targets`, scene "push", kind
 "unknown", seed 1), which was used for development before. The model of all trainings knows which laws act, and infers
@@ -16,6 +16,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -24,16 +25,20 @@ from rfdropo_bayes.files import append_line, output_folder, read_lines, write_te
 from rfdropo_bayes.model.experiment_file import describe, read_tables
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, run_ended
+from rfdropo_bayes.policies import training
+from rfdropo_bayes.policies.evaluation import EVALUATION_SEED, draw_cases, play
 from rfdropo_bayes.studies.fresh_targets import make_target
 from rfdropo_bayes.studies.table2 import share_of
 from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.evaluate import CSV, evaluate
+from rfdropo_bayes.verbs.make_vec import make_vec
 from rfdropo_bayes.verbs.train import train
 
 OUT = Path("reports/fresh_targets/transfer")
-SCENE, KIND, SEED = "push", "unknown", 1
+SCENE, KIND, SEED, TASK = "push", "unknown", 1, "TrunkPush-v0"
 ROLLOUTS, EPISODES = 2_000, 200
 WITHIN = (5.0, 10.0, 15.25)  # mm
+RECURRENT = "a recurrent policy"
 VARIANTS: dict[str, dict[str, Any]] = {
     "as it comes": {},
     "no noise in training": {"noise": 0.0},
@@ -42,8 +47,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "twice as wide as the posterior": {"width": 2.0},
     "the posterior's middle alone": {"width": 1e-3},
     "entropy bonus of 0.005": {"options": {"ent_coef": 0.005}},
+    "a critic that sees the parameters": {"critic": "parameters"},
+    "input floor of 0.1 mm": {},
+    RECURRENT: {},
 }
 """Keys of [training] that differ from those of the fresh targets: 0.5 mm of noise, draws of the posterior."""
+FLOORS = {"input floor of 0.1 mm": 1e-4}
+"""What is added to the deviations of inputs in the place of 10 mm [m]: that of Stable-Baselines3."""
 
 
 def prepared(work: Path) -> tuple[Path, Path]:
@@ -63,26 +73,50 @@ def prepared(work: Path) -> tuple[Path, Path]:
     return files["truth"], known
 
 
-def cell(work: Path, truth: Path, known: Path, variant: str, seed: int, steps: int) -> dict[str, Any]:
-    """Train a policy and play it on the target."""
+def experiment(work: Path, known: Path, name: str, keys: Mapping[str, Any]) -> Path:
+    """An experiment that trains under the posterior, with further keys of [training]."""
     tables = read_tables(known)
     tables.pop("data")
-    tables["training"] |= {"steps": steps, "randomisation": "posterior", "source": str((work / "fit").resolve())}
-    tables["training"] |= VARIANTS[variant]
+    tables["training"] |= {"randomisation": "posterior", "source": str((work / "fit").resolve()), **keys}
     tables["simulator"] = {**tables.get("simulator", {}), "precision": "float32"}
-    name = f"{variant.replace(' ', '_')}_{seed}"
     path = known.with_name(f"{name}.toml")
     write_text(path, describe(tables))
+    return path
+
+
+def cell(work: Path, truth: Path, known: Path, variant: str, seed: int, steps: int) -> dict[str, Any]:
+    """Train a policy and play it on the target."""
+    name = f"{variant.replace(' ', '_')}_{seed}"
+    model = Model.read(experiment(work, known, name, {"steps": steps, **VARIANTS[variant]}))
+    if variant == RECURRENT:
+        return recurrent_cell(model, Model.read(truth), seed)
     out = work / "policies" / name
     if not run_ended(out):
-        train(Model.read(path), out, seed=seed, resume=(out / CHECKPOINTS).exists(), page=False)
+        with patch.object(training, "LEAST_SPREAD", FLOORS.get(variant, training.LEAST_SPREAD)):
+            train(model, out, seed=seed, resume=(out / CHECKPOINTS).exists(), page=False)
     played = work / "evaluations" / name
-    evaluate(Model.read(truth), [out], played, task="TrunkPush-v0", episodes=EPISODES, film=False, overwrite=True)
+    evaluate(Model.read(truth), [out], played, task=TASK, episodes=EPISODES, film=False, overwrite=True)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     distance = pd.read_csv(played / CSV)["distance"].to_numpy(dtype=float)
     home = {key: 1e3 * summary["evaluation"][f"distance_{key}"] for key in ("median", "q95")}
-    seconds = round(summary["seconds"], 1)
-    return {"home_mm": home, "seconds": seconds, "distance_mm": [round(1e3 * value, 3) for value in distance.tolist()]}
+    return {"home_mm": home, "seconds": round(summary["seconds"], 1), "distance_mm": millimetres(distance)}
+
+
+def recurrent_cell(model: Model, target: Model, seed: int) -> dict[str, Any]:
+    """The same of a recurrent policy, on the same episodes."""
+    from recurrent_policy import Recalling, learnt
+
+    table = model.settings.training
+    policy, normalisation, row = learnt(make_vec(TASK, model, n=table.environments), table, seed)
+    venv = make_vec(TASK, target)
+    cases = draw_cases(venv, EPISODES, EVALUATION_SEED)
+    episodes = play(Recalling(policy, normalisation, venv), venv, cases)
+    return {**row, "distance_mm": millimetres(np.array([episode.distance for episode in episodes]))}
+
+
+def millimetres(distance: np.ndarray) -> list[float]:
+    """Distances as the ledger holds them."""
+    return [round(1e3 * value, 3) for value in distance.tolist()]
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -113,11 +147,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trainings", type=int, default=2)
     parser.add_argument("--steps", type=int, default=600_000)
+    parser.add_argument("--setting", action="append", choices=VARIANTS, help="only these, in this order")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--only-done", action="store_true")
     given = parser.parse_args()
     ledger, work = output_folder(given.out) / "ledger.jsonl", given.out / "work"
-    jobs = [{"variant": v, "seed": seed, "steps": given.steps} for seed in range(given.trainings) for v in VARIANTS]
+    variants, seeds = given.setting or list(VARIANTS), range(given.trainings)
+    jobs = [{"variant": variant, "seed": seed, "steps": given.steps} for seed in seeds for variant in variants]
     done = [{key: row[key] for key in jobs[0]} for row in read_lines(ledger)]
     left = [job for job in jobs if job not in done]
     if left and not given.only_done:

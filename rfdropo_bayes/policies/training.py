@@ -22,7 +22,7 @@ from pydantic_core import PydanticSerializationError
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import stop_if_asked_twice
-from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options
+from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options, check_critic
 from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, play
 from rfdropo_bayes.policies.parity import check_exportable
 from rfdropo_bayes.policies.training_config import TrainingTable
@@ -85,8 +85,8 @@ def train(
     """Train a policy.
 
     Args:
-        environments: makes so many environments as one ``VecEnv`` with a ``layout``, a ``log`` and how many parameter
-            sets it has ``redrawn``.
+        environments: makes so many environments as one ``VecEnv`` with a ``layout``, a ``randomisation``, a ``log`` and
+            how many parameter sets it has ``redrawn``.
         table: algorithm and budget.
         out: folder for ``log.jsonl``, ``episodes.jsonl`` (what every training episode began with and how it ended),
             TensorBoard's files and the checkpoint.
@@ -97,7 +97,8 @@ def train(
         show: progress on stderr; None draws a bar on a terminal, and prints a line now and then elsewhere.
 
     Raises:
-        InputError: an unknown algorithm or option, or a checkpoint of another run.
+        InputError: an unknown algorithm or option, a critic that the algorithm cannot have, or a checkpoint of another
+            run.
     """
     import torch
 
@@ -106,6 +107,7 @@ def train(
     layout = venv.get_attr("layout")[0]
     options = algorithm_options(table.algorithm, layout.kind, gamma, table.options, table.environments)
     maker = algorithm_class(table.algorithm, layout.kind)
+    check_critic(table.algorithm, table.critic)
     known = {"table": _plain(table), "seed": seed, **(fingerprint or {})}
     folder = Path(out) / CHECKPOINT
     state = _load_state(folder, known) if resume else None
@@ -156,8 +158,10 @@ def _begin(
         spread = LEAST_SPREAD**2  # added to variances
         normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=spread) if table.normalise else None
         ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
+        around = _learnt_in(normalisation or venv, table)
+        policy, options = _policy_class(around, table, options)
         try:
-            return maker("MlpPolicy", normalisation or venv, **ours, **options), normalisation
+            return maker(policy, around, **ours, **options), normalisation
         except Exception as error:  # Stable-Baselines3 asserts, and PyTorch and Python raise whatever they raise
             raise InputError(
                 f"{maker.__name__} cannot be made: {error}",
@@ -181,7 +185,27 @@ def _load(
 
     normalisation = VecNormalize.load(str(folder / f"{which}normalisation.pkl"), venv) if table.normalise else None
     path = folder / f"{which}model.zip"
-    return maker.load(path, env=normalisation or venv, device="cpu", tensorboard_log=tensorboard), normalisation
+    around = _learnt_in(normalisation or venv, table)
+    return maker.load(path, env=around, device="cpu", tensorboard_log=tensorboard), normalisation
+
+
+def _learnt_in(around: Any, table: TrainingTable) -> Any:
+    """The environments that a model learns in: those that a policy acts in, with more to see for its critic."""
+    if table.critic == "observation":
+        return around
+    from rfdropo_bayes.policies.critic import ParametersBeside
+
+    return ParametersBeside(around)
+
+
+def _policy_class(around: Any, table: TrainingTable, options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
+    """What Stable-Baselines3 makes a policy of, and the options with what this needs to know."""
+    if table.critic == "observation":
+        return "MlpPolicy", options
+    from rfdropo_bayes.policies.critic import AsymmetricPolicy
+
+    own = {**options["policy_kwargs"], "unseen": len(around.varied.names)}
+    return AsymmetricPolicy, {**options, "policy_kwargs": own}
 
 
 def _best_row(curve: Sequence[Mapping[str, float]]) -> int:
@@ -202,7 +226,7 @@ def _leg(
     began, redrawn = time.monotonic(), venv.get_attr("redrawn")[0]
     leg = int(state["leg"]) + 1
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
-    model.set_env(normalisation or venv, force_reset=True)
+    model.set_env(model.get_env(), force_reset=True)
     venv.set_attr("log", log)
     count = _failures(table.steps)
     left = table.steps - model.num_timesteps

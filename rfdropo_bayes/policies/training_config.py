@@ -41,6 +41,11 @@ class TrainingTable(BaseModel):
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"
     )
+    critic: Literal["observation", "parameters"] = Field(
+        default="observation",
+        description="what the critic of PPO or A2C sees in training: the observation, or also the parameters that "
+        "differ between episodes; the policy never sees them",
+    )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(
         default=False,

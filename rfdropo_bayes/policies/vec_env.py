@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from rfdropo_bayes.policies.episodes import Episodes, EpisodeStep
+from rfdropo_bayes.policies.randomisation import Randomisation
 from rfdropo_bayes.policies.rendering import picture
 from rfdropo_bayes.policies.spaces import spaces_of
 
@@ -40,6 +41,11 @@ class TrunkVecEnv(VecEnv):
     def redrawn(self) -> int:
         """Parameter sets for which no initial state was found, and others drawn."""
         return self.episodes.redrawn
+
+    @property
+    def randomisation(self) -> Randomisation:
+        """Where the parameters of episodes come from."""
+        return self.episodes.randomisation
 
     def reset(self) -> np.ndarray:
         """Begin an episode in every lane, with the seeds and options that were set."""

@@ -14,6 +14,7 @@ from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import command_of, run_folder
+from rfdropo_bayes.policies.critic import varied_parameters
 from rfdropo_bayes.policies.episodes import Episodes
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.policies.parity import difference, observations
@@ -99,7 +100,8 @@ def train(
         }
         policy = ExportedPolicy(export_policy(found.model, found.normalisation, layout, out / POLICY, facts))
         _check_parity(policy, found)
-        summary = _summary(table, found, policy, facts)
+        sees = varied_parameters(randomisation).names if table.critic == "parameters" else ()
+        summary = _summary(table, found, policy, facts) | {"critic_sees": list(sees)}
         curve_figure(found.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
         if page:

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from rfdropo_bayes.policies.randomisation import Randomisation, Uniform
 from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 STEP = 0.1
@@ -34,6 +35,7 @@ class Points(VecEnv):
     """
 
     redrawn = 0
+    randomisation: Randomisation = Uniform({"gain": (0.8, 1.2)})
 
     def __init__(self, count: int, kind: str = "continuous") -> None:
         self.layout = layout(kind)
