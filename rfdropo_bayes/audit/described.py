@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class Described:
         """The model with the law."""
         return self.found.last
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[Fit, FitTarget] | None:
         """The model's fit under priors that do not pull, and its target."""
         last = self.last

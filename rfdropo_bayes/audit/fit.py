@@ -449,7 +449,7 @@ def heights(target: FitTarget, points: Float[np.ndarray, "n d"], what: str) -> F
 
 
 def widened(target: FitTarget, fit: Fit) -> Fit:
-    """A fit as it is under priors no narrower than the sizes found: its point and its covariance.
+    """A fit as it is under priors no narrower than the sizes found: its point, its covariance, and its promise.
 
     The prior of a candidate's size says what is usual, and decides whether the candidate is believed. Once it is, a
     size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
@@ -464,9 +464,10 @@ def widened(target: FitTarget, fit: Fit) -> Fit:
     factors = widening(fit, own)
     if (factors == 1.0).all():
         return fit
-    found = climb(target.on(target.forward.with_coordinates(own.widened(factors))), fit.x / factors, fit.free)
-    unit = factors[fit.free]
-    return replace(fit, x=factors * found.x, covariance=found.covariance * np.outer(unit, unit))
+    wide = target.on(target.forward.with_coordinates(own.widened(factors)))
+    found, unit = climb(wide, fit.x / factors, fit.free), factors[fit.free]
+    target.forward.rollouts = wide.forward.rollouts
+    return replace(fit, x=factors * found.x, covariance=found.covariance * np.outer(unit, unit), promise=found.promise)
 
 
 def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:

@@ -265,9 +265,11 @@ def audit(
             steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in described.steps]
             screens = [*(step.before for step in steps), last] if steps else screens[:1]
             extended, validation = steps[-1].fit if steps else base, _described_validation(described)
+    sizes = extended
+    with suppress(OutOfTime), deadline.stage("sizes"):
+        sizes = widened(steps[-1].judge, extended) if steps else extended
     stopped = deadline.reached
-    deadline.lift()  # what is left are single rollouts, for the report
-    sizes = widened(steps[-1].judge, extended) if steps else extended
+    deadline.lift()  # what is left are single rollouts, for the report, and the climb for the sizes of a law
     shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
     remainder = _remainder(target, extended, described)
     if verdict in (PARTLY, UNEXPLAINED) and not steps:

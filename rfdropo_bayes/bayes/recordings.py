@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.bayes.noise import Timeline, timeline
 from rfdropo_bayes.bayes.noise.autoregression import steps_of
-from rfdropo_bayes.data import UNSENT, Trajectory, check_channels, shared_markers
+from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
@@ -73,7 +73,7 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     if len(set(names)) < len(names):
         raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
     for trajectory in trajectories:
-        if trajectory.settings.get(UNSENT):
+        if trajectory.unsent:
             remedy = "leave it out: a session in the shadow shows what a policy would do"
             raise InputError("no drive has carried its commands out", where=trajectory.name, remedy=remedy)
     length = max(len(trajectory.time) for trajectory in trajectories)

@@ -21,7 +21,6 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 SCHEMA = "rfdropo_bayes.trajectory/1"
 FIRST_COMMAND = "first_command"  # among the settings: which command was in force before the first row
 GOAL_AXES = "goal_axes"  # among the settings: coordinates in which a pushed object is to come to its goal
-UNSENT = "unsent"  # among the settings: no drive has carried the commands out
 MISSING = "missing_readings"  # among the settings: how many tensions, motor angles and poses a recording lacks
 
 

@@ -230,6 +230,11 @@ class Trajectory:
         return np.ones(self.dataset["tension"].shape, dtype=bool) if "tension" in self.dataset else None
 
     @property
+    def unsent(self) -> bool:
+        """Whether no drive has carried the commands out: a session in the shadow."""
+        return self.settings.get("mode") == "shadow"
+
+    @property
     def left_out(self) -> str:
         """What is left out of this recording as faulty or missing, in words; empty if nothing is."""
         faults = self.settings.get("faults", {})

@@ -259,6 +259,7 @@ class ControlLoop:
         source.rehearse()
         for number in count():
             self._left = max(0.0, duration - number * self.period)
+            self._check_sight(source)
             acting = number < last and number % cycles == 0
             if acting:
                 previous = self.command.copy()
@@ -273,10 +274,13 @@ class ControlLoop:
             ramp = self.command - sum((share * change for share, change in shares), np.zeros(len(self.command)))
             self.set_points.towards(self._without_slack(self.command), self._without_slack(ramp))
             self.cycle(phase, acting, source.rehearse if (number + 1) % cycles == 0 else None)
-            if source.sees_markers and (name := self.markers.lost(time.monotonic())):
-                raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
-            if source.sees_object and self.markers.object_lost(time.monotonic()):
-                raise Stop(Cause.MARKERS_LOST, "the object is lost")
+
+    def _check_sight(self, source: CommandSource) -> None:
+        """Raise a Stop where a marker or the object that a source needs is lost, or was never seen."""
+        if source.sees_markers and (name := self.markers.lost(time.monotonic())):
+            raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
+        if source.sees_object and self.markers.object_lost(time.monotonic()):
+            raise Stop(Cause.MARKERS_LOST, "the object is lost")
 
     def _act(self, source: CommandSource, period: float) -> bool:
         self.markers.act()

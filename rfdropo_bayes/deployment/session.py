@@ -18,7 +18,7 @@ import tomli_w
 from rich.live import Live
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.data import GOAL_AXES, UNSENT, Trajectory
+from rfdropo_bayes.data import GOAL_AXES, Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
@@ -145,8 +145,6 @@ class _Session:
         self.simulated, self._stack = simulated, stack
         self.period = 1.0 / settings.rate_hz
         self._facts: dict[str, Any] = {"mode": mode.value, "simulated": simulated, "rate_hz": settings.rate_hz}
-        if mode is Mode.SHADOW:
-            self._facts[UNSENT] = True
         self.found: dict[str, dict[str, int]] = {}
         self.without: dict[str, list[str]] = {}
         self.source: CommandSource | None = None

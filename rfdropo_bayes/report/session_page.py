@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data import GOAL_AXES, UNSENT, Trajectory
+from rfdropo_bayes.data import GOAL_AXES, Trajectory
 from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.session_figures import commands_figure, drives_figure, goal_figure, punctuality_figure
 from rfdropo_bayes.report.style import embed
@@ -115,8 +115,9 @@ def distance_to_goal(
     """Times [s] at which the last marker, or the object that is pushed, was seen, and its distance from a goal [m];
     empty without a goal. An object's is that along its plate."""
     axes, track, seen = [0, 1, 2], recording.position[:, -1], recording.position_mask[:, -1]
-    if _pushed(recording):
-        assert recording.object_pose is not None
+    if _pushes(recording):
+        if recording.object_pose is None:
+            return np.empty(0), np.empty(0)
         axes, track = recording.settings[GOAL_AXES], recording.object_pose[:, :3]
         seen = np.isfinite(track).all(axis=1)
     if set(goal) != set("xyz") or not seen.any():
@@ -125,14 +126,14 @@ def distance_to_goal(
     return recording.time[seen], np.linalg.norm((track[seen] - place)[:, axes], axis=1)
 
 
-def _pushed(recording: Trajectory) -> bool:
+def _pushes(recording: Trajectory) -> bool:
     """Whether an object is to reach the goal."""
-    return GOAL_AXES in recording.settings and recording.object_pose is not None
+    return GOAL_AXES in recording.settings
 
 
 def _judged(recording: Trajectory) -> str:
     """What is to reach the goal, in words."""
-    return "the object" if _pushed(recording) else f"the last marker, {recording.marker_names[-1]},"
+    return "the object" if _pushes(recording) else f"the last marker, {recording.marker_names[-1]},"
 
 
 def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float | None:
@@ -172,7 +173,7 @@ def session_steps(session: MotorSession) -> list[str]:
         found.append(f"{words}: see the commands below.")
     if cause == PLANNED and summary["facts"].get("simulated"):
         found.append("The drives were simulated. On a robot, begin with --mode check, home and shadow.")
-    if UNSENT in recording.settings:
+    if recording.unsent:
         return [*found, "No drive has carried these commands out: this recording is no data. Go on with --mode run."]
     found.append(
         'The recording is data: put session.nc under fit in [data] with format = "netcdf", then rfdropo calibrate and '

@@ -236,7 +236,7 @@ def _hidden(
     their truth does not roll out; what is hidden; and what could not be."""
     rng = np.random.default_rng(seed)
     chosen, unreached = list(turn), list[str]()
-    for _ in range(TRIES):
+    for _ in range(TRIES if condition.effects else 1):
         names = sorted(set(chosen), key=list(REGISTRY).index)
         if len(names) == condition.effects:
             found = hide(condition.setting, names, condition.rho, seed, place, exclude=exclude, workshop=workshop)
@@ -244,7 +244,8 @@ def _hidden(
                 return found, names, unreached
             unreached.append(" + ".join(names))
         chosen = rng.choice(library, condition.effects, replace=False).tolist()
-    raise InputError("no mechanism reaches the wanted size", where=condition.name)
+    why = "no mechanism reaches the wanted size" if condition.effects else "the truth does not roll out"
+    raise InputError(why, where=condition.name)
 
 
 def _without(content: Mapping[str, Any], names: Sequence[str], exclude: Sequence[str]) -> str:

@@ -57,7 +57,11 @@ def trunk(
     specs = {spec.name: spec for spec in simulator.parameters}
     if "cube_side" in specs:  # as an episode of a task begins
         up, side = int(np.argmax(np.abs(base.gravity))), values.get("cube_side", specs["cube_side"].nominal)
-        values |= {f"cube_{'xyz'[up]}": float(resting_height(base, np.array(side)))}
+        height = f"cube_{'xyz'[up]}"
+        if height in values:
+            remedy = f"leave {height} out: the cube begins at rest on its plate"
+            raise InputError(f"{height} = {values[height]:g} is given", where="[simulation.settings]", remedy=remedy)
+        values |= {height: float(resting_height(base, np.array(side)))}
     return SimulatedTrunk(robot, simulator, period, values, marker_noise, seed)
 
 

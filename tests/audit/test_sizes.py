@@ -52,15 +52,23 @@ class Ridge(Toy):
 
 
 def test_a_wider_prior_leaves_a_ratio_that_motion_tells_however_curved_its_line_is():
+    """A first-order step to the wider prior leaves the line on which the ratio is constant."""
     asked = problem({"gain": 1.3, "bend": 0.0, "delay": 40.0}, 3)
     target, fit, index = with_delay(replace(asked, lanes=Lanes(Ridge(), np.arange(4))))
-    found, ratios = widened(target, fit), []
-    for each in (fit, found):
-        named = asked.coordinates.named(each.x)
-        stiffness = asked.coordinates.slopes(each.x[None])[0, 1]
-        slope = np.array([0.0, -stiffness, 1.0 / each.x[index]])  # of the logarithm
-        ratios.append((named["delay"] * np.exp(-named["bend"]), np.sqrt(slope @ each.covariance @ slope)))
-    assert 3.0 < fit.x[index] < 10.0  # the prior has moved it along the curve, to where it is still unusual
-    for ratio, deviation in ratios:
-        assert deviation < 0.02
-        assert abs(np.log(ratio / 40.0)) < 3.3 * deviation
+    before = target.forward.rollouts
+    found = widened(target, fit)
+    assert target.forward.rollouts > before
+    narrow = np.array([0.0, 0.0, 1.0 - 1.0 / fit.x[index] ** 2])  # what the wider prior takes off the precision
+    covariance = np.linalg.inv(np.linalg.inv(fit.covariance) - np.diag(narrow))
+    straight = fit.x.copy()
+    straight[fit.free] += covariance @ (narrow * fit.x[fit.free])
+
+    def away(x: np.ndarray, covariance: np.ndarray) -> float:
+        """Of the logarithm of the ratio from the truth, in its deviations."""
+        named, stiffness = asked.coordinates.named(x), asked.coordinates.slopes(x[None])[0, 1]
+        slope = np.array([0.0, -stiffness, 1.0 / x[index]])
+        error = np.log(named["delay"] / 40.0) - named["bend"]
+        return float(error / np.sqrt(slope @ covariance @ slope))
+
+    assert abs(away(found.x, found.covariance)) < 3.3
+    assert abs(away(straight, covariance)) > 10.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.data import UNSENT, Measured, Origin, SentCommands, Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
@@ -18,7 +18,7 @@ from rfdropo_bayes.robots import Robot
     [
         ("m", {}, None),
         ("rad", {}, "commands are in rad, the robot's in m"),
-        ("m", {UNSENT: True}, "no drive has carried its commands out"),
+        ("m", {"mode": "shadow"}, "no drive has carried its commands out"),
     ],
 )
 def test_commands_in_another_unit_or_that_nothing_followed_are_refused(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.data import UNSENT, Trajectory
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.causes import Cause
@@ -152,7 +152,7 @@ def test_nothing_moves_in_the_shadow(dry_run, tmp_path: Path) -> None:
     assert np.all(rows["length"] == 0.0)
     assert np.all(rows["statusword"] & 0x6F == 0x40)  # switch on disabled throughout
     assert np.abs(rows["command"]).max() > 1e-3  # the policy commanded, in vain
-    assert Trajectory.load(tmp_path / "s" / "session.nc").settings[UNSENT]
+    assert Trajectory.load(tmp_path / "s" / "session.nc").unsent
 
 
 def test_after_a_quick_stop_the_command_is_where_the_drives_hold(dry_run, tmp_path: Path) -> None:

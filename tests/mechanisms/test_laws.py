@@ -270,8 +270,8 @@ def test_what_a_law_cannot_be_is_said():
     ):
         with pytest.raises(InputError, match=match):
             build_robot_simulator(spec(wrong))
-    body = build_robot_simulator(spec(law("stiffness")))
-    with pytest.raises(InputError, match=r"whole rollout.*laws at cables, and laws of time"):
+    body = build_robot_simulator(spec(law("stiffness", "position", motion=["tip x"])))
+    with pytest.raises(InputError, match=r"follows the motion of a whole rollout.*laws at cables and on the body"):
         body.session(1, 0.1)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rfdropo_bayes.data import GOAL_AXES, UNSENT, Trajectory
+from rfdropo_bayes.data import GOAL_AXES, Trajectory
 from rfdropo_bayes.report.session_page import MotorSession, distance_to_goal, drive_rows, render_session, session_steps
 
 GOAL = {"x": 0.0, "y": 0.0, "z": 0.2}
@@ -94,7 +94,7 @@ def test_an_object_that_is_pushed_is_judged_along_its_plate():
 
 
 def test_commands_that_no_drive_carried_out_are_no_data():
-    shadow = recording().with_attributes(settings={UNSENT: True})
+    shadow = recording().with_attributes(settings={"mode": "shadow"})
     steps = session_steps(session()._replace(recording=shadow))
     assert "No drive has carried these commands out" in steps[-1]
     assert not any("under fit" in step for step in steps)
