@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -206,7 +206,7 @@ class ReferenceLanes:
             acting = engine.section_loads(loads)
 
             def one(before: _Lane, given: tuple[Float[Array, " cable"], Int[Array, ""]]) -> tuple[_Lane, None]:
-                under, force = before.prepared, jnp.zeros(())
+                under, force = before.prepared, cast("Array | float", 0.0)
                 if acting is not None:
                     under, force = loaded(system, under, acting, given[1])
                 around = force, engine.scene, before.cube
