@@ -183,6 +183,13 @@ class Answer:
         return self.causes.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
 
 
+def _sizes(steps: Sequence[Added], extended: Fit, deadline: Deadline) -> Fit:
+    """The extended model's fit under priors no narrower than its sizes; as it is where the time is up."""
+    with suppress(OutOfTime), deadline.stage("sizes"):
+        return widened(steps[-1].judge, extended) if steps else extended
+    return extended
+
+
 def _leaves_something(verdict: str, base: Fit) -> bool:
     """Whether there is something to describe: a discrepancy that the library does not explain, or a base model that
     could not be fitted for it."""
@@ -265,9 +272,7 @@ def audit(
             steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in described.steps]
             screens = [*(step.before for step in steps), last] if steps else screens[:1]
             extended, validation = steps[-1].fit if steps else base, _described_validation(described)
-    sizes = extended
-    with suppress(OutOfTime), deadline.stage("sizes"):
-        sizes = widened(steps[-1].judge, extended) if steps else extended
+    sizes = _sizes(steps, extended, deadline)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report, and the climb for the sizes of a law
     shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
