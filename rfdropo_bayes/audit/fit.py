@@ -467,7 +467,8 @@ def widened(target: FitTarget, fit: Fit) -> Fit:
     wide = target.on(target.forward.with_coordinates(own.widened(factors)))
     found, unit = climb(wide, fit.x / factors, fit.free), factors[fit.free]
     target.forward.rollouts = wide.forward.rollouts
-    return replace(fit, x=factors * found.x, covariance=found.covariance * np.outer(unit, unit), promise=found.promise)
+    x = np.clip(factors * found.x, *own.bounds)  # which the product misses by its last bit
+    return replace(fit, x=x, covariance=found.covariance * np.outer(unit, unit), promise=found.promise)
 
 
 def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:

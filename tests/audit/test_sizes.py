@@ -54,7 +54,9 @@ class Ridge(Toy):
 def test_a_wider_prior_leaves_a_ratio_that_motion_tells_however_curved_its_line_is():
     """A first-order step to the wider prior leaves the line on which the ratio is constant."""
     asked = problem({"gain": 1.3, "bend": 0.0, "delay": 40.0}, 3)
-    target, fit, index = with_delay(replace(asked, lanes=Lanes(Ridge(), np.arange(4))))
+    target, mode, index = with_delay(replace(asked, lanes=Lanes(Ridge(), np.arange(4))))
+    on_line = asked.coordinates.encode({"gain": 1.3, "bend": np.log(6.5 / 40.0), "delay": 6.5})
+    fit = climb(target, on_line, mode.free, evaluations=0)
     before = target.forward.rollouts
     found = widened(target, fit)
     assert target.forward.rollouts > before

@@ -141,12 +141,13 @@ class Paid(Points):
         return seen, (gain - 1.0) / 0.2, done, infos
 
 
-@pytest.mark.parametrize(("critic", "low", "high"), [("parameters", 0.9, 1.0), ("observation", -0.5, 0.5)])
+@pytest.mark.parametrize(("critic", "low", "high"), [("parameters", 0.9, 1.0), ("observation", -0.2, 0.2)])
 def test_a_critic_that_sees_the_gain_knows_what_an_episode_is_worth(tmp_path, critic, low, high) -> None:
-    """The value of a first observation is a multiple of the gain's deviation."""
+    """The value of a first observation is a multiple of the gain's deviation. Of 512 episodes a critic that does not
+    see it has a correlation of more than 0.2 by chance in one seed of 100,000."""
     table = TABLE.model_copy(update={"critic": critic, "normalise": False})
     model = train(Paid, table, tmp_path, seed=3, gamma=0.9).model
-    venv = model.get_env()
+    venv = Paid(512) if critic == "observation" else ParametersBeside(Paid(512))
     venv.seed(100)
     seen = venv.reset()
     with torch.no_grad():
