@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -228,16 +229,18 @@ def engine() -> Any:
     return mujoco
 
 
+def integral(robot: Robot, table: Any, low: float, high: float) -> float:
+    """Of a profile of the robot's body between two heights [m]; it is uniform in each layer, and none lies outside."""
+    station = np.asarray(robot.body.station_m)
+    total = np.concatenate([[0.0], np.cumsum(np.asarray(table) * np.diff(station))])
+    return float(np.interp(high, station, total) - np.interp(low, station, total))
+
+
 def _sections(robot: Robot, values: Mapping[str, float], links: int) -> list[_Section]:
     """Joints and links from base to tip."""
     shape, modulus = robot.body, values["young_modulus"]
     station = np.asarray(shape.station_m)
-    length = station[-1] / links
-
-    def within(table: Any, low: float, high: float) -> float:
-        """Integral of a profile, which is uniform in each of the robot's layers."""
-        total = np.concatenate([[0.0], np.cumsum(np.asarray(table) * np.diff(station))])
-        return float(np.interp(high, station, total) - np.interp(low, station, total))
+    length, within = station[-1] / links, partial(integral, robot)
 
     def spring(own: float, table: Any, at: float) -> float:
         """Of the piece with this middle: its parts yield one after the other."""

@@ -1,10 +1,9 @@
 """A robot made anew in PyElastica: a Cosserat rod with the robot's sections, and cables as forces at their guides.
 
-A section keeps its shape, as if Poisson's ratio were zero, and twists with half of Young's modulus. Shear is ten times
-as stiff, for our layered body sags as one without it. A cable runs straight from guide to guide. Its pull is that of a
-spring in series with the commanded length, zero where it is slack, and acts on every guide, with its lever about the
-axis. The rod's own stepper is explicit, and so is damped in proportion to mass: damping in proportion to stiffness
-would need steps of 0.5 us.
+A section keeps its shape, as if Poisson's ratio were zero, twists with half of Young's modulus, and shears as a round
+one (Cowper). A cable runs straight from guide to guide. Its pull is that of a spring in series with the commanded
+length, zero where it is slack, and acts on every guide, with its lever about the axis. The rod's own stepper is
+explicit, and so is damped in proportion to mass: damping in proportion to stiffness would need steps of 0.5 us.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,15 +26,16 @@ from rfdropo_bayes.studies.mujoco_truth import (
     CONTROL,
     ENGINE_EFFECTS,
     POISSON,
+    SHEARED,
     EngineArm,
     EngineEffect,
     commanded,
+    integral,
     seen_at,
 )
 
 ELEMENTS = 20
-STEP = 2.5e-5  # [s]: with twice as much the element at the tip, half as long as the others, diverges
-RIGID = 10.0  # times E / 2, of shear: our layered body sags so at a Poisson's ratio of 0.45; at 0 it shears with E / 2
+STEP = 5e-5  # [s]: with twice as much the rod diverges; half as much moves the tip by 0.001 mm (root mean square)
 
 
 class _Cables(NamedTuple):
@@ -239,17 +240,18 @@ class ElasticaArm(EngineArm):
     def _rod(self, elastica: Any) -> Any:
         """The undeformed rod, with the sections of the robot's file."""
         shape, modulus = self.robot.body, self.values["young_modulus"]
-        station = np.asarray(shape.station_m)
-        nodes = _nodes(self.robot, self.elements)
+        within, nodes = partial(integral, self.robot), _nodes(self.robot, self.elements)
+        ends = np.maximum(nodes, 0.0)
+        elements, pieces = (ends[:-1], ends[1:]), (np.arange(self.elements), 1.0 + np.arange(self.elements))
+        pieces = tuple(at * nodes[-1] / self.elements for at in pieces)
+
+        def yields(table: Any, length: Any, parts: Any) -> np.ndarray:
+            """Stiffness of elements or nodes of a length: the layers of each part yield one after the other."""
+            return length / np.array([within(1.0 / np.asarray(table), *part) for part in zip(*parts, strict=True)])
+
         lengths = np.diff(nodes)
-        middle = 0.5 * (station[1:] + station[:-1])
-
-        def along(at: np.ndarray, table: Any) -> np.ndarray:
-            return np.interp(at, middle, np.asarray(table))
-
-        centre, between = 0.5 * (nodes[1:] + nodes[:-1]), nodes[1:-1]
-        weighed = np.asarray(shape.mass_area_m2)
-        density = self.values["trunk_mass"] / float(np.sum(weighed * np.diff(station)))
+        area = yields(shape.axial_area_m2, lengths, elements)  # half of the first element is the base's
+        density = self.values["trunk_mass"] / within(shape.mass_area_m2, 0.0, nodes[-1])
         shear = modulus / (2.0 * (1.0 + POISSON))
         rod = elastica.CosseratRod.straight_rod(
             self.elements + 1,
@@ -258,23 +260,21 @@ class ElasticaArm(EngineArm):
             normal=np.array([1.0, 0.0, 0.0]),
             base_length=nodes[-1] - nodes[0],
             position=np.stack([0.0 * nodes, 0.0 * nodes, nodes]),
-            base_radius=np.sqrt(along(centre, shape.axial_area_m2) / np.pi),
+            base_radius=np.sqrt(yields(shape.axial_area_m2, np.diff(ends), elements) / np.pi),
             density=density,
             youngs_modulus=modulus,
             shear_modulus=shear,
         )
-        moment = np.asarray(shape.bending_moment_area_m4)
+        moment, bent = np.asarray(shape.bending_moment_area_m4), 0.5 * (lengths[1:] + lengths[:-1])
         rod.shear_matrix[:] = 0.0
-        rod.shear_matrix[0, 0] = rod.shear_matrix[1, 1] = RIGID * shear * along(centre, shape.axial_area_m2)
-        rod.shear_matrix[2, 2] = modulus * along(centre, shape.axial_area_m2)
-        rod.shear_matrix[..., 0] *= 2.0  # half of the first element is the base's
+        rod.shear_matrix[0, 0] = rod.shear_matrix[1, 1] = SHEARED * shear * area
+        rod.shear_matrix[2, 2] = modulus * area
         rod.bend_matrix[:] = 0.0
         # The layer's plane x bends by forces along x, that is about y.
-        rod.bend_matrix[0, 0] = modulus * along(between, moment[:, 1])
-        rod.bend_matrix[1, 1] = modulus * along(between, moment[:, 0])
-        rod.bend_matrix[2, 2] = shear * along(between, shape.torsion_constant_m4)
-        # Each node bends for a whole piece; to the rod, the last one stands for three quarters of it.
-        rod.bend_matrix[:] *= 0.5 * (lengths[1:] + lengths[:-1]) / lengths[0]
-        piece = density * along(centre, weighed) * lengths
-        rod.mass[:] = 0.5 * (np.append(piece, 0.0) + np.append(0.0, piece))
+        rod.bend_matrix[0, 0] = modulus * yields(moment[:, 1], bent, pieces)
+        rod.bend_matrix[1, 1] = modulus * yields(moment[:, 0], bent, pieces)
+        rod.bend_matrix[2, 2] = shear * yields(shape.torsion_constant_m4, bent, pieces)
+        centre = np.append(0.5 * (nodes[1:] + nodes[:-1]), nodes[-1])
+        weighed = [density * within(shape.mass_area_m2, *part) for part in pairwise(centre)]
+        rod.mass[:] = [weighed[0], *weighed]  # the first node is held
         return rod
