@@ -257,13 +257,15 @@ class PortedForward(Forward):
     def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
         return self.coordinates.values(points)[:, len(self.coordinates.names) - len(self._own) :]
 
-    def _acting(self, theta: np.ndarray, commands: Commands, points: Points) -> list[tuple[Port, Signals]]:
-        """Signals of every lane at each port that has a law."""
+    def _acting(
+        self, theta: np.ndarray, commands: Commands, points: Points, terms: Sequence[PlacedTerm]
+    ) -> list[tuple[Port, Signals]]:
+        """Signals of every lane at each port that has some of the law's terms."""
         flat = theta.reshape(-1, theta.shape[-1])
         own = dict(zip(self._own, np.repeat(self._beside(points), self.count, axis=0).T, strict=True))
-        for term in self.terms:
+        for term in terms:
             own[term.spec.name] = own[term.spec.name] * np.tile(term.scope.has(self.recordings), len(points))
-        parts = [(t, m) for t in self.terms if not t.feature.of_motion for m in self.ports.members(t.port)]
+        parts = [(t, m) for t in terms if not t.feature.of_motion for m in self.ports.members(t.port)]
         found: dict[Port, Signals] = {}
         if parts:
             levels = self.table.levels(flat, commands)
@@ -277,7 +279,7 @@ class PortedForward(Forward):
             ]
             for term, member, w in signals:
                 found[member] = found.get(member, 0.0) + own[term.spec.name][:, None] * w
-        following = [term for term in self.terms if term.feature.of_motion]
+        following = [term for term in terms if term.feature.of_motion]
         acting = found
         for _ in range(PASSES if following else 0):
             signals = signals_of(self.ports, list(acting.items()))
@@ -290,13 +292,16 @@ class PortedForward(Forward):
 
     def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
         flat, start, commands = super()._per_lane(theta, points)
-        return flat, start, commands._replace(signals=signals_of(self.ports, self._acting(theta, commands, points)))
+        moving = [term for term in self.terms if term.port.stage != "sensing"]
+        signals = signals_of(self.ports, self._acting(theta, commands, points, moving))
+        return flat, start, commands._replace(signals=signals)
 
     def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
-        if all(term.port.stage != "sensing" for term in self.terms):
+        seen_by = [term for term in self.terms if term.port.stage == "sensing"]  # they do not move the body
+        if not seen_by:
             return found
         commands = self.commands.of(np.tile(np.arange(self.count), len(points)))
-        acting = self._acting(theta, commands, points)
+        acting = self._acting(theta, commands, points, seen_by)
         shift = self._offset(theta).reshape(-1, 1, 1, 3)  # of the measuring frame, which comes last
         seen = as_sensed(acting, found["position"] - shift, commands, self.table.time_step)
         return {**found, "position": seen + shift}

@@ -23,6 +23,7 @@ from rfdropo_bayes.audit.law_search import TIED, LinearModel, _relinearised, law
 from rfdropo_bayes.audit.law_words import law_tables, ports_sentence
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.port_responses import responses, under
+from rfdropo_bayes.audit.port_rollouts import PortedForward, placed
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.mechanisms.features import Feature
@@ -294,6 +295,23 @@ def test_signals_are_timed_from_the_first_row_on():
     plain, early = (law_search(t, *options).find(t, base) for t in (target, target.on(forward)))
     assert plain.centre[0] == 0.0
     np.testing.assert_allclose(early.centre, plain.centre - 4 * STEP, atol=1e-12)
+
+
+def test_a_law_that_follows_the_motion_takes_no_rollouts_for_what_is_measured():
+    """A term at a marker beside one on the body: the first changes what is seen, and the second alone what moves."""
+    question = asked(101)
+    target, base = base_model(question, question.seed)
+    search = law_search(target, question.ports, ("a", "b"), "m", 0, 0.1, lambda line: None)
+    marker = next(port for port in question.ports.ports if port.stage == "sensing")
+    at_marker = placed(marker, Feature("command", (0,)), 1.0, ("a", "b"), "m")
+    body = Port("body force x", "body", "force", 0, 0, "N", 0.1, "look at the body")
+    on_body = placed(body, Feature("position", (0,), of_motion=True), 1.0, ("a", "b"), "m")
+    forward = PortedForward(target.forward, question.ports, search.table, [at_marker, on_body])
+    forward.table.over_motion = None  # asking for a rollout raises
+    point = np.append(base.x, [0.3, 0.2])[None]
+    shown = {"position": np.zeros((forward.count, target.measurements.time.shape[1], 4, 3))}
+    seen = forward._as_seen(shown, forward.coordinates.physical_values(point, forward.slots), point)
+    assert np.abs(seen["position"][:, :, marker.number]).max() > 0.0
 
 
 def test_nothing_is_described_where_nothing_is_hidden():
