@@ -54,20 +54,16 @@ def train(
     folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.make_vec import with_training
-    from rfdropo_bayes.verbs.train import PAGE, POLICY
+    from rfdropo_bayes.verbs.train import PAGE, POLICY, learnt
     from rfdropo_bayes.verbs.train import train as learn
 
     model = Model.read(experiment, overrides)
     if calibration is not None:
         model = with_training(model, {"randomisation": "posterior"})
     found = learn(model, folder, posterior=calibration, resume=resume, overwrite=overwrite)
-    last = found["evaluation"]
-    learnt = (
-        f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
-        f"{1e3 * last['distance_q95']:.2f} mm, after {found['steps']} steps in {found['seconds']:.0f} s"
-    )
+    done = f"after {found['steps']} steps in {found['seconds']:.0f} s {learnt(found)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
-    lines = (learnt, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
+    lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
     say(found, *lines, quiet=quiet, as_json=as_json)
 
 

@@ -42,6 +42,7 @@ class Motion(NamedTuple):
     imbalance: Float[Any, "*batch"]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
     converged: Bool[Any, "*batch"]  # whether the impulses of every step's constraints were found
     pose: Float[Any, "*batch row 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
+    peak: Float[Any, "*batch cable"] | None = None  # largest tension at the steps of a session's last call [N]
 
 
 class _Progress(NamedTuple):

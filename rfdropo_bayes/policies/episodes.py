@@ -50,6 +50,8 @@ class EpisodeStep(NamedTuple):
     truncated: Bool[np.ndarray, " lane"]
     distance: Float[np.ndarray, " lane"]  # [m]; that of the last good state where the simulation failed
     diverged: Bool[np.ndarray, " lane"]
+    tension: Float[np.ndarray, " lane"]  # largest of any cable at the action's time steps [N]; NaN if none is told
+    stopped: Bool[np.ndarray, " lane"]  # by the limit on tension
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Settings:
             marker has moved is the difference of two sightings, as on a robot.
         near: an episode ends within this distance of the goal [m]; None lets it go on, which keeps the reward of
             staying there.
+        tension_limit: an episode ends once a cable pulls more [N], as drives stop then; None lets it pull.
     """
 
     actions: Actions = "discrete"
@@ -71,6 +74,7 @@ class Settings:
     noise: float = 0.0
     history: int = 1
     near: float | None = None
+    tension_limit: float | None = None
 
 
 class Episodes:
@@ -90,7 +94,8 @@ class Episodes:
         parameters: of every lane, those that were drawn or given.
 
     Raises:
-        InputError: a randomisation that does not fit the simulator, or a task that does not fit the robot.
+        InputError: a randomisation that does not fit the simulator, a task that does not fit the robot, or a limit on
+            tensions that the simulator does not tell.
     """
 
     def __init__(
@@ -98,6 +103,8 @@ class Episodes:
     ) -> None:
         self.task, self.settings, self.lanes = task, settings, lanes
         self.simulator, self.robot = simulator, simulator.robot
+        if settings.tension_limit is not None and not simulator.cable_names:
+            raise _without_tensions(self.robot.name, "name its cables, see docs/your_simulator.md, or leave it out")
         asked = (settings.actions, settings.observed, settings.period, settings.step, settings.history)
         self.layout = layout_of(task, self.robot, *asked)
         self.shown = shown_of(self.layout, self.robot)
@@ -110,7 +117,7 @@ class Episodes:
         markers = len(self.robot.marker_names)
         self.goal, self.commands = np.zeros((lanes, 3)), np.zeros((lanes, len(self.layout.channels)))
         self.age = np.zeros(lanes, dtype=int)
-        self.first = np.ones(lanes)
+        self.first, self.worst = np.ones(lanes), np.full(lanes, FLOOR)
         self.marker = np.zeros((lanes, markers, 3))
         self.pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (lanes, 1)) if task.push else None
         self.seen, self.seen_before, self.seen_pose = self.marker, self.marker, self.pose
@@ -192,9 +199,14 @@ class Episodes:
         distance = self.distance()
         gained = np.where(good, reward(distance, self.first), FLOOR * (EPISODE - self.age + 1))
         ended = ~good if self.settings.near is None else ~good | (distance <= self.settings.near)
-        return EpisodeStep(
-            self._observe(np.arange(self.lanes)), gained, ended, (self.age >= EPISODE) & ~ended, distance, ~good
-        )
+        tension, limit = self._largest_tension(found), self.settings.tension_limit
+        stopped = np.zeros(self.lanes, dtype=bool) if limit is None else good & (tension > limit)
+        # Who holds still keeps the reward of the place: at the worst that was met, a stop is never worth more.
+        self.worst = np.minimum(self.worst, gained)
+        gained = np.where(stopped, self.worst * (EPISODE - self.age + 1), gained)
+        ended |= stopped
+        late = (self.age >= EPISODE) & ~ended
+        return EpisodeStep(self._observe(np.arange(self.lanes)), gained, ended, late, distance, ~good, tension, stopped)
 
     def distance(self) -> Float[np.ndarray, " lane"]:
         """Distance of the tip, or of the cube, to the goal [m]."""
@@ -204,6 +216,14 @@ class Episodes:
     def begun_with(self, lane: int) -> dict[str, Any]:
         """What the episode of a lane began with, enough to begin it again as an option of `reset`."""
         return {"parameters": dict(self.parameters[lane]), "goal": self.goal[lane].tolist()}
+
+    def _largest_tension(self, found: Observation) -> Float[np.ndarray, " lane"]:
+        """Largest tension of any cable since the last action [N]; NaN where the simulator tells none."""
+        if found.peak is not None and self.simulator.cable_names:
+            return np.asarray(found.peak, dtype=float).max(axis=1)
+        if self.settings.tension_limit is not None:
+            raise _without_tensions(self.robot.name, "let its lanes tell Motion.peak, or leave it out")
+        return np.full(self.lanes, np.nan)
 
     def _begin(self, waiting: Mapping[int, Mapping[str, float] | None]) -> Observation:
         """Start lanes, with the parameters that are given or with draws."""
@@ -234,7 +254,7 @@ class Episodes:
         if self.pose is not None:
             self.pose = self.pose.copy()
             self.pose[rows] = found.object_pose
-        self.commands[rows], self.age[rows] = 0.0, 0
+        self.commands[rows], self.age[rows], self.worst[rows] = 0.0, 0, FLOOR
         self.earlier.begin(rows, self.commands[rows])
         self.first[rows] = self.distance()[rows]
         self._look(rows)
@@ -276,6 +296,10 @@ def _rows_of(found: Observation, chosen: Bool[np.ndarray, " row"]) -> Observatio
     """Some rows of an observation."""
     parts: list[Any] = [None if part is None else np.asarray(part)[chosen] for part in found]
     return Observation(*parts)
+
+
+def _without_tensions(name: str, remedy: str) -> InputError:
+    return InputError(f"{name} tells no cable tensions between two actions", where="tension_limit", remedy=remedy)
 
 
 def _check_options(option: Mapping[str, Any]) -> None:

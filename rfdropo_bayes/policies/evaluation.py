@@ -2,7 +2,7 @@
 
 A case is what an episode starts from: parameters of the simulator and a goal. Policies that are compared see the same
 cases, in the same order. An episode succeeds if the distance to the goal at its end is within a threshold, as in the
-paper's Table II.
+paper's Table II. One that a failed simulation or the limit on tension ended fails at every threshold.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class Episode:
         total: sum of rewards.
         diverged: whether the simulation failed; the episode then counts as a failure at every distance.
         actions: the actions taken, to see the episode again.
+        tension: largest tension of any cable [N]; NaN if none is told.
+        stopped: whether a tension beyond the limit ended it; it then counts as a failure at every distance.
     """
 
     case: int
@@ -51,11 +53,13 @@ class Episode:
     total: float
     diverged: bool
     actions: np.ndarray = field(repr=False)
+    tension: float = float("nan")
+    stopped: bool = False
 
     @property
     def distance(self) -> float:
-        """Distance to the goal at the end [m]; infinite if the simulation failed."""
-        return float("inf") if self.diverged else float(self.distances[-1])
+        """Distance to the goal at the end [m]; infinite if the simulation failed or the limit on tension ended it."""
+        return float("inf") if self.diverged or self.stopped else float(self.distances[-1])
 
 
 def draw_cases(venv: Any, count: int, seed: int) -> list[Case]:
@@ -82,7 +86,7 @@ def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int
     Args:
         act: the policy; it sees observations as the environments give them.
         venv: environments that take ``parameters`` and ``goal`` as reset options and report ``distance`` and
-            ``diverged`` in their info.
+            ``diverged`` in their info, and perhaps ``tension`` and ``stopped``.
         cases: what to start from.
         seed: of the noise.
         longest: no episode has more actions.
@@ -104,7 +108,8 @@ def _play_lanes(act: Act, venv: Any, count: int, first: int, longest: int) -> li
     """One episode in each of the first ``count`` lanes."""
     distances: list[list[float]] = [[] for _ in range(count)]
     actions: list[list[np.ndarray]] = [[] for _ in range(count)]
-    total, diverged, done = np.zeros(count), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    total, tension = np.zeros(count), np.full(count, np.nan)
+    diverged, stopped, done = np.zeros((3, count), dtype=bool)
     seen = venv.reset()
     for _ in range(longest):
         action = act(seen)
@@ -114,10 +119,20 @@ def _play_lanes(act: Act, venv: Any, count: int, first: int, longest: int) -> li
             actions[lane].append(np.asarray(action[lane]))
             total[lane] += reward[lane]
             diverged[lane] |= bool(infos[lane].get("diverged", False))
+            stopped[lane] |= bool(infos[lane].get("stopped", False))
+            tension[lane] = np.fmax(tension[lane], infos[lane].get("tension", np.nan))
         done |= ended[:count]
         if done.all():
             return [
-                Episode(first + k, np.array(distances[k]), float(total[k]), bool(diverged[k]), np.array(actions[k]))
+                Episode(
+                    first + k,
+                    np.array(distances[k]),
+                    float(total[k]),
+                    bool(diverged[k]),
+                    np.array(actions[k]),
+                    float(tension[k]),
+                    bool(stopped[k]),
+                )
                 for k in range(count)
             ]
     raise InputError(f"an episode did not end within {longest} actions", where="evaluation", remedy="give it a limit")
@@ -128,6 +143,22 @@ def success(episodes: Sequence[Episode], threshold: float, level: float = 0.95) 
     hits = int(np.sum([episode.distance <= threshold for episode in episodes]))
     interval = binomtest(hits, len(episodes)).proportion_ci(level, method="wilson")
     return hits / len(episodes), float(interval.low), float(interval.high)
+
+
+def peak_tension(episodes: Sequence[Episode]) -> dict[str, float] | None:
+    """Median and largest over episodes of their largest tension [N], and how many the limit stopped; None where no
+    tension is told. Episodes whose simulation failed do not count."""
+    known = [each.tension for each in episodes if not each.diverged and np.isfinite(each.tension)]
+    if not known:
+        return None
+    ended = sum(each.stopped for each in episodes)
+    return {"median": float(np.median(known)), "largest": max(known), "stopped": ended}
+
+
+def tension_sentence(pull: Mapping[str, float], limit: float | None) -> str:
+    """What `peak_tension` found, in words; ``limit`` on tension [N]."""
+    words = f"Cables pull at most {pull['median']:.3g} N in half of the episodes, {pull['largest']:.3g} N in all"
+    return f"{words}." if limit is None else f"{words}; the limit of {limit:g} N stopped {pull['stopped']:.0f} of them."
 
 
 def interquartile_mean(
@@ -169,7 +200,8 @@ def interquartile_mean(
 
 
 def episode_table(policies: Mapping[str, Sequence[Episode]], cases: Sequence[Case]) -> pd.DataFrame:
-    """A row for every policy and case: final and smallest distance [m], sum of rewards, goal and parameters."""
+    """A row for every policy and case: final and smallest distance [m], sum of rewards, largest tension [N],
+    whether the limit on it ended the episode, goal and parameters."""
     rows = [
         {
             "policy": name,
@@ -178,6 +210,8 @@ def episode_table(policies: Mapping[str, Sequence[Episode]], cases: Sequence[Cas
             "smallest_distance": float(np.min(episode.distances)),
             "total_reward": episode.total,
             "diverged": episode.diverged,
+            "peak_tension": episode.tension,
+            "stopped": episode.stopped,
             **{f"goal_{axis}": value for axis, value in zip("xyz", cases[episode.case].goal, strict=False)},
             **dict(cases[episode.case].parameters),
         }

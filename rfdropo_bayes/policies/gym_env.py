@@ -48,7 +48,12 @@ class TrunkEnv(gymnasium.Env):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One action."""
         step = self.episodes.act(np.asarray(action)[None])
-        info = {"distance": float(step.distance[0]), "diverged": bool(step.diverged[0])}
+        info = {
+            "distance": float(step.distance[0]),
+            "diverged": bool(step.diverged[0]),
+            "tension": float(step.tension[0]),
+            "stopped": bool(step.stopped[0]),
+        }
         return (
             step.observation[0],
             float(step.reward[0]),
@@ -98,7 +103,7 @@ class TrunkVectorEnv(VectorEnv):
         """One action in every lane. Where episodes end, ``final_obs`` and ``final_info`` tell of them, and
         ``parameters`` and ``goal`` of those that begin."""
         step = self.episodes.act(np.asarray(actions))
-        info: dict[str, Any] = {"distance": step.distance, "diverged": step.diverged}
+        info: dict[str, Any] = {name: getattr(step, name) for name in ("distance", "diverged", "tension", "stopped")}
         seen = step.observation
         ended = np.flatnonzero(step.terminated | step.truncated)
         if len(ended):

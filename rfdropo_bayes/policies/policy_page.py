@@ -12,7 +12,17 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from rfdropo_bayes.policies.episodes import Episodes
-from rfdropo_bayes.policies.evaluation import EVALUATION_SEED, THRESHOLDS, Case, Episode, draw_cases, play, success
+from rfdropo_bayes.policies.evaluation import (
+    EVALUATION_SEED,
+    THRESHOLDS,
+    Case,
+    Episode,
+    draw_cases,
+    peak_tension,
+    play,
+    success,
+    tension_sentence,
+)
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
 from rfdropo_bayes.policies.policy_figures import curve_figure, draws_figure, save_animation, success_figure
 from rfdropo_bayes.policies.rendering import frames_of
@@ -57,7 +67,7 @@ class Played(NamedTuple):
 
     @property
     def distances(self) -> np.ndarray:
-        """From the goal at the end of every episode [m]; infinite where a simulation failed."""
+        """From the goal at the end of every episode [m]; infinite where a simulation or the drives failed."""
         return np.array([episode.distance for episode in self.episodes])
 
 
@@ -66,7 +76,7 @@ def play_policy(policy: ExportedPolicy, batch: Episodes, seed: int) -> Played:
     venv = TrunkVecEnv(batch)
     cases = draw_cases(venv, EPISODES, EVALUATION_SEED + seed)
     episodes = play(policy.act, venv, cases, seed)
-    ordered = sorted((each for each in episodes if not each.diverged), key=lambda each: each.distance)
+    ordered = sorted((each for each in episodes if np.isfinite(each.distance)), key=lambda each: each.distance)
     middle = (len(ordered) - 1) // 2
     shown = {"the median episode": ordered[middle], "the worst episode": ordered[-1]} if ordered else {}
     films = {}
@@ -98,6 +108,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
         pictures["draws"] = embed(draws_figure(played.varied, played.distances), words)
     worst = sorted(played.episodes, key=lambda each: -each.distance)[:WORST]
     encoded = {words: base64.b64encode(gif).decode("ascii") for words, gif in played.films.items()}
+    pull = peak_tension(played.episodes)
     return render(
         "policy.html.j2",
         summary=summary,
@@ -110,6 +121,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
         episodes=len(played.episodes),
         median=1e3 * float(np.median(played.distances)),
         films=encoded,
+        tension=None if pull is None else tension_sentence(pull, summary["settings"]["tension_limit"]),
         advice=next_steps(summary, played),
         config=config,
     )

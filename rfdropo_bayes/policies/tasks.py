@@ -128,7 +128,8 @@ NEAREST = 0.005
 """Of episodes that begin nearer than this to their goal [m], rewards are those of one that began there: the potential
 goes through zero at a millimetre."""
 FLOOR = -1.05
-"""Reward for each action that a failed simulation leaves undone: that of being about twice as far off as at first."""
+"""Reward for each action that a failed simulation leaves undone: that of being about twice as far off as at first. For
+one that a tension beyond the limit leaves undone the worst reward of the episode counts where it is lower still."""
 
 
 def distance_to(

@@ -23,7 +23,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import stop_if_asked_twice
 from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options, check_critic
-from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, play
+from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, peak_tension, play
 from rfdropo_bayes.policies.parity import check_exportable
 from rfdropo_bayes.policies.training_config import TrainingTable
 
@@ -46,7 +46,8 @@ class Trained:
     Attributes:
         model: of Stable-Baselines3.
         normalisation: the ``VecNormalize`` around its environments, or None.
-        curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m].
+        curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m];
+            where tensions are told, median and largest over episodes of their largest [N], and episodes stopped by it.
         diverged: training episodes that ended because the simulation failed.
         seconds: of all legs.
         redrawn: parameter sets for which no initial state was found, and others drawn.
@@ -283,12 +284,15 @@ def _failures(steps: int) -> Any:
 
 def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
     distance = np.array([episode.distance for episode in episodes])
-    low, middle, high = np.quantile(distance, [0.05, 0.5, 0.95])
+    with np.errstate(invalid="ignore"):  # between two episodes without an end
+        low, middle, high = np.nan_to_num(np.quantile(distance, [0.05, 0.5, 0.95]), nan=np.inf, posinf=np.inf)
+    pull = peak_tension(episodes)
     return {
         "reward": float(np.mean([episode.total for episode in episodes])),
         "distance_q05": float(low),
         "distance_median": float(middle),
         "distance_q95": float(high),
+        **({} if pull is None else {f"tension_{name}": value for name, value in pull.items()}),
     }
 
 

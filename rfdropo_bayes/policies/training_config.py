@@ -37,6 +37,11 @@ class TrainingTable(BaseModel):
         le=10,
         description="actions whose commands, and movements of the markers since, are seen, from the last one back",
     )
+    tension_limit: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="an episode ends, unsuccessful, once a cable pulls more [N], as drives stop then; none by default",
+    )
     algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"

@@ -24,9 +24,10 @@ class TrunkVecEnv(VecEnv):
         log: file that gets one JSON line per finished episode: what it began with and how it ended. An episode can be
             begun again with that as an option of a reset.
 
-    The info of every step holds ``distance`` [m] and ``diverged``; at the end of an episode also
-    ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (r: sum of rewards, l: actions), and what it began
-    with: ``parameters`` and ``goal``. ``reset_infos`` holds what the present episode of each lane began with.
+    The info of every step holds ``distance`` [m], ``diverged``, ``tension`` [N], the largest since the step before, and
+    ``stopped``, whether it was beyond the limit; at the end of an episode also ``terminal_observation``,
+    ``TimeLimit.truncated``, ``episode`` (r: sum of rewards, l: actions), and what it began with: ``parameters`` and
+    ``goal``. ``reset_infos`` holds what the present episode of each lane began with.
     """
 
     def __init__(self, episodes: Episodes, log: Path | None = None) -> None:
@@ -68,9 +69,9 @@ class TrunkVecEnv(VecEnv):
         step = self.episodes.act(self._actions)
         self.total += step.reward
         done = step.terminated | step.truncated
+        told = {name: getattr(step, name).tolist() for name in ("distance", "diverged", "tension", "stopped")}
         infos: list[dict[str, Any]] = [
-            {"distance": distance, "diverged": diverged}
-            for distance, diverged in zip(step.distance.tolist(), step.diverged.tolist(), strict=True)
+            {name: values[lane] for name, values in told.items()} for lane in range(self.num_envs)
         ]
         seen = step.observation
         ended = np.flatnonzero(done)
@@ -94,7 +95,7 @@ class TrunkVecEnv(VecEnv):
                 "episode": {"r": total, "l": length},
                 **self.reset_infos[lane],
             }
-            ending = {"distance": infos[lane]["distance"], "diverged": infos[lane]["diverged"], "reward": total}
+            ending = {name: infos[lane][name] for name in ("distance", "diverged", "stopped")} | {"reward": total}
             lines.append(json.dumps({"lane": int(lane), **self.reset_infos[lane], **ending, "actions": length}))
         if self.log is not None:
             with self.log.open("a", encoding="utf-8") as file:

@@ -20,6 +20,8 @@ from rfdropo_bayes.errors import InputError
 CommandUnit = Literal["m", "rad", "N", "N m", "-"]
 EARLIER_COMMANDS, EARLIER_MOVED = "earlier commands", "earlier moved"
 """Parts of an observation that show more than the last action; see `Earlier`."""
+PEAK_TENSION = "peak_tension_n"
+"""Metadata of an exported policy: the largest tension of a cable [N] in the evaluation that it was kept for."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ class LaneStart(NamedTuple):
 
 
 class BodyLanes(Protocol):
-    """The bodies of a session's lanes; their `Motion` is where they are, without an axis of rows."""
+    """The bodies of a session's lanes; their `Motion` is where they are, without an axis of rows, and the largest
+    tensions on the way there."""
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """Start some lanes anew, with one entry per row; returns the motion of these rows."""
@@ -120,13 +121,13 @@ class CompiledLanes:
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
-        return _last(self._session.advance(displacement, stride=displacement.shape[1], loads=self._acting(loads)))
+        return _last(self._session.advance(displacement, loads=self._acting(loads)), begun=1)
 
 
-def _last(found: Motion) -> Motion:
-    """The last recorded row."""
-    pose = None if found.pose is None else found.pose[:, -1]
-    return found._replace(position=found.position[:, -1], tension=found.tension[:, -1], pose=pose)
+def _last(found: Motion, begun: int = 0) -> Motion:
+    """The last recorded row, and the largest tensions of rows from ``begun`` on."""
+    pose, peak = None if found.pose is None else found.pose[:, -1], found.tension[:, begun:].max(axis=1)
+    return found._replace(position=found.position[:, -1], tension=found.tension[:, -1], pose=pose, peak=peak)
 
 
 class _Lane(NamedTuple):
@@ -158,12 +159,12 @@ class ReferenceLanes:
         elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):
             raise InputError("a lane whose body has other effects than the lanes before", where="reset")
         self._lanes = jax.tree.map(lambda new, old: old.at[rows].set(new[rows]), fresh, self._lanes)
-        return Motion(*(None if part is None else part[rows] for part in self._shown()))
+        return Motion(*(None if part is None else part[rows] for part in self._shown(self._lanes.state.tension)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
-        self._lanes = self._moved(self._lanes, jnp.asarray(displacement), loads)
-        return self._shown()
+        self._lanes, peak = self._moved(self._lanes, jnp.asarray(displacement), loads)
+        return self._shown(peak)
 
     def save(self) -> Float[np.ndarray, "lane values"]:
         """See `BodyLanes`."""
@@ -175,7 +176,7 @@ class ReferenceLanes:
         whole[rows] = state
         self._lanes = lanes_like(self._lanes, whole)
 
-    def _shown(self) -> Motion:
+    def _shown(self, peak: Float[Array, "lane cable"]) -> Motion:
         assert self._lanes is not None
         lanes, markers = self._lanes, self._engine.body.markers
         position = jax.vmap(lambda nodes: point_positions(markers, nodes))(lanes.state.position)
@@ -183,7 +184,7 @@ class ReferenceLanes:
         if cube is not None:
             pose = np.concatenate([cube.position, cube.orientation], axis=1)
         parts = position, lanes.state.tension, lanes.diverged, lanes.imbalance, lanes.converged
-        shown: Any = [*map(np.asarray, parts), pose]
+        shown: Any = [*map(np.asarray, parts), pose, np.asarray(peak)]
         return Motion(*shown)
 
     @cached_property
@@ -199,22 +200,25 @@ class ReferenceLanes:
         return jax.jit(jax.vmap(first))
 
     @cached_property
-    def _moved(self) -> Callable[[_Lane | None, Array, BodySignals | None], _Lane]:
+    def _moved(self) -> Callable[[_Lane | None, Array, BodySignals | None], tuple[_Lane, Array]]:
         system, time_step, engine = self._system, self._engine.time_step, self._engine
 
-        def moved(lane: _Lane, displacement: Float[Array, "step cable"], loads: BodySignals | None) -> _Lane:
+        def moved(
+            lane: _Lane, displacement: Float[Array, "step cable"], loads: BodySignals | None
+        ) -> tuple[_Lane, Float[Array, " cable"]]:
             acting = engine.section_loads(loads)
 
-            def one(before: _Lane, given: tuple[Float[Array, " cable"], Int[Array, ""]]) -> tuple[_Lane, None]:
+            def one(before: _Lane, given: tuple[Float[Array, " cable"], Int[Array, ""]]) -> tuple[_Lane, Array]:
                 under, force = before.prepared, cast("Array | float", 0.0)
                 if acting is not None:
                     under, force = loaded(system, under, acting, given[1])
                 around = force, engine.scene, before.cube
                 state, info = step(system, under, before.state, given[0], time_step, *around, engine.integrator)
                 codes = before.diverged | info.diverged, before.converged & info.converged
-                return before._replace(state=state, diverged=codes[0], converged=codes[1]), None
+                return before._replace(state=state, diverged=codes[0], converged=codes[1]), state.tension
 
-            return jax.lax.scan(one, lane, (displacement, jnp.arange(len(displacement))))[0]
+            lane, tension = jax.lax.scan(one, lane, (displacement, jnp.arange(len(displacement))))
+            return lane, tension.max(axis=0)
 
         return jax.jit(jax.vmap(moved))
 

@@ -413,7 +413,7 @@ class Session:
             pose = np.concatenate(
                 [pose[:, :3], pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)], axis=1
             )
-        return Observation(position, found.tension, pose, status, angle)
+        return Observation(position, found.tension, pose, status, angle, found.peak)
 
 
 @jax.jit

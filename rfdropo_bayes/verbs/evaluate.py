@@ -25,6 +25,7 @@ from rfdropo_bayes.policies.evaluation import (
     episode_table,
     interquartile_mean,
     median_episode,
+    peak_tension,
     play,
     success,
 )
@@ -45,7 +46,7 @@ from rfdropo_bayes.verbs.train import POLICY
 
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
 SCHEMA_VERSION = 1
-OF_EPISODES = ("task", "goals", "start", "actions", "observation", "period", "noise")
+OF_EPISODES = ("task", "goals", "start", "actions", "observation", "period", "noise", "tension_limit")
 """Keys of [training] that say what an episode is, whatever is simulated."""
 
 
@@ -110,7 +111,7 @@ def evaluate(
             found[name] = play(policy.act, venv, cases, seed)
             if film:
                 _film(batch, found[name], cases, out / f"{name}.gif")
-        content = _judged(found, cases, seed)
+        content = _judged(found, cases, seed) | {"tension_limit_n": table.tension_limit}
         content["otherwise_trained"] = _otherwise_trained(loaded, steps_of(simulator))
         with whole(out / CSV) as partial:
             episode_table(found, cases).to_csv(partial, index=False)
@@ -145,6 +146,7 @@ def _episodes_for(
         step=np.max(layout.moves, axis=0).tolist(),
         noise=table.noise,
         history=layout.history,
+        tension_limit=table.tension_limit,
     )
     batch = Episodes(simulator, task, lanes, randomisation, settings)
     batch.layout.require(layout, where=name)
@@ -189,6 +191,7 @@ def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed:
             "interquartile_mean_mm": dict(zip(("value", "low", "high"), map(_millimetres, middle), strict=True)),
             "median_mm": _millimetres(float(np.median([episode.distance for episode in episodes]))),
             "diverged": int(np.sum([episode.diverged for episode in episodes])),
+            "peak_tension_n": peak_tension(episodes),
         }
     return {"episodes": len(cases), "policies": policies, "seed": seed, "schema_version": SCHEMA_VERSION}
 
@@ -207,21 +210,24 @@ def evaluation_table(content: Mapping[str, Any]) -> str:
     names = next(iter(content["policies"].values()))["success_mm"]
     lines = [
         f"Share of {content['episodes']} episodes, the same for all policies, that end within a distance of the goal,",
-        "with 95 % Wilson intervals; median and interquartile mean of the final distance.",
+        "with 95 % Wilson intervals; median and interquartile mean of the final distance; largest tension of a cable",
+        "in an episode, and episodes that the limit on tension stopped.",
         "",
-        f"| policy | {' | '.join(f'{name} mm' for name in names)} | median [mm] | IQM [mm] | diverged |",
-        f"|{'---|' * (len(names) + 4)}",
+        f"| policy | {' | '.join(f'{name} mm' for name in names)} | median [mm] | IQM [mm] | diverged "
+        "| tension, median [N] | largest [N] | stopped |",
+        f"|{'---|' * (len(names) + 7)}",
     ]
     for name, row in content["policies"].items():
         cells = [
             f"{100 * r['share']:.0f} % [{100 * r['low']:.0f}, {100 * r['high']:.0f}]"
             for r in row["success_mm"].values()
         ]
-        middle = row["interquartile_mean_mm"]
+        middle, pull = row["interquartile_mean_mm"], row["peak_tension_n"]
         cells += [
             _shown(row["median_mm"]),
             f"{_shown(middle['value'])} [{_shown(middle['low'])}, {_shown(middle['high'])}]",
             str(row["diverged"]),
+            *(["-"] * 3 if pull is None else [f"{pull['median']:.3g}", f"{pull['largest']:.3g}", str(pull["stopped"])]),
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join([*lines, *(f"\n{sentence}" for sentence in content.get("otherwise_trained", []))]) + "\n"

@@ -125,7 +125,15 @@ def _check_length(task: Task, robot: Robot | BlackBox) -> None:
 
 
 def episode_settings(table: TrainingTable) -> Settings:
-    return Settings(table.actions, table.observation, table.period, table.step, table.noise, table.history)
+    return Settings(
+        table.actions,
+        table.observation,
+        table.period,
+        table.step,
+        table.noise,
+        table.history,
+        tension_limit=table.tension_limit,
+    )
 
 
 def steps_of(simulator: AnySimulator) -> str:

@@ -16,6 +16,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import command_of, run_folder
 from rfdropo_bayes.policies.critic import varied_parameters
 from rfdropo_bayes.policies.episodes import Episodes
+from rfdropo_bayes.policies.evaluation import tension_sentence
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.policies.parity import difference, observations
 from rfdropo_bayes.policies.policy_figures import curve_figure
@@ -28,7 +29,7 @@ from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
-from rfdropo_bayes.robots.policy_layout import PolicyLayout
+from rfdropo_bayes.robots.policy_layout import PEAK_TENSION, PolicyLayout
 from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.verbs.make_vec import episode_settings, randomisation_of, steps_of, training_of, with_training
 
@@ -98,6 +99,8 @@ def train(
             "time_step_s": f"{simulator.time_step:g}",
             "seed": str(seed),
         }
+        if "tension_largest" in found.best:
+            facts[PEAK_TENSION] = f"{found.best['tension_largest']:g}"
         policy = ExportedPolicy(export_policy(found.model, found.normalisation, layout, out / POLICY, facts))
         _check_parity(policy, found)
         sees = varied_parameters(randomisation).names if table.critic == "parameters" else ()
@@ -145,6 +148,16 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
     }
 
 
+def learnt(summary: Mapping[str, Any]) -> str:
+    """How the policy that was kept did in its evaluation, in a sentence or two."""
+    best = summary["evaluation"]
+    half, most = (best[f"distance_{name}"] for name in ("median", "q95"))
+    ends = [f"{1e3 * end:.2f} mm of the goal" if np.isfinite(end) else "no distance: they fail" for end in (half, most)]
+    words = f"half of the episodes end within {ends[0]}, 95 % within {ends[1]}."
+    pull = {name: best[f"tension_{name}"] for name in ("median", "largest", "stopped") if f"tension_{name}" in best}
+    return f"{words} {tension_sentence(pull, summary['settings']['tension_limit'])}" if pull else words
+
+
 def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
     """What somebody needs to know before using a policy, as Markdown."""
     episodes = summary["settings"]["evaluation_episodes"]
@@ -162,8 +175,7 @@ Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {su
 Time steps: {summary["integrator"]}, {1e3 * float(summary["time_step_s"]):g} ms.
 Parameters of every episode: {summary["randomisation"]}, SHA-256 {summary["posterior_sha256"][:16]}.
 
-This is the policy after {best["steps"]} steps, the best evaluated: half of {episodes} episodes end within
-{1e3 * best["distance_median"]:.2f} mm of the goal, 95 % within {1e3 * best["distance_q95"]:.2f} mm.
+This is the policy after {best["steps"]} steps, the best evaluated, in {episodes} episodes: {learnt(summary)}
 One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} ms at the 99th percentile.
 
 | Observation | Numbers | Unit |

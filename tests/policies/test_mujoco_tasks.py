@@ -34,10 +34,12 @@ GOALS = [[-0.08, -0.06, -0.19], [0.08, 0.06, -0.15]]
 REACH = {"task": "TrunkReach-v0", "goals": GOALS}
 
 
-def model_of(folder: Path, text: str = ARM, mechanisms: tuple[str, ...] = ()) -> rb.Model:
+def model_of(
+    folder: Path, text: str = ARM, mechanisms: tuple[str, ...] = (), cables: dict[str, str] | None = None
+) -> rb.Model:
     path = folder / "arm.xml"
     path.write_text(text)
-    arm = rb.MuJoCo(path, markers={"tip": "tip"}, parameters={"damping": "joint/elbow/damping"})
+    arm = rb.MuJoCo(path, markers={"tip": "tip"}, parameters={"damping": "joint/elbow/damping"}, cables=cables)
     return rb.Model(arm, priors={"damping": {}}, mechanisms=list(mechanisms))
 
 
@@ -65,11 +67,36 @@ def test_commands_stay_in_the_range_of_the_actuators_and_move_by_a_share_of_it(t
         (ARM, {"goals": None}, "nobody knows where its goals are"),
         (ARM, {"task": "TrunkPush-v0"}, "has no cube to push"),
         (ARM.replace(' ctrlrange="-1 1"', ""), {}, "nothing limits the command 'a'"),
+        (ARM, {"tension_limit": 1.0}, "tells no cable tensions between two actions; name its cables"),
     ],
 )
 def test_what_a_task_needs_is_said(tmp_path, text, changes, said):
     with pytest.raises(InputError, match=said):
         rb.make_vec(model=model_of(tmp_path, text), n=1, **{**REACH, **changes})
+
+
+def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(tmp_path):
+    """An episode's largest pull is that of a whole rollout at its time steps."""
+    model = model_of(tmp_path, cables={"b": "b"})
+    venv = rb.make_vec(model=model, n=2, tension_limit=0.026, **REACH)
+    venv.seed(0)
+    venv.reset()
+    begun = venv.reset_infos[0]["parameters"]
+    up = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=np.float32)
+    told, commands = [], []
+    for _ in range(5):
+        _, _, done, infos = venv.step(up)
+        told.append(infos[0]["tension"])
+        commands.append([0.0, 0.1 * len(told)])
+        assert (done == [infos[0]["stopped"], False]).all()
+        if done[0]:
+            break
+    assert told[-1] > 0.026 >= max(told[:-1])
+    simulator, steps = venv.episodes.simulator, round(0.05 / 0.005)
+    every = 0.005 * np.arange(steps * len(told) + 1)
+    given = simulator.commands(0.05 * np.arange(len(told)), np.array(commands), np.zeros(2), every)
+    whole = np.asarray(simulator.rollout(begun, given).tension)[1:].reshape(len(told), -1)
+    np.testing.assert_allclose(told, whole.max(axis=1), atol=1e-9)
 
 
 @pytest.mark.slow

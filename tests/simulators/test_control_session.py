@@ -113,6 +113,30 @@ def test_a_session_is_a_rollout_bit_for_bit(precision, state, integrator):
     assert np.ptp(whole.position, axis=1).max() > 0.02
 
 
+@pytest.mark.parametrize(("engine", "tolerance"), [("numba", 0.0), pytest.param("jax", 1e-9, marks=pytest.mark.slow)])
+def test_the_largest_tension_of_a_period_is_that_of_the_rollouts_steps(engine, tolerance):
+    model = simulator(engine)
+    parameters, commands = drawn({})
+    steps = round(PERIOD / model.time_step)
+    every = model.time_step * np.arange(steps * PERIODS + 1)
+    grid = [
+        model.commands(PERIOD * np.arange(PERIODS), model.taken("", np.zeros(8), sent), np.zeros(8), every)
+        for sent in commands
+    ]
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *grid)
+    whole = np.asarray(jax.jit(jax.vmap(model.rollout))(parameters, stacked).tension)
+    session = Session(model, LANES, PERIOD)
+    begun = session.reset(np.arange(LANES), parameters)
+    np.testing.assert_array_equal(begun.peak, begun.tension)
+    higher = 0
+    for period in range(PERIODS):
+        now = session.act(commands[:, period])
+        largest = whole[:, steps * period + 1 : steps * (period + 1) + 1].max(axis=1)
+        np.testing.assert_allclose(now.peak, largest, rtol=tolerance, atol=1e-12)
+        higher += np.sum(now.peak > now.tension)
+    assert higher > 0
+
+
 PUSHED = {"cube_x": 0.012, "cube_z": 0.15, "cube_mass": 0.05, "friction": 0.3}
 
 

@@ -20,6 +20,7 @@ from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.policy_layout import PEAK_TENSION
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -74,6 +75,8 @@ def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     policy = ExportedPolicy(tmp_path / "policy" / "policy.onnx")
     assert policy.layout.task == task
     assert policy.facts["posterior_sha256"] == summary["posterior_sha256"]
+    assert float(policy.facts[PEAK_TENSION]) == pytest.approx(summary["evaluation"]["tension_largest"], rel=1e-5)
+    assert "Cables pull at most" in (tmp_path / "policy" / "report.html").read_text()
     rfdropo("evaluate", REACH, "--policy", tmp_path / "policy", "--out", tmp_path / "test", "--episodes", 8, *settings)
     table = pd.read_csv(tmp_path / "test" / "episodes.csv")
     assert len(table) == 8
@@ -280,5 +283,10 @@ def test_one_episode_is_an_evaluation_and_none_is_not(tmp_path) -> None:
     found = rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "one", episodes=1, film=False)
     (policy,) = found["policies"].values()
     assert policy["interquartile_mean_mm"] == {"value": policy["median_mm"], "low": None, "high": None}
+    pull = policy["peak_tension_n"]
+    assert pull["largest"] == pull["median"] > 1.0
+    assert pull["stopped"] == 0
+    table = (tmp_path / "one" / "evaluation.md").read_text()
+    assert f"| {pull['median']:.3g} | {pull['largest']:.3g} | 0 |" in table
     with pytest.raises(InputError, match="0 episodes show nothing"):
         rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path / "none", episodes=0)

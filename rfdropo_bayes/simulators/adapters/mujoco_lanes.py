@@ -82,13 +82,14 @@ class MuJoCoLanes:
             self._state[rows] = states[:, -2]
         late = states[:, -1, 0] - begun - (steps + 1) * clock
         self._failed[rows] |= ~((np.abs(late) < 0.5 * clock) & np.isfinite(states[:, -1]).all(axis=1))
-        position, tension = self.rollouts.shown(seen[:, -1:])
+        position, tension = self.rollouts.shown(seen[:, -max(steps, 1) :])
         diverged: Bool[np.ndarray, " row"] = self._failed[rows].copy()
         sound = ~diverged[:, None]
         return Motion(
-            np.where(sound[..., None], position[:, 0], 0.0),
-            np.where(sound, tension[:, 0], 0.0),
+            np.where(sound[..., None], position[:, -1], 0.0),
+            np.where(sound, tension[:, -1], 0.0),
             diverged,
             np.zeros(len(rows)),
             np.ones(len(rows), dtype=bool),
+            peak=np.where(sound, tension.max(axis=1), 0.0),
         )
