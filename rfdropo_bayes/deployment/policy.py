@@ -19,8 +19,8 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.sensors import POSE
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import EARLIER_COMMANDS, EARLIER_MOVED, Earlier, PolicyLayout
+from rfdropo_bayes.robots import Motor, Robot
+from rfdropo_bayes.robots.policy_layout import EARLIER_COMMANDS, EARLIER_MOVED, PEAK_TENSION, Earlier, PolicyLayout
 
 METADATA = "rfdropo_layout"
 """Key of the layout in the metadata of the ONNX file."""
@@ -88,6 +88,9 @@ class OnnxPolicy:
         sha256: hash that the file must have; None accepts any.
         markers: those that it sees, where it does not see all of the robot's.
 
+    Attributes:
+        peak_tension: largest tension of a cable in the evaluation that its training ended with [N]; NaN if not told.
+
     Raises:
         InputError: if the file cannot be read, or its layout, hash or shapes do not fit.
     """
@@ -111,6 +114,7 @@ class OnnxPolicy:
         self._markers = _markers_seen(robot, markers)
         self._goal = np.array([goal.get(axis, np.nan) for axis in "xyz"])
         _check_layout(self.layout, robot, 3 * len(self._markers), where)
+        self.peak_tension = float(self._session.get_modelmeta().custom_metadata_map.get(PEAK_TENSION, "nan"))
         names = [part.name for part in self.layout.observation]
         if "goal" in names and not np.all(np.isfinite(self._goal)):
             raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
@@ -191,6 +195,18 @@ class OnnxPolicy:
         given = self._session.run(["action"], {self._input.name: np.zeros((1, wanted), np.float32)})[0]
         if np.size(given) != len(self._reach):
             raise InputError(f"gives {np.size(given)} values for {len(self._reach)} channels", where=where)
+
+
+def pulls_too_hard(peak: float, motors: Sequence[Motor]) -> str | None:
+    """A warning where a policy pulled more in its training's evaluation [N] than a motor bears; None where not."""
+    weakest = min(motors, key=lambda motor: motor.tension_limit_n[1])
+    limit = weakest.tension_limit_n[1]
+    if not peak > limit:
+        return None
+    return (
+        f"in simulation the policy pulled up to {peak:.3g} N, and {weakest.channel} stops at {limit:g} N: train with "
+        f"[training] tension_limit = {limit:g}"
+    )
 
 
 def _bound(session: Any, size: int, channels: int) -> Callable[[np.ndarray], Float[np.ndarray, " channel"]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import platform
+import sys
 import threading
 from collections.abc import Mapping
 from enum import StrEnum
@@ -29,7 +30,13 @@ from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals,
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
 from rfdropo_bayes.deployment.loop import ControlLoop, Phase
-from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands, replay_rate
+from rfdropo_bayes.deployment.policy import (
+    CommandSource,
+    OnnxPolicy,
+    RecordedCommands,
+    pulls_too_hard,
+    replay_rate,
+)
 from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
@@ -153,6 +160,9 @@ class _Session:
         self.offsets = self._offsets()
         self.log = SessionLog(out, robot, self._facts, settings.frames)
         stack.callback(self.log.close)
+        if "warning" in self._facts:
+            self.log.event("warning", self._facts["warning"])
+            print(f"warning: {self._facts['warning']}", file=sys.stderr, flush=True)
         content = settings.model_dump(mode="json", exclude_none=True)
         (out / "config.toml").write_text(tomli_w.dumps({"mode": mode.value} | content), encoding="utf-8")
 
@@ -164,6 +174,8 @@ class _Session:
                 Path(settings.policy.file), self.robot, settings.goal, settings.policy.sha256, settings.policy.markers
             )
             self._facts["policy_sha256"] = policy.sha256
+            warning = pulls_too_hard(policy.peak_tension, self.robot.motors)
+            self._facts |= {} if warning is None else {"warning": warning}
             if policy.sees_object:
                 self._facts[GOAL_AXES] = np.delete(np.arange(3), np.argmax(np.abs(self.robot.gravity))).tolist()
             self.source = policy

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 import rfdropo_bayes as rb
@@ -32,6 +33,7 @@ from rfdropo_bayes.deployment.settings import (
 )
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.policy_layout import PEAK_TENSION
 
 from .policies import linear_policy
 
@@ -255,6 +257,20 @@ def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: R
         deploy(settings, "dry-run", tmp_path / "s")
     assert json.loads((tmp_path / "s" / "summary.json").read_text())["cause"] == "refused"
     assert "does not divide" in (tmp_path / "s" / "log.jsonl").read_text()
+
+
+def test_a_policy_that_pulled_harder_than_a_motor_bears_is_warned_of(robot: Robot, tmp_path: Path, capsys) -> None:
+    path = linear_policy(tmp_path / "p.onnx", robot, np.zeros((16, 4)), np.zeros(4))
+    limit = min(motor.tension_limit_n[1] for motor in robot.motors)
+    for peak in (limit, limit + 1.0):
+        model = onnx.load(path)
+        onnx.helper.set_model_props(model, {p.key: p.value for p in model.metadata_props} | {PEAK_TENSION: f"{peak}"})
+        onnx.save(model, path)
+        settings = Deployment(robot="motor_arm", policy=PolicyTable(file=str(path)), drives=SLOW)
+        deploy(settings, "check", tmp_path / f"{peak}", simulated=True)
+        told = f"pulled up to {peak:.3g} N"
+        assert (told in capsys.readouterr().err) == (peak > limit)
+        assert (told in (tmp_path / f"{peak}" / "log.jsonl").read_text()) == (peak > limit)
 
 
 def test_the_master_takes_a_node_number_that_no_drive_has() -> None:
