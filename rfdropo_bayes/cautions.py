@@ -51,6 +51,8 @@ class Code(StrEnum):
     """A day is fitted worse than the fitted ones, few of the body's draws explain it, or fits did not converge."""
     GROUP_WITHOUT = "group_without"
     """Parameters that some groups alone have: a group that no fit has seen is taken to be without them."""
+    UNSAFE_POSTERIOR = "unsafe_posterior"
+    """A policy is trained on a posterior that its own record, or an audit of its recordings, speaks against."""
     RESIDUALS_CORRELATED = "residuals_correlated"
     """Residuals last from row to row beyond the noise model."""
     RESIDUALS_LAST = "residuals_last"

@@ -203,9 +203,13 @@ def _randomised(table: TrainingTable, simulator: AnySimulator, folder: Path) -> 
             where="[training]",
             remedy="name the folder of a calibration: source = ...",
         )
-    beside = folder / table.source
-    source = beside if beside.exists() else Path(table.source)
-    return _of_run(source, simulator, phi=table.randomisation == "phi")
+    return _of_run(source_of(table.source, folder), simulator, phi=table.randomisation == "phi")
+
+
+def source_of(source: str, folder: Path) -> Path:
+    """The run that [training] source names, relative to the experiment's folder or to the working directory."""
+    beside = folder / source
+    return beside if beside.exists() else Path(source)
 
 
 def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Randomisation:

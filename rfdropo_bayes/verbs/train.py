@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import say_step
@@ -31,7 +32,15 @@ from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PEAK_TENSION, PolicyLayout
 from rfdropo_bayes.signatures import with_keys_of
-from rfdropo_bayes.verbs.make_vec import episode_settings, randomisation_of, steps_of, training_of, with_training
+from rfdropo_bayes.verbs.make_vec import (
+    episode_settings,
+    randomisation_of,
+    source_of,
+    steps_of,
+    training_of,
+    with_training,
+)
+from rfdropo_bayes.verbs.unsafe_posterior import posterior_caution
 
 POLICY, CARD, SUMMARY, CURVE, PAGE = "policy.onnx", "card.md", "summary.json", "curve.png", "report.html"
 SCHEMA_VERSION = 1
@@ -77,6 +86,7 @@ def train(
     seed = model.settings.seed if seed is None else seed
     table, task, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, posterior)
+    cautions = _cautions(table, posterior, model.folder, show)
     settings = episode_settings(table)
     known = {"randomisation": randomisation.sha256, "simulator": simulator.description["content_sha256"]}
 
@@ -105,6 +115,7 @@ def train(
         _check_parity(policy, found)
         sees = varied_parameters(randomisation).names if table.critic == "parameters" else ()
         summary = _summary(table, found, policy, facts) | {"critic_sees": list(sees)}
+        summary["cautions"] = [caution.as_dict() for caution in cautions]
         curve_figure(found.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
         if page:
@@ -115,6 +126,20 @@ def train(
             write_text(out / PAGE, render_policy(summary, played, str(tables.get("title", task.name)), text))
         write_json(out / SUMMARY, summary)
     return summary
+
+
+def _cautions(
+    table: TrainingTable, posterior: Calibration | Path | None, folder: Path, show: bool | None
+) -> list[Caution]:
+    """What earlier results say against the posterior, or phi, that parameters come from; said on stderr, too."""
+    source = posterior
+    if source is None and table.source is not None and table.randomisation in ("posterior", "phi"):
+        source = source_of(table.source, folder)
+    found = None if source is None else posterior_caution(source)
+    if found is None:
+        return []
+    say_step(f"warning: {found.sentence}", show=show)
+    return [found]
 
 
 def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:

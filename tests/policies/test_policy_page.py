@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,8 @@ SUMMARY = {
     "seed": "0",
     "evaluation": {"steps": 6000},
     "curve": curve(0.03, 0.02, 0.01),
+    "settings": {"tension_limit": 150.0},
+    "cautions": [],
     "versions": {"numpy": "2"},
 }
 
@@ -75,6 +78,17 @@ def test_the_page_says_how_often_the_policy_succeeds():
     assert "97 %" in page
     assert "data:image/gif;base64,R0lGODlh" in page
     assert page.count('<td class="n">failed</td>') == 3
+
+
+def test_the_page_tells_of_tensions_and_of_what_speaks_against_the_posterior():
+    seen = played()
+    pulls = [replace(each, tension=100.0 + each.case, stopped=each.case > 50) for each in seen.episodes]
+    caution = {"code": "unsafe_posterior", "sentence": "reports/fit is not safe", "grave": False}
+    page = render_policy({**SUMMARY, "cautions": [caution]}, seen._replace(episodes=pulls), "My arm", "")
+    assert "at most 150 N in half of the episodes, 199 N in all; the limit of 150 N stopped 49 of them" in page
+    assert page.count('<td class="n">stopped</td>') == 8  # the worst episodes
+    assert "<strong>Warning:</strong> reports/fit is not safe." in page
+    assert "Warning" not in render_policy(SUMMARY, seen, "My arm", "")
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7])

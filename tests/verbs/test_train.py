@@ -92,7 +92,7 @@ def test_a_policy_is_trained_under_a_calibration_with_one_command(tmp_path) -> N
         model, runs, rb.Laplace(starts=1, screen=4, max_steps=3, draws=16), seed=0, show=False, out=tmp_path / "fit"
     )
     settings = [part for entry in [*QUICK, 'training.critic="parameters"'] for part in ("--set", entry)]
-    rfdropo("train", "--from", tmp_path / "fit", "--task", "reach", "--goal", "0.01,-0.03,0.13", *settings)
+    told = rfdropo("train", "--from", tmp_path / "fit", "--task", "reach", "--goal", "0.01,-0.03,0.13", *settings)
     summary = json.loads((tmp_path / "fit_train" / "summary.json").read_text())
     assert summary["randomisation"] == "posterior"
     assert summary["critic_sees"] == ["young_modulus"]
@@ -100,6 +100,11 @@ def test_a_policy_is_trained_under_a_calibration_with_one_command(tmp_path) -> N
     page = (tmp_path / "fit_train" / "report.html").read_text()
     assert "parameters of every episode: posterior" in page
     assert "young_<wbr>modulus" in page
+    warned = (
+        "fit is not safe to train on: its 90 % bands of the fit recordings hold only"  # of a virtual trunk's drives
+    )
+    assert told.count(warned) == page.count(warned) == 1
+    assert [caution["code"] for caution in summary["cautions"]] == ["unsafe_posterior"]
 
 
 @pytest.mark.parametrize(
