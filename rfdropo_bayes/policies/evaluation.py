@@ -187,15 +187,16 @@ def interquartile_mean(
     if min(map(len, distances)) < 2:
         return found, float("nan"), float("nan")
     # Strata are resampled apart: each argument of `bootstrap` is one.
-    interval = bootstrap(
-        distances,
-        middle,
-        n_resamples=resamples,
-        confidence_level=level,
-        method="percentile",
-        vectorized=True,
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
+    with np.errstate(invalid="ignore"):  # resamples of which a quarter failed have no middle
+        interval = bootstrap(
+            distances,
+            middle,
+            n_resamples=resamples,
+            confidence_level=level,
+            method="percentile",
+            vectorized=True,
+            rng=np.random.default_rng(seed),
+        ).confidence_interval
     return found, float(interval.low), float(interval.high)
 
 

@@ -391,6 +391,9 @@ def test_the_mean_of_one_episode_has_no_interval() -> None:
 def test_failures_of_a_quarter_leave_no_interquartile_mean() -> None:
     found = interquartile_mean([episodes_with([0.01] * 14 + [np.inf] * 6)], seed=0)
     assert found == (np.inf, np.inf, np.inf)
+    found, low, high = interquartile_mean([episodes_with([0.01] * 80 + [np.inf] * 20)], seed=0)
+    assert found == low == pytest.approx(0.01)
+    assert not np.isfinite(high)  # of many resamples a quarter failed
 
 
 def test_the_table_has_a_row_for_every_policy_and_case() -> None:
