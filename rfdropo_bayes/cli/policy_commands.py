@@ -61,7 +61,7 @@ def train(
     if calibration is not None:
         model = with_training(model, {"randomisation": "posterior"})
     found = learn(model, folder, posterior=calibration, resume=resume, overwrite=overwrite)
-    done = f"after {found['steps']} steps in {found['seconds']:.0f} s {learnt(found)}"
+    done = f"after {found['steps']} steps in {found['seconds']:.0f} s: {learnt(found)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
     say(found, *lines, quiet=quiet, as_json=as_json)
