@@ -136,7 +136,8 @@ def _adopted(truth: Truth, out: Path, seed: int) -> dict[str, Any]:
         own = experiment_tables(truth.setting, fit=["fit_*.nc"]).model_dump(exclude_none=True, exclude_defaults=True)
         place = _recorded(truth, own, None, 0.0, [seed, 0], out / BASE / "data")
         assert place is not None
-        found = audit(Model.read(place / "audit.toml"), out=out / BASE / "audit", workshop=_WORKSHOP, overwrite=True)
+        asked = Model.read(place / "audit.toml", ["audit.ports=false"])  # laws are not adopted
+        found = audit(asked, out=out / BASE / "audit", workshop=_WORKSHOP, overwrite=True)
         stored.write_text(json.dumps(_with_findings(own, found.content["findings"])), encoding="utf-8")
         (out / BASE / "sentence.txt").write_text(found.sentence + "\n", encoding="utf-8")
     return dict(json.loads(stored.read_text(encoding="utf-8")))
