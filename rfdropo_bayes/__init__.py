@@ -16,9 +16,10 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from rfdropo_bayes.runtime import limit_blas_threads
+from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads
 
 limit_blas_threads()
+keep_callback_threads()
 
 __version__ = "0.1.0"
 

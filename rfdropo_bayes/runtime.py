@@ -26,21 +26,25 @@ def limit_blas_threads() -> None:
         os.environ.setdefault(name, "1")
 
 
+def keep_callback_threads() -> None:
+    """Give XLA's pool at least `CALLBACK_THREADS` threads, unless the user chose otherwise.
+
+    A callback waits, in a thread of that pool, for a copy of its arguments by another thread of it. The pool has one
+    thread for each processor: on one processor two callbacks of one program wait for ever. The variable is read when
+    JAX first makes an array, and engines that use JAX do so when they are imported.
+    """
+    if available_processors() < CALLBACK_THREADS:
+        os.environ.setdefault("PJRT_NPROC", str(CALLBACK_THREADS))
+
+
 def configure_jax() -> None:
     """Make float64 the default of JAX, and let it finish one operation before the next.
 
     Stiff finite-element solves lose their answer in float32. Operations that run ahead of a callback into the compiled
     engines can take the threads that the callback waits for: on two processors a rollout outside ``jax.jit`` then
     hangs for ever.
-
-    A callback waits, in a thread of XLA's pool, for a copy of its arguments by another thread of it. The pool has one
-    thread for each processor: on one processor two callbacks of one program wait for ever. So the pool never has fewer
-    than `CALLBACK_THREADS`.
     """
     import jax
-
-    if available_processors() < CALLBACK_THREADS:
-        os.environ.setdefault("PJRT_NPROC", str(CALLBACK_THREADS))  # read when JAX first uses the processor
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rfdropo_bayes.runtime import CALLBACK_THREADS, configure_jax, keep_compilations
+from rfdropo_bayes.runtime import CALLBACK_THREADS, keep_callback_threads, keep_compilations
 
 VARIABLES = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
 
@@ -49,5 +49,5 @@ def test_callbacks_have_the_threads_that_they_wait_for(
     monkeypatch.setenv("PJRT_NPROC", given or "")
     if given is None:
         monkeypatch.delenv("PJRT_NPROC")
-    configure_jax()
+    keep_callback_threads()
     assert os.environ.get("PJRT_NPROC") == (None if threads is None else str(threads))

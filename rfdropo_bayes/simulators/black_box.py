@@ -63,6 +63,8 @@ class BlackBox:
         name: of the simulator, for reports.
         batched: whether the function takes many parameter sets at once.
         lanes: parameter sets that it is given at once.
+        one_shape: whether a function that takes many gets arrays of one shape: ``lanes`` sets each time, some of them
+            again, and whole commands. One that JAX compiles is then compiled once for recordings of one length.
         difference: relative step of derivatives; larger where the motion is rough on small scales.
         stroke: size of usual commands, in their unit; those of cables and motors are known.
         limits: least and greatest command of each channel, which a policy keeps; none by default.
@@ -83,6 +85,7 @@ class BlackBox:
     name: str = "black box"
     batched: bool = False
     lanes: int = 64
+    one_shape: bool = False
     difference: float | None = None
     stroke: float | None = None
     families: Mapping[str, str] = field(default_factory=dict)
@@ -91,6 +94,9 @@ class BlackBox:
     def __post_init__(self) -> None:
         if not self.markers or not self.channels or not self.time_step > 0.0:
             raise InputError("needs a marker, a channel and a positive time step", where=self.name)
+        if self.one_shape and not self.batched:
+            remedy = "give batched=True, and a function of many parameter sets"
+            raise InputError("arrays of one shape, of one parameter set", where=self.name, remedy=remedy)
         if self.command_unit not in STROKES:
             remedy = nearest(self.command_unit, STROKES)
             raise InputError(f"commands in {self.command_unit!r}", where=self.name, remedy=remedy)
@@ -179,17 +185,30 @@ class BlackBox:
             return [single(given, command) for given, command in zip(sets, commands, strict=True)]
 
         def together(values: Batch, commands: np.ndarray) -> list[Any]:
+            count = len(commands)
+            size = self.lanes if self.one_shape else count
+            blocks = [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
+            return [answer for rows in blocks for answer in attempted(values, commands, rows)]
+
+        def attempted(values: Batch, commands: np.ndarray, rows: np.ndarray) -> list[Any]:
             try:
-                found = function(values, commands)
+                return self.answers(values, commands, rows)
             except Exception:
-                rows = [
-                    ({n: c[k : k + 1] for n, c in values.items()}, commands[k : k + 1]) for k in range(len(commands))
-                ]
-                return [None] if len(rows) == 1 else [answer for row in rows for answer in together(*row)]
-            parts = found if isinstance(found, Mapping) else {"position": found}
-            return [{name: np.asarray(part)[k] for name, part in parts.items()} for k in range(len(commands))]
+                alone = [rows[k : k + 1] for k in range(len(rows))]
+                return [None] if len(rows) == 1 else [a for row in alone for a in attempted(values, commands, row)]
 
         return together if self.batched else one_by_one
+
+    def answers(
+        self, values: Batch, commands: Float[np.ndarray, "n row channel"], rows: Int[np.ndarray, " few"]
+    ) -> list[dict[str, np.ndarray]]:
+        """What a function of many parameter sets returns for some rows of a batch, at most `lanes` with `one_shape`."""
+        taken = np.resize(rows, self.lanes) if self.one_shape else rows
+        function: Any = self.function
+        found = function({name: column[taken] for name, column in values.items()}, commands[taken])
+        parts = found if isinstance(found, Mapping) else {"position": found}
+        arrays = {name: np.asarray(part) for name, part in parts.items()}
+        return [{name: part[k] for name, part in arrays.items()} for k in range(len(rows))]
 
     @property
     def engine(self) -> str:
@@ -307,7 +326,8 @@ class BlackBoxSimulator(ExtendedSimulator):
             InputError: the function fails on the first rows of them, at the nominal parameters.
         """
         found = commands_on_grid(time, value, initial, observation_time, time_step=self.time_step)
-        self._probe(np.concatenate([np.asarray(found.initial)[None], found.step])[:PROBED_ROWS])
+        rows = None if self.box.one_shape else PROBED_ROWS
+        self._probe(np.concatenate([np.asarray(found.initial)[None], found.step])[:rows])
         return found
 
     def _probe(self, command: Float[np.ndarray, "row channel"]) -> None:
@@ -315,9 +335,13 @@ class BlackBoxSimulator(ExtendedSimulator):
         values = {spec.name: spec.nominal for spec in self.box.specs}
         remedy = "return positions (row, marker, 3) [m]; see BlackBox"
         try:
-            if self.box.batched or not callable(self.box.function):
-                columns = {name: np.array([value]) for name, value in values.items()}
+            columns = {name: np.array([value]) for name, value in values.items()}
+            if not callable(self.box.function):
                 found = self.box.simulate(columns, command[None])[0]
+            elif self.box.batched:
+                # On the device of callbacks: what JAX compiles now serves them, too.
+                with jax.default_device(jax.local_devices(backend="cpu")[0]):
+                    found = self.box.answers(columns, command[None], np.zeros(1, int))[0]
             else:
                 found = self.box.function(values, command)
         except Exception as error:
@@ -400,7 +424,7 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     def _rolled(self, inputs: tuple[Batch, Float[np.ndarray, "n row channel"]], steps: int) -> Moved:
         """Rollouts of a batch; those that failed are zero."""
-        values, command = inputs[0], inputs[1][:, : steps + 1]
+        values, command = inputs[0], inputs[1] if self.box.one_shape else inputs[1][:, : steps + 1]
         count, rows = command.shape[:2]
         position = np.zeros((count, rows, len(self.marker_names), 3))
         tension, failed = np.zeros((count, rows, len(self.cable_names))), np.zeros(count, dtype=bool)

@@ -92,6 +92,43 @@ def test_a_prefix_is_that_of_the_whole_and_a_failure_is_counted(simulator, sent)
     assert int(simulator.rollout({"gain": jnp.asarray(2.95)}, sent).status) == Result.DIVERGED
 
 
+def test_what_jax_compiles_is_compiled_once_for_all_batches_of_whole_recordings(sent):
+    sizes = []
+
+    def one(parameters, command):
+        share = 1.0 - jnp.exp(-STEP / parameters["time_constant"])
+
+        def step(place, level):
+            place = place + share * (parameters["gain"] * level - place)
+            return place, place
+
+        start = parameters["gain"] * command[0, 0]
+        place = jnp.append(start, jax.lax.scan(step, start, command[1:, 0])[1])
+        return jnp.stack([place, jnp.zeros_like(place), jnp.full_like(place, 0.1)], axis=-1)[:, None]
+
+    compiled = jax.jit(jax.vmap(one))
+
+    def counted(parameters, command):
+        sizes.append(command.shape)
+        return compiled(parameters, command)
+
+    box = BlackBox(counted, parameters=PARAMETERS, batched=True, lanes=3, one_shape=True, **NAMES)
+    simulator = BlackBoxSimulator(box)
+    level = np.concatenate([sent.initial, sent.step[:, 0]])
+    time = STEP * np.arange(41)
+    simulator.commands(time[:-1], level[1:, None], level[:1], time)
+    gains = jnp.linspace(1.0, 2.0, 5)
+    seen = jax.jit(jax.vmap(lambda gain: simulator.rollout(VALUES | {"gain": gain}, sent)))(gains)
+    for gain, place in zip(gains, seen.position, strict=True):
+        np.testing.assert_allclose(place[1:, 0, 0], filtered(gain, 0.25, level), atol=1e-12)
+    part = simulator.rollout(VALUES, sent, jnp.asarray(15))
+    np.testing.assert_allclose(part.position[1:16, 0, 0], filtered(1.4, 0.25, level)[:15], atol=1e-12)
+    assert sizes == 4 * [(3, 41, 1)]  # the first look at the function, two for five sets, one for the part
+    assert compiled._cache_size() == 1
+    with pytest.raises(InputError, match="of one shape, of one parameter set"):
+        BlackBox(lag, parameters=PARAMETERS, one_shape=True, **NAMES)
+
+
 def test_derivatives_are_those_of_the_formula():
     simulator = BlackBoxSimulator(BlackBox(lag, parameters=PARAMETERS, **NAMES))
     level = np.full(30, 0.02)
@@ -144,6 +181,15 @@ def test_a_port_is_spoken_of_as_a_cable_only_where_commands_are_metres_of_cable(
 def test_a_function_that_is_none_is_told_so_before_anything_long(function, said):
     simulator = BlackBoxSimulator(BlackBox(function, parameters=PARAMETERS, **NAMES))
     with pytest.raises(InputError, match=said):
+        simulator.commands(np.array([0.0]), np.zeros((1, 1)), np.zeros(1), STEP * np.arange(5))
+
+
+def test_a_function_of_many_sets_that_raises_is_told_why():
+    def broken(parameters, command):
+        return parameters["stiffness"]
+
+    simulator = BlackBoxSimulator(BlackBox(broken, parameters=PARAMETERS, batched=True, **NAMES))
+    with pytest.raises(InputError, match="raises KeyError: 'stiffness'"):
         simulator.commands(np.array([0.0]), np.zeros((1, 1)), np.zeros(1), STEP * np.arange(5))
 
 
