@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
-ALONE = {"pyelastica_rod"}  # needs a package of its own; tests/simulators/test_adapters.py runs it
+ALONE = {"pyelastica_rod", "soromox_arm"}  # need packages of their own; tests/simulators/test_adapters.py runs them
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 MOST_LINES = 60
 

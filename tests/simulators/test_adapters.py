@@ -1,4 +1,4 @@
-"""Simulators of others by name: the example of the document, a process, and PyElastica's rod."""
+"""Simulators of others by name: the example of the document, a process, PyElastica's rod and soromox's arm."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp
+from scipy.integrate import cumulative_trapezoid, solve_bvp, trapezoid
+from scipy.optimize import minimize
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.model.experiment_file import read_tables, self_contained
@@ -80,3 +81,38 @@ def test_a_rod_of_pyelastica_hangs_as_an_elastica_does():
     s = np.linspace(0.0, length, 30)
     exact = solve_bvp(slopes, ends, s, np.zeros((3, 30))).sol(length)[2]
     assert place[-1, 0, 0] == pytest.approx(exact, rel=0.03)
+
+
+def bent_tip(values, tension, pieces):
+    """[m] How far the tip of `soromox_arm.py` is beside the vertical: the least energy of pieces of constant bend."""
+    length, plate, radius = 0.3, 0.01, 0.01
+    stiffness = values["young_modulus"] * np.pi * radius**4 / 4.0
+    weight = 9.81 * values["density"] * np.pi * radius**2
+    s = np.linspace(0.0, length, 3001)
+
+    def angles(turns):
+        return np.interp(s, np.linspace(0.0, length, pieces + 1), np.append(0.0, np.cumsum(turns)))
+
+    def energy(turns):
+        angle = angles(turns)
+        depth = cumulative_trapezoid(np.cos(angle), s, initial=0.0)
+        end = depth[-1] + 0.5 * plate * np.cos(angle[-1])
+        fallen = weight * trapezoid(depth, s) + 9.81 * values["tip_mass"] * end
+        pulled = tension * values["offset_a"] * angle[-1]  # a tendon beside the axis shortens by offset times turn
+        return 0.5 * stiffness * np.sum(turns**2) * pieces / length - fallen - pulled
+
+    found = angles(minimize(energy, np.zeros(pieces), options={"gtol": 1e-9}).x)
+    return trapezoid(np.sin(found), s) + plate * np.sin(found[-1])
+
+
+@pytest.mark.slow
+def test_an_arm_of_soromox_comes_to_rest_where_its_energy_is_least():
+    pytest.importorskip("soromox", reason="soromox is not installed: pip install soromox")
+    box = adapted("soromox_arm.py:arm", REPOSITORY / "examples", {})
+    values = {name: spec.nominal for name, spec in box.parameters.items()} | {"damping": 2.5e4, "tip_mass": 0.01}
+    command = np.concatenate([np.zeros((1, 1, 3)), np.tile([1.0, 0.0, 0.0], (1, 1000, 1))], axis=1)
+    place = np.asarray(box.function({name: np.array([value]) for name, value in values.items()}, command))[0]
+    assert place.dtype == float
+    np.testing.assert_allclose(place[0, :, 2], [-0.1, -0.2, -0.31], atol=1e-9)  # it hangs
+    assert place[-1, 2, 1] == pytest.approx(bent_tip(values, 1.0, pieces=2), rel=1e-4)
+    np.testing.assert_allclose(place[-1, :, 0], 0.0, atol=1e-6)  # in the plane of the tendon
