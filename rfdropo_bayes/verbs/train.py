@@ -135,7 +135,7 @@ def _cautions(
     source = posterior
     if source is None and table.source is not None and table.randomisation in ("posterior", "phi"):
         source = source_of(table.source, folder)
-    found = None if source is None else posterior_caution(source)
+    found = None if source is None else posterior_caution(source, table.width)
     if found is None:
         return []
     say_step(f"warning: {found.sentence}", show=show)

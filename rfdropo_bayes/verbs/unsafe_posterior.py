@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, PARTLY, UNEXPLAINED
+from rfdropo_bayes.audit.verdict import NEGLIGIBLE, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import read_tables
+from rfdropo_bayes.model.run_folder import RUN
 from rfdropo_bayes.report.run_files import CONFIG, SUMMARY
 from rfdropo_bayes.results.audited import AUDIT, EXTENDED
 from rfdropo_bayes.results.calibrated import Calibration
@@ -18,14 +19,15 @@ from rfdropo_bayes.results.calibrated import Calibration
 NAMED = 3  # reasons that the warning gives, the worst
 
 
-def posterior_caution(source: Calibration | Path) -> Caution | None:
+def posterior_caution(source: Calibration | Path, width: float = 1.0) -> Caution | None:
     """A caution where a calibration is not safe to randomise over, or an audit of its recordings says that its model
     lacks something; None where nothing speaks against it.
 
-    Audits are looked for in the calibration's folder and in those beside it, by the hash of their recordings.
+    Audits are looked for in the calibration's folder and in those beside it: those that share a recording with it.
 
     Args:
         source: the calibration, its folder or its posterior.nc.
+        width: times as wide as the posterior that the training draws.
     """
     if isinstance(source, Calibration):
         folder, content = source.folder, source.content
@@ -34,37 +36,51 @@ def posterior_caution(source: Calibration | Path) -> Caution | None:
         content = _read(folder / SUMMARY)
     own = content.get("randomisation", {})
     reasons = list(own["reasons"][:NAMED]) if own.get("verdict") == "unsafe" else []
-    reasons += [] if folder is None else _audited(folder, content)
+    reasons += [] if folder is None else _audited(folder.resolve(), content)
     if not reasons:
         return None
     where = "the posterior" if folder is None else str(folder)
+    wider = ", or draw wider with [training] width" if width <= 1.0 else f". Width {width:g} may make up for some of it"
     return Caution(
         Code.UNSAFE_POSTERIOR,
         f"{where} is not safe to train on: {'; '.join(reasons)}. A narrow posterior of a wrong model transfers worse "
-        "than none: audit the model and calibrate extended.toml, or draw wider with [training] width",
+        f"than none: audit the model and calibrate extended.toml{wider}",
     )
 
 
 def _audited(folder: Path, summary: Mapping[str, Any]) -> list[str]:
-    """What audits of the same recordings found that the calibrated model lacks."""
-    found = []
+    """What audits of its recordings found that the calibrated model lacks; nothing where one passed this model."""
+    own, found = _terms(folder / CONFIG), []
     for path in sorted(folder.parent.glob(f"*/{AUDIT}")):
-        audit, model = _read(path), _model(folder)
-        if "data_sha256" not in summary or audit.get("data_sha256") != summary["data_sha256"]:
+        audit = _read(path)
+        verdict, place = audit.get("verdict"), path.parent
+        if not _same_recordings(folder, summary, place, audit):
             continue
-        if audit["verdict"] in (PARTLY, UNEXPLAINED):
-            found.append(f"the audit in {path.parent} leaves a discrepancy unexplained")
-        elif audit["verdict"] in (EXPLAINED, EQUIVALENT, DESCRIBED) and model and model == _model(path.parent):
-            found.append(f"the audit of this model names what it lacks, see {path.with_name(EXTENDED)}")
+        if verdict in (NO_DISCREPANCY, NEGLIGIBLE) and own is not None and own == _terms(place / CONFIG):
+            return []
+        extended = _terms(place / EXTENDED)
+        if own is not None and extended is not None and extended - own:
+            found.append(f"the audit in {place} names what its model lacks, see {path.with_name(EXTENDED)}")
+        elif verdict in (PARTLY, UNEXPLAINED):
+            found.append(f"the audit in {place} leaves a discrepancy unexplained")
     return found
 
 
-def _model(folder: Path) -> Any:
-    """What a run's [model] says; None where its folder does not tell."""
+def _same_recordings(folder: Path, summary: Mapping[str, Any], place: Path, audit: Mapping[str, Any]) -> bool:
+    """Whether two runs share a recording, by their run.json; else whether they have the same ones."""
+    first, second = (set(_read(each / RUN).get("settings", {}).get("data", {}).values()) for each in (folder, place))
+    if first and second:
+        return bool(first & second)
+    return "data_sha256" in summary and audit.get("data_sha256") == summary["data_sha256"]
+
+
+def _terms(experiment: Path) -> set[str] | None:
+    """Mechanisms and laws of a run's model; None where its file does not tell."""
     try:
-        return read_tables(folder / CONFIG).get("model")
+        model = read_tables(experiment).get("model", {})
     except InputError:
         return None
+    return {json.dumps(term, sort_keys=True) for key in ("mechanisms", "laws") for term in model.get(key, [])}
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rfdropo_bayes.verbs.unsafe_posterior import posterior_caution
 UNSAFE = {"verdict": "unsafe", "reasons": ["the best climb stopped", "second", "third", "fourth"]}
 CAREFUL = {"verdict": "with care", "reasons": ["no recording was kept back to test it on"]}
 MODEL = '[model]\nnoise = "white"\n'
+TILTED = '[model]\nmechanisms = ["base_tilt"]\n'
 
 
 def written(folder: Path, file: str, content: Any, config: str = MODEL) -> Path:
@@ -36,6 +37,8 @@ def test_a_calibration_that_its_own_record_calls_unsafe_is_warned_of_and_no_othe
     assert found.code is Code.UNSAFE_POSTERIOR
     assert "the best climb stopped; second; third. " in found.sentence
     assert posterior_caution(folder / "posterior.nc") == found
+    assert found.sentence.endswith("or draw wider with [training] width")
+    assert str(posterior_caution(folder, 3.0)).count("Width 3 may make up") == 1
     memory = posterior_caution(Calibration(None, {"randomisation": UNSAFE}, ""))  # type: ignore[arg-type]
     assert memory is not None
     assert memory.sentence.startswith("the posterior is not safe to train on")
@@ -48,27 +51,44 @@ def test_a_calibration_without_a_grave_reason_is_not_warned_of(tmp_path) -> None
 
 
 @pytest.mark.parametrize(
-    ("verdict", "config", "told"),
+    ("verdict", "extended", "told"),
     [
         ("unexplained", MODEL, "leaves a discrepancy unexplained"),
-        ("partly_explained", '[model]\nnoise = "lasting"\n', "leaves a discrepancy unexplained"),
-        ("explained", MODEL, "names what it lacks, see"),
-        ("described", MODEL, "names what it lacks, see"),
-        ("explained", '[model]\nnoise = "lasting"\n', None),  # what is calibrated is another model: the extended one
+        ("explained", TILTED, "names what its model lacks, see"),
+        ("partly_explained", TILTED, "names what its model lacks, see"),
+        ("described", '[model]\n[[model.laws]]\nport = "cable left"\n', "names what its model lacks, see"),
         ("no_discrepancy", MODEL, None),
         ("no_verdict", MODEL, None),
     ],
 )
-def test_an_audit_of_the_same_recordings_is_heard(tmp_path, verdict, config, told) -> None:
+def test_an_audit_of_the_same_recordings_is_heard(tmp_path, verdict, extended, told) -> None:
     folder = fit(tmp_path)
     audit = {"verdict": verdict, "data_sha256": "a1"}
-    written(tmp_path / "audited", "audit.json", audit, config)
+    (written(tmp_path / "audited", "audit.json", audit, "[model]\n") / "extended.toml").write_text(extended)
     written(tmp_path / "of_others", "audit.json", {"verdict": "unexplained", "data_sha256": "b2"})
     found = posterior_caution(folder)
     assert (found is None) == (told is None)
     if found is not None:
         assert found.sentence.count(told) == 1
         assert "of_others" not in found.sentence
+
+
+def test_a_model_that_has_what_an_audit_found_is_judged_by_what_is_left(tmp_path) -> None:
+    """A part is unexplained, until an audit of this very model says that nothing is left; recordings may overlap."""
+    folder = fit(tmp_path)
+    (folder / "config.toml").write_text(TILTED)
+    for name, verdict, config in (("a1", "partly_explained", MODEL), ("a2", "negligible", TILTED)):
+        place = written(tmp_path / name, "audit.json", {"verdict": verdict, "data_sha256": name}, config)
+        (place / "extended.toml").write_text(TILTED)
+        (place / "run.json").write_text(json.dumps({"settings": {"data": {"one": "aa", name: name}}}))
+        if name == "a1":
+            assert posterior_caution(folder) is not None  # by the hash of all recordings
+            (folder / "run.json").write_text(json.dumps({"settings": {"data": {"one": "aa"}}}))
+            found = posterior_caution(folder)
+            assert found is not None
+            assert "a1 leaves a discrepancy unexplained" in found.sentence
+            assert "names what its model lacks" not in found.sentence
+    assert posterior_caution(folder) is None
 
 
 def test_a_damaged_audit_does_not_stop_a_training(tmp_path) -> None:
