@@ -76,27 +76,31 @@ def test_what_a_task_needs_is_said(tmp_path, text, changes, said):
 
 
 def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(tmp_path):
-    """An episode's largest pull is that of a whole rollout at its time steps."""
+    """An episode's largest pull is that of a whole rollout, the force that a new command exerts at once included."""
     model = model_of(tmp_path, cables={"b": "b"})
-    venv = rb.make_vec(model=model, n=2, tension_limit=0.026, **REACH)
-    venv.seed(0)
-    venv.reset()
-    begun = venv.reset_infos[0]["parameters"]
-    up = np.array([[0.0, 1.0], [0.0, 0.0]], dtype=np.float32)
-    told, commands = [], []
-    for _ in range(5):
-        _, _, done, infos = venv.step(up)
-        told.append(infos[0]["tension"])
-        commands.append([0.0, 0.1 * len(told)])
-        assert (done == [infos[0]["stopped"], False]).all()
-        if done[0]:
-            break
-    assert told[-1] > 0.026 >= max(told[:-1])
+    told, commands = {}, []
+    for limit in (None, 0.2):
+        venv = rb.make_vec(model=model, n=2, tension_limit=limit, **REACH)
+        venv.seed(0)
+        venv.reset()
+        begun, told[limit] = venv.reset_infos[0]["parameters"], []
+        for up in (1.0, -1.0, 1.0, -1.0):
+            _, _, done, infos = venv.step(np.array([[0.0, up], [0.0, 0.0]], dtype=np.float32))
+            told[limit].append(infos[0]["tension"])
+            assert (done == [infos[0]["stopped"], False]).all()
+            if done[0]:
+                break
+            if limit is None:
+                commands.append(venv.episodes.commands[0].copy())
+    assert told[0.2] == told[None][:2]
+    assert told[None][1] > 0.2 > told[None][0]
     simulator, steps = venv.episodes.simulator, round(0.05 / 0.005)
-    every = 0.005 * np.arange(steps * len(told) + 1)
-    given = simulator.commands(0.05 * np.arange(len(told)), np.array(commands), np.zeros(2), every)
-    whole = np.asarray(simulator.rollout(begun, given).tension)[1:].reshape(len(told), -1)
-    np.testing.assert_allclose(told, whole.max(axis=1), atol=1e-9)
+    whole = []
+    for count in range(1, 5):
+        every = 0.005 * np.arange(steps * count + 1)
+        given = simulator.commands(0.05 * np.arange(count), np.array(commands[:count]), np.zeros(2), every)
+        whole.append(np.asarray(simulator.rollout(begun, given).tension)[-steps - 1 :].max())
+    np.testing.assert_allclose(told[None], whole, atol=1e-9)
 
 
 @pytest.mark.slow
