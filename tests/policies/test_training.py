@@ -366,6 +366,16 @@ def episodes_with(distances) -> list[Episode]:
     return [Episode(k, np.array([d]), 0.0, False, np.zeros(1)) for k, d in enumerate(distances)]
 
 
+def test_quantiles_are_finite_up_to_the_first_episode_without_an_end() -> None:
+    """Of 41 episodes, the quantile of 95 % is the 39th, and has no weight on the 40th."""
+    ends = [*np.full(38, 0.01), 0.02, np.inf, np.inf]
+    episodes = [Episode(0, np.array([min(end, 1.0)]), 0.0, np.isinf(end), np.zeros(1)) for end in ends]
+    row = run._summary(episodes)
+    assert [row[f"distance_{name}"] for name in ("q05", "median", "q95")] == [0.01, 0.01, 0.02]
+    assert run._summary([*episodes, episodes[-1]])["distance_q95"] == np.inf
+    assert run._summary(episodes[-2:])["distance_q05"] == np.inf
+
+
 def test_success_has_wilsons_interval() -> None:
     share, low, high = success(episodes_with([0.01] * 8 + [0.03] * 2), 0.02)
     # Wilson (1927) for 8 of 10 at 95 %: (p + z^2/2n -+ z sqrt(p q / n + z^2/4n^2)) / (1 + z^2/n)
