@@ -22,15 +22,17 @@ INTERVALS = 4
 
 @styled
 def curve_figure(curve: Sequence[Mapping[str, float]]) -> Figure:
-    """Reward and final distance of the evaluations during a training."""
+    """Reward and final distance of the evaluations during a training; a distance may be None, or infinite."""
     figure = Figure(figsize=(WIDTH, 2.6))
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     steps = [row["steps"] for row in curve]
     left.plot(steps, [row["reward"] for row in curve], marker=".")
     left.set(xlabel="environment steps", ylabel="reward of an episode")
-    low, middle, high = ([MILLIMETRES * row[f"distance_{name}"] for row in curve] for name in ("q05", "median", "q95"))
-    right.fill_between(steps, low, np.nan_to_num(high, posinf=np.nan), alpha=0.25, label="5 to 95 %")
+    names = [f"distance_{name}" for name in ("q05", "median", "q95")]
+    ends = MILLIMETRES * np.array([[row[name] for row in curve] for name in names], dtype=float)  # None becomes NaN
+    low, middle, high = np.where(np.isfinite(ends), ends, np.nan)
+    right.fill_between(steps, low, high, alpha=0.25, label="5 to 95 %")
     right.plot(steps, middle, marker=".", label="median")
     right.set(xlabel="environment steps", ylabel="final distance to the goal [mm]", yscale="log")
     right.legend()

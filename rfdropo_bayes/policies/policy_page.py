@@ -130,7 +130,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
 def next_steps(summary: Mapping[str, Any], played: Played) -> list[str]:
     """What to try next, each a sentence with its ground."""
     found = []
-    medians = [row["distance_median"] for row in summary["curve"]]
+    medians = [np.inf if row["distance_median"] is None else row["distance_median"] for row in summary["curve"]]
     before = medians[(2 * len(medians)) // 3 - 1] if len(medians) > 2 else np.inf
     if medians[-1] < RISING * before < np.inf:
         ratio = f"{1e3 * before:.1f} to {1e3 * medians[-1]:.1f} mm"

@@ -124,7 +124,7 @@ def train(
             say_step("drawing report.html", show=show)
             text = (out / CONFIG).read_text(encoding="utf-8")
             write_text(out / PAGE, render_policy(summary, played, str(tables.get("title", task.name)), text))
-        write_json(out / SUMMARY, summary)
+        write_json(out / SUMMARY, summary, finite=True)
     return summary
 
 
@@ -161,8 +161,8 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
         "seconds": found.seconds,
         "diverged_episodes": found.diverged,
         "redrawn_parameters": found.redrawn,
-        "evaluation": {key: value for key, value in found.best.items() if key != "seconds"},
-        "curve": found.curve,
+        "evaluation": _plain({key: value for key, value in found.best.items() if key != "seconds"}),
+        "curve": [_plain(row) for row in found.curve],
         "latency": latency(policy),
         "layout_sha256": policy.layout.sha256,
         "settings": table.model_dump(mode="json"),
@@ -173,11 +173,16 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
     }
 
 
+def _plain(row: Mapping[str, float]) -> dict[str, float | None]:
+    """A row of the curve as JSON has it: no number where episodes have no end."""
+    return {name: value if np.isfinite(value) else None for name, value in row.items()}
+
+
 def learnt(summary: Mapping[str, Any]) -> str:
     """How the policy that was kept did in its evaluation, in a sentence or two."""
     best = summary["evaluation"]
     half, most = (best[f"distance_{name}"] for name in ("median", "q95"))
-    ends = [f"{1e3 * end:.2f} mm of the goal" if np.isfinite(end) else "no distance: they fail" for end in (half, most)]
+    ends = [f"{1e3 * end:.2f} mm of the goal" if end is not None else "no distance: they fail" for end in (half, most)]
     words = f"half of the episodes end within {ends[0]}, 95 % within {ends[1]}."
     pull = {name: best[f"tension_{name}"] for name in ("median", "largest", "stopped") if f"tension_{name}" in best}
     return f"{words} {tension_sentence(pull, summary['settings']['tension_limit'])}" if pull else words

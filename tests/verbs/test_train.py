@@ -15,13 +15,17 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
+from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.randomisation import fitting
+from rfdropo_bayes.policies.training import Trained
+from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import PEAK_TENSION
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
+from rfdropo_bayes.verbs.train import _summary, learnt
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -119,6 +123,21 @@ def test_what_a_training_cannot_take_is_said(words, told) -> None:
     result = CliRunner().invoke(app, ["train", *map(str, words)])
     assert result.exit_code != 0
     assert told in " ".join((result.output + str(result.exception)).split())
+
+
+def summary_of(**best: float) -> dict:
+    """That of a training whose only evaluation this was."""
+    row = {"steps": 100, "seconds": 1.0, "reward": 1.0, "distance_q05": 0.001, "distance_median": 0.01, **best}
+    found = Trained(None, None, [row], 0, 1.0)
+    return _summary(TrainingTable(tension_limit=5.0), found, ExportedPolicy(COMMITTED / "policy.onnx"), {})
+
+
+def test_a_summary_is_json_where_episodes_have_no_end() -> None:
+    summary = summary_of(distance_q95=np.inf)
+    assert json.loads(json.dumps(summary, allow_nan=False))["evaluation"]["distance_q95"] is None
+    assert summary["curve"][0]["distance_q95"] is None
+    curve_figure(summary["curve"]).draw_without_rendering()
+    assert learnt(summary).startswith("half of the episodes end within 10.00 mm of the goal")
 
 
 @pytest.mark.slow
