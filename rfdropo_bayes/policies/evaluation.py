@@ -161,6 +161,11 @@ def tension_sentence(pull: Mapping[str, float], limit: float | None) -> str:
     return f"{words}." if limit is None else f"{words}; the limit of {limit:g} N stopped {pull['stopped']:.0f} of them."
 
 
+def without_end(stopped: float, failed: float) -> str:
+    """How many episodes reached no end, and why, in words."""
+    return f"{stopped:.0f} stopped by the limit on tension, {failed:.0f} failed"
+
+
 def interquartile_mean(
     groups: Sequence[Sequence[Episode]], seed: int, level: float = 0.95, resamples: int = 2000
 ) -> tuple[float, float, float]:

@@ -22,6 +22,7 @@ from rfdropo_bayes.policies.evaluation import (
     play,
     success,
     tension_sentence,
+    without_end,
 )
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
 from rfdropo_bayes.policies.policy_figures import curve_figure, draws_figure, save_animation, success_figure
@@ -70,6 +71,16 @@ class Played(NamedTuple):
         """From the goal at the end of every episode [m]; infinite where a simulation or the drives failed."""
         return np.array([episode.distance for episode in self.episodes])
 
+    @property
+    def stopped(self) -> int:
+        """Episodes that the limit on tension stopped."""
+        return sum(episode.stopped for episode in self.episodes)
+
+    @property
+    def failed(self) -> int:
+        """Episodes whose simulation failed."""
+        return sum(episode.diverged for episode in self.episodes)
+
 
 def play_policy(policy: ExportedPolicy, batch: Episodes, seed: int) -> Played:
     """Play a policy under the randomisation of its training, in episodes that the training has not seen."""
@@ -108,7 +119,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
         pictures["draws"] = embed(draws_figure(played.varied, played.distances), words)
     worst = sorted(played.episodes, key=lambda each: -each.distance)[:WORST]
     encoded = {words: base64.b64encode(gif).decode("ascii") for words, gif in played.films.items()}
-    pull = peak_tension(played.episodes)
+    pull, middle = peak_tension(played.episodes), float(np.median(played.distances))
     return render(
         "policy.html.j2",
         summary=summary,
@@ -119,7 +130,8 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
         parameters=list(played.varied),
         worst=[(each, played.cases[each.case]) for each in worst],
         episodes=len(played.episodes),
-        median=1e3 * float(np.median(played.distances)),
+        median=1e3 * middle if np.isfinite(middle) else None,
+        unended=without_end(played.stopped, played.failed),
         films=encoded,
         tension=None if pull is None else tension_sentence(pull, summary["settings"]["tension_limit"]),
         advice=next_steps(summary, played),
@@ -135,9 +147,11 @@ def next_steps(summary: Mapping[str, Any], played: Played) -> list[str]:
     if medians[-1] < RISING * before < np.inf:
         ratio = f"{1e3 * before:.1f} to {1e3 * medians[-1]:.1f} mm"
         found.append(f"The median distance fell from {ratio} in the last third of the training: raise training.steps.")
-    failed = sum(each.diverged for each in played.episodes)
-    if failed:
-        words = f"{failed} of {len(played.episodes)} simulations failed"
+    if played.stopped:
+        words = f"{played.stopped} of {len(played.episodes)} episodes were stopped by the limit on tension"
+        found.append(f"{words}: train longer, or raise training.tension_limit where the motors bear more.")
+    if played.failed:
+        words = f"{played.failed} of {len(played.episodes)} simulations failed"
         found.append(f"{words}: see for which parameters below, and shorten simulator.time_step or narrow their range.")
     finite = np.isfinite(played.distances)
     for name, values in played.varied.items():

@@ -47,8 +47,9 @@ class Trained:
     Attributes:
         model: of Stable-Baselines3.
         normalisation: the ``VecNormalize`` around its environments, or None.
-        curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m];
-            where tensions are told, median and largest over episodes of their largest [N], and episodes stopped by it.
+        curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m],
+            infinite where episodes have no end; episodes whose simulation failed; where tensions are told, median and
+            largest over episodes of their largest [N], and episodes that the limit stopped.
         diverged: training episodes that ended because the simulation failed.
         seconds: of all legs.
         redrawn: parameter sets for which no initial state was found, and others drawn.
@@ -294,6 +295,7 @@ def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
         "distance_q05": float(low),
         "distance_median": float(middle),
         "distance_q95": float(high),
+        "failed": sum(episode.diverged for episode in episodes),
         **({} if pull is None else {f"tension_{name}": value for name, value in pull.items()}),
     }
 

@@ -17,7 +17,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import command_of, run_folder
 from rfdropo_bayes.policies.critic import varied_parameters
 from rfdropo_bayes.policies.episodes import Episodes
-from rfdropo_bayes.policies.evaluation import tension_sentence
+from rfdropo_bayes.policies.evaluation import tension_sentence, without_end
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.policies.parity import difference, observations
 from rfdropo_bayes.policies.policy_figures import curve_figure
@@ -182,8 +182,14 @@ def learnt(summary: Mapping[str, Any]) -> str:
     """How the policy that was kept did in its evaluation, in a sentence or two."""
     best = summary["evaluation"]
     half, most = (best[f"distance_{name}"] for name in ("median", "q95"))
-    ends = [f"{1e3 * end:.2f} mm of the goal" if end is not None else "no distance: they fail" for end in (half, most)]
-    words = f"half of the episodes end within {ends[0]}, 95 % within {ends[1]}."
+    counts = without_end(best.get("tension_stopped", 0), best.get("failed", 0))
+    if half is None:
+        words = f"fewer than half of the episodes reach an end: {counts}."
+    elif most is None:
+        ended = f"half of the episodes end within {1e3 * half:.2f} mm of the goal"
+        words = f"{ended}; fewer than 95 % reach an end: {counts}."
+    else:
+        words = f"half of the episodes end within {1e3 * half:.2f} mm of the goal, 95 % within {1e3 * most:.2f} mm."
     pull = {name: best[f"tension_{name}"] for name in ("median", "largest", "stopped") if f"tension_{name}" in best}
     return f"{words} {tension_sentence(pull, summary['settings']['tension_limit'])}" if pull else words
 

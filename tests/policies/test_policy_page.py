@@ -73,6 +73,18 @@ def test_failed_simulations_are_counted():
     assert told[0].startswith("3 of 100 simulations failed")
 
 
+def test_stopped_episodes_are_counted_and_leave_a_median_that_is_no_number():
+    seen = played(failed=1)
+    pulls = [replace(each, tension=100.0, stopped=each.case > 40) for each in seen.episodes]
+    seen = seen._replace(episodes=pulls)
+    told = next_steps({"curve": curve(0.01, 0.01)}, seen)
+    assert told[0].startswith("59 of 100 episodes were stopped by the limit on tension: train longer")
+    page = render_policy(SUMMARY, seen, "My arm", "")
+    assert "Fewer than half of 100 episodes reach an end (59 stopped by the limit on tension, 1 failed)," in page
+    assert "inf" not in page[page.index('id="result"') : page.index('id="success"')]
+    assert "Half of 100 episodes end within" in render_policy(SUMMARY, played(), "My arm", "")
+
+
 def test_the_page_says_how_often_the_policy_succeeds():
     page = render_policy(SUMMARY, played(failed=3), "My arm", "seed = 0")
     assert "97 %" in page

@@ -127,7 +127,7 @@ def test_what_a_training_cannot_take_is_said(words, told) -> None:
 
 def summary_of(**best: float) -> dict:
     """That of a training whose only evaluation this was."""
-    row = {"steps": 100, "seconds": 1.0, "reward": 1.0, "distance_q05": 0.001, "distance_median": 0.01, **best}
+    row = {"steps": 100, "seconds": 1.0, "reward": 1.0, "distance_q05": 0.001, "distance_median": 0.01} | best
     found = Trained(None, None, [row], 0, 1.0)
     return _summary(TrainingTable(tension_limit=5.0), found, ExportedPolicy(COMMITTED / "policy.onnx"), {})
 
@@ -137,7 +137,26 @@ def test_a_summary_is_json_where_episodes_have_no_end() -> None:
     assert json.loads(json.dumps(summary, allow_nan=False))["evaluation"]["distance_q95"] is None
     assert summary["curve"][0]["distance_q95"] is None
     curve_figure(summary["curve"]).draw_without_rendering()
-    assert learnt(summary).startswith("half of the episodes end within 10.00 mm of the goal")
+    assert summary["curve"][0]["distance_median"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [
+        ((0.01, 0.02), "half of the episodes end within 10.00 mm of the goal, 95 % within 20.00 mm."),
+        (
+            (0.01, np.inf),
+            "half of the episodes end within 10.00 mm of the goal; fewer than 95 % reach an end: 7 stopped by the "
+            "limit on tension, 1 failed.",
+        ),
+        ((np.inf, np.inf), "fewer than half of the episodes reach an end: 7 stopped by the limit on tension, 1 failed"),
+    ],
+)
+def test_what_was_learnt_does_not_take_a_few_stopped_episodes_for_most(ends, words) -> None:
+    pull = {"tension_median": 1.0, "tension_largest": 6.0, "tension_stopped": 7}
+    told = learnt(summary_of(distance_median=ends[0], distance_q95=ends[1], failed=1, **pull))
+    assert told.startswith(words)
+    assert told.endswith("the limit of 5 N stopped 7 of them.")
 
 
 @pytest.mark.slow
