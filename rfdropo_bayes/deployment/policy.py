@@ -20,7 +20,16 @@ from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.sensors import POSE
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, Robot
-from rfdropo_bayes.robots.policy_layout import EARLIER_COMMANDS, EARLIER_MOVED, PEAK_TENSION, Earlier, PolicyLayout
+from rfdropo_bayes.robots.policy_layout import (
+    EARLIER_COMMANDS,
+    EARLIER_MOVED,
+    EVALUATED_EPISODES,
+    PEAK_TENSION,
+    STOPPED_EPISODES,
+    TENSION_LIMIT,
+    Earlier,
+    PolicyLayout,
+)
 
 METADATA = "rfdropo_layout"
 """Key of the layout in the metadata of the ONNX file."""
@@ -44,6 +53,28 @@ class PolicyScene(NamedTuple):
     length: Float[np.ndarray, " channel"]
     tension: Float[np.ndarray, " channel"]
     object_pose: Float[np.ndarray, "7"]
+
+
+class Pull(NamedTuple):
+    """What is told of tensions in the evaluation that a policy was kept for.
+
+    Attributes:
+        peak: largest of a cable, with what episodes overshot the limit by [N]; NaN if not told.
+        limit: at which episodes were stopped [N]; infinite if there was none.
+        stopped: episodes that were.
+        episodes: all of them.
+    """
+
+    peak: float
+    limit: float
+    stopped: int
+    episodes: int
+
+    @classmethod
+    def told(cls, facts: Mapping[str, str]) -> Pull:
+        """By the metadata of a policy."""
+        peak, limit = float(facts.get(PEAK_TENSION, "nan")), float(facts.get(TENSION_LIMIT, "inf"))
+        return cls(peak, limit, int(facts.get(STOPPED_EPISODES, "0")), int(facts.get(EVALUATED_EPISODES, "0")))
 
 
 class Act(NamedTuple):
@@ -89,7 +120,7 @@ class OnnxPolicy:
         markers: those that it sees, where it does not see all of the robot's.
 
     Attributes:
-        peak_tension: largest tension of a cable in the evaluation that its training ended with [N]; NaN if not told.
+        pull: its tensions in the evaluation that it was kept for.
 
     Raises:
         InputError: if the file cannot be read, or its layout, hash or shapes do not fit.
@@ -114,7 +145,7 @@ class OnnxPolicy:
         self._markers = _markers_seen(robot, markers)
         self._goal = np.array([goal.get(axis, np.nan) for axis in "xyz"])
         _check_layout(self.layout, robot, 3 * len(self._markers), where)
-        self.peak_tension = float(self._session.get_modelmeta().custom_metadata_map.get(PEAK_TENSION, "nan"))
+        self.pull = Pull.told(self._session.get_modelmeta().custom_metadata_map)
         names = [part.name for part in self.layout.observation]
         if "goal" in names and not np.all(np.isfinite(self._goal)):
             raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
@@ -197,16 +228,17 @@ class OnnxPolicy:
             raise InputError(f"gives {np.size(given)} values for {len(self._reach)} channels", where=where)
 
 
-def pulls_too_hard(peak: float, motors: Sequence[Motor]) -> str | None:
-    """A warning where a policy pulled more in its training's evaluation [N] than a motor bears; None where not."""
+def pulls_too_hard(pull: Pull, motors: Sequence[Motor]) -> str | None:
+    """A warning where a policy pulled more in its training's evaluation than a motor bears; None where not."""
     weakest = min(motors, key=lambda motor: motor.tension_limit_n[1])
     limit = weakest.tension_limit_n[1]
-    if not peak > limit:
+    if not pull.peak > limit:
         return None
-    return (
-        f"in simulation the policy pulled up to {peak:.3g} N, and {weakest.channel} stops at {limit:g} N: train with "
-        f"[training] tension_limit = {limit:g}"
-    )
+    words = f"in simulation the policy pulled up to {pull.peak:.3g} N, and {weakest.channel} stops at {limit:g} N"
+    if pull.limit <= limit:
+        counts = f"{pull.stopped} of {pull.episodes} evaluation episodes"
+        return f"{words}: {counts} were stopped by the training's limit of {pull.limit:g} N: train longer"
+    return f"{words}: train with [training] tension_limit = {limit:g}"
 
 
 def _bound(session: Any, size: int, channels: int) -> Callable[[np.ndarray], Float[np.ndarray, " channel"]]:

@@ -174,7 +174,7 @@ class _Session:
                 Path(settings.policy.file), self.robot, settings.goal, settings.policy.sha256, settings.policy.markers
             )
             self._facts["policy_sha256"] = policy.sha256
-            warning = pulls_too_hard(policy.peak_tension, self.robot.motors)
+            warning = pulls_too_hard(policy.pull, self.robot.motors)
             self._facts |= {} if warning is None else {"warning": warning}
             if policy.sees_object:
                 self._facts[GOAL_AXES] = np.delete(np.arange(3), np.argmax(np.abs(self.robot.gravity))).tolist()

@@ -22,6 +22,8 @@ EARLIER_COMMANDS, EARLIER_MOVED = "earlier commands", "earlier moved"
 """Parts of an observation that show more than the last action; see `Earlier`."""
 PEAK_TENSION = "peak_tension_n"
 """Metadata of an exported policy: the largest tension of a cable [N] in the evaluation that it was kept for."""
+TENSION_LIMIT, STOPPED_EPISODES, EVALUATED_EPISODES = "tension_limit_n", "stopped_episodes", "evaluated_episodes"
+"""Metadata beside it: the limit on tension [N] in that evaluation, if any; episodes that it stopped, and all."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,13 @@ from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
-from rfdropo_bayes.robots.policy_layout import PEAK_TENSION, PolicyLayout
+from rfdropo_bayes.robots.policy_layout import (
+    EVALUATED_EPISODES,
+    PEAK_TENSION,
+    STOPPED_EPISODES,
+    TENSION_LIMIT,
+    PolicyLayout,
+)
 from rfdropo_bayes.signatures import with_keys_of
 from rfdropo_bayes.verbs.make_vec import (
     episode_settings,
@@ -110,7 +116,7 @@ def train(
             "seed": str(seed),
         }
         if "tension_largest" in found.best:
-            facts[PEAK_TENSION] = f"{found.best['tension_largest']:g}"
+            facts |= _tension_facts(found.best, table)
         policy = ExportedPolicy(export_policy(found.model, found.normalisation, layout, out / POLICY, facts))
         _check_parity(policy, found)
         sees = varied_parameters(randomisation).names if table.critic == "parameters" else ()
@@ -140,6 +146,13 @@ def _cautions(
         return []
     say_step(f"warning: {found.sentence}", show=show)
     return [found]
+
+
+def _tension_facts(best: Mapping[str, float], table: TrainingTable) -> dict[str, str]:
+    """What a deployment needs to know of tensions in the evaluation of the policy, as metadata."""
+    limit = {} if table.tension_limit is None else {TENSION_LIMIT: f"{table.tension_limit:g}"}
+    counts = {STOPPED_EPISODES: best["tension_stopped"], EVALUATED_EPISODES: table.evaluation_episodes}
+    return {PEAK_TENSION: f"{best['tension_largest']:g}"} | limit | {name: f"{n:.0f}" for name, n in counts.items()}
 
 
 def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:

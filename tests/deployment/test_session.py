@@ -20,6 +20,7 @@ from rfdropo_bayes.deployment.causes import Cause
 from rfdropo_bayes.deployment.homing import Home, HomingResult, load_homing
 from rfdropo_bayes.deployment.log import read_journal, session_trajectory
 from rfdropo_bayes.deployment.loop import Phase
+from rfdropo_bayes.deployment.policy import OnnxPolicy, pulls_too_hard
 from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import (
@@ -33,7 +34,7 @@ from rfdropo_bayes.deployment.settings import (
 )
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import PEAK_TENSION
+from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
 
 from .policies import linear_policy
 
@@ -259,18 +260,29 @@ def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: R
     assert "does not divide" in (tmp_path / "s" / "log.jsonl").read_text()
 
 
+def with_facts(path: Path, facts: dict[str, str]) -> None:
+    """Write metadata into a policy, beside those that it has."""
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {p.key: p.value for p in model.metadata_props} | facts)
+    onnx.save(model, path)
+
+
 def test_a_policy_that_pulled_harder_than_a_motor_bears_is_warned_of(robot: Robot, tmp_path: Path, capsys) -> None:
     path = linear_policy(tmp_path / "p.onnx", robot, np.zeros((16, 4)), np.zeros(4))
     limit = min(motor.tension_limit_n[1] for motor in robot.motors)
+    set_it, longer = f"train with [training] tension_limit = {limit:g}", f"limit of {limit:g} N: train longer"
     for peak in (limit, limit + 1.0):
-        model = onnx.load(path)
-        onnx.helper.set_model_props(model, {p.key: p.value for p in model.metadata_props} | {PEAK_TENSION: f"{peak}"})
-        onnx.save(model, path)
+        with_facts(path, {PEAK_TENSION: f"{peak}"})
         settings = Deployment(robot="motor_arm", policy=PolicyTable(file=str(path)), drives=SLOW)
         deploy(settings, "check", tmp_path / f"{peak}", simulated=True)
-        told = f"pulled up to {peak:.3g} N"
-        assert (told in capsys.readouterr().err) == (peak > limit)
+        told, said = f"pulled up to {peak:.3g} N", capsys.readouterr().err
+        assert (told in said) == (set_it in said) == (peak > limit)
         assert (told in (tmp_path / f"{peak}" / "log.jsonl").read_text()) == (peak > limit)
+    with_facts(path, {TENSION_LIMIT: f"{limit}", STOPPED_EPISODES: "3", EVALUATED_EPISODES: "64"})
+    said = pulls_too_hard(OnnxPolicy(path, robot, {}).pull, robot.motors)
+    assert f"3 of 64 evaluation episodes were stopped by the training's {longer}" in said
+    with_facts(path, {TENSION_LIMIT: f"{limit + 0.5}"})
+    assert set_it in pulls_too_hard(OnnxPolicy(path, robot, {}).pull, robot.motors)
 
 
 def test_the_master_takes_a_node_number_that_no_drive_has() -> None:

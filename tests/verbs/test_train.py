@@ -23,9 +23,9 @@ from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import PEAK_TENSION
+from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
-from rfdropo_bayes.verbs.train import _summary, learnt
+from rfdropo_bayes.verbs.train import _summary, _tension_facts, learnt
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -80,6 +80,7 @@ def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     assert policy.layout.task == task
     assert policy.facts["posterior_sha256"] == summary["posterior_sha256"]
     assert float(policy.facts[PEAK_TENSION]) == pytest.approx(summary["evaluation"]["tension_largest"], rel=1e-5)
+    assert (policy.facts[STOPPED_EPISODES], policy.facts[EVALUATED_EPISODES]) == ("0", "16")
     assert "Cables pull at most" in (tmp_path / "policy" / "report.html").read_text()
     rfdropo("evaluate", REACH, "--policy", tmp_path / "policy", "--out", tmp_path / "test", "--episodes", 8, *settings)
     table = pd.read_csv(tmp_path / "test" / "episodes.csv")
@@ -157,6 +158,13 @@ def test_what_was_learnt_does_not_take_a_few_stopped_episodes_for_most(ends, wor
     told = learnt(summary_of(distance_median=ends[0], distance_q95=ends[1], failed=1, **pull))
     assert told.startswith(words)
     assert told.endswith("the limit of 5 N stopped 7 of them.")
+
+
+def test_a_deployment_is_told_of_the_limit_and_of_the_episodes_that_it_stopped() -> None:
+    best = {"tension_largest": 6.0, "tension_stopped": 3}
+    known = {PEAK_TENSION: "6", STOPPED_EPISODES: "3", EVALUATED_EPISODES: "64"}
+    assert _tension_facts(best, TrainingTable()) == known
+    assert _tension_facts(best, TrainingTable(tension_limit=5.0)) == known | {TENSION_LIMIT: "5"}
 
 
 @pytest.mark.slow
