@@ -199,7 +199,7 @@ class Episodes:
         distance = self.distance()
         gained = np.where(good, reward(distance, self.first), FLOOR * (EPISODE - self.age + 1))
         ended = ~good if self.settings.near is None else ~good | (distance <= self.settings.near)
-        tension, limit = self._largest_tension(found), self.settings.tension_limit
+        tension, limit = self._largest_tension(found, good), self.settings.tension_limit
         stopped = np.zeros(self.lanes, dtype=bool) if limit is None else good & (tension > limit)
         # Who holds still keeps the reward of the place: at the worst that was met, a stop is never worth more.
         self.worst = np.minimum(self.worst, gained)
@@ -217,13 +217,15 @@ class Episodes:
         """What the episode of a lane began with, enough to begin it again as an option of `reset`."""
         return {"parameters": dict(self.parameters[lane]), "goal": self.goal[lane].tolist()}
 
-    def _largest_tension(self, found: Observation) -> Float[np.ndarray, " lane"]:
-        """Largest tension of any cable since the last action [N]; NaN where the simulator tells none."""
+    def _largest_tension(self, found: Observation, good: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
+        """Largest tension of any cable since the last action [N]; NaN where the simulator tells none, which is an error
+        in ``good`` lanes under a limit."""
+        tension = np.full(self.lanes, np.nan)
         if found.peak is not None and self.simulator.cable_names:
-            return np.asarray(found.peak, dtype=float).max(axis=1)
-        if self.settings.tension_limit is not None:
-            raise _without_tensions(self.robot.name, "let its lanes tell Motion.peak, or leave it out")
-        return np.full(self.lanes, np.nan)
+            tension = np.asarray(found.peak, dtype=float).max(axis=1)
+        if self.settings.tension_limit is not None and not np.isfinite(tension[good]).all():
+            raise _without_tensions(self.robot.name, "let its lanes tell Motion.peak, finite, or leave it out")
+        return tension
 
     def _begin(self, waiting: Mapping[int, Mapping[str, float] | None]) -> Observation:
         """Start lanes, with the parameters that are given or with draws."""

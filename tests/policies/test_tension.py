@@ -110,11 +110,12 @@ def test_a_stop_is_never_worth_more_than_holding_still(away) -> None:
     assert (min(totals[None]) < FLOOR) == (away < 0.01)
 
 
-def test_a_limit_where_no_tension_is_told_is_refused(monkeypatch) -> None:
+@pytest.mark.parametrize("peak", [None, np.array([[1.0, np.nan, 1.0, 1.0]])])
+def test_a_limit_where_no_tension_is_told_is_refused(monkeypatch, peak) -> None:
     lanes = make_episodes(REACH, 1, **OPTIONS, tension_limit=10.0)
     lanes.reset([0])
     act = lanes.session.act
-    monkeypatch.setattr(lanes.session, "act", lambda commands: act(commands)._replace(peak=None))
+    monkeypatch.setattr(lanes.session, "act", lambda commands: act(commands)._replace(peak=peak))
     with pytest.raises(InputError, match=r"smooth_arm tells no cable tensions .* Motion\.peak"):
         lanes.act(np.zeros((1, CHANNELS)))
 
