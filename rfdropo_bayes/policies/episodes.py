@@ -95,7 +95,7 @@ class Episodes:
 
     Raises:
         InputError: a randomisation that does not fit the simulator, a task that does not fit the robot, or a limit on
-            tensions that the simulator does not tell.
+            tensions that is not positive, or that the simulator does not tell.
     """
 
     def __init__(
@@ -103,7 +103,10 @@ class Episodes:
     ) -> None:
         self.task, self.settings, self.lanes = task, settings, lanes
         self.simulator, self.robot = simulator, simulator.robot
-        if settings.tension_limit is not None and not simulator.cable_names:
+        limit = settings.tension_limit
+        if limit is not None and not 0.0 < limit < np.inf:
+            raise InputError(f"tension_limit = {limit:g}", where=task.name, remedy="give a positive number [N]")
+        if limit is not None and not simulator.cable_names:
             raise _without_tensions(self.robot.name, "name its cables, see docs/your_simulator.md, or leave it out")
         asked = (settings.actions, settings.observed, settings.period, settings.step, settings.history)
         self.layout = layout_of(task, self.robot, *asked)
@@ -111,7 +114,7 @@ class Episodes:
         self._specs = {spec.name: spec for spec in simulator.parameters}
         self.randomisation = fitting(randomisation, simulator.parameters)
         self.session = Session(simulator, lanes, settings.period)
-        self.redrawn = 0
+        self.redrawn, self._compared = 0, limit is None
         self.generators = [np.random.default_rng(child) for child in np.random.SeedSequence().spawn(lanes)]
         self.parameters: list[dict[str, float]] = [{} for _ in range(lanes)]
         markers = len(self.robot.marker_names)
@@ -140,8 +143,8 @@ class Episodes:
             The first observations of these rows.
 
         Raises:
-            InputError: an unknown option or parameter, values outside their bounds, or no initial state after
-                `REDRAWS` draws.
+            InputError: an unknown option or parameter, values outside their bounds, no initial state after
+                `REDRAWS` draws, or a limit on tension below what cables pull in every lane without an action.
         """
         rows = np.asarray(rows, dtype=int)
         given = [dict(option) for option in options] if options else [{} for _ in rows]
@@ -158,6 +161,7 @@ class Episodes:
             self._take(np.array(list(waiting))[good], _rows_of(found, good))
             failed = [row for row, well in zip(waiting, good, strict=True) if not well]
             if not failed:
+                self._compare_at_rest(rows)
                 return self._observe(rows)
             fixed = [row for row in failed if waiting[row] is not None]
             if fixed or attempt == REDRAWS:
@@ -226,6 +230,25 @@ class Episodes:
         if self.settings.tension_limit is not None and not np.isfinite(tension[good]).all():
             raise _without_tensions(self.robot.name, "let its lanes tell Motion.peak, finite, or leave it out")
         return tension
+
+    def _compare_at_rest(self, rows: Int[np.ndarray, " row"]) -> None:
+        """Once, where all lanes have just begun: raise if a period without an action passes the limit in each.
+
+        A session's first observation does not tell the tension of an arm that begins at rest.
+        """
+        if self._compared or len(rows) < self.lanes:
+            return
+        self._compared, before = True, self.session.save()
+        found = self.session.act(self.commands)
+        self.session.restore(before)
+        good = np.asarray(found.status) == int(Result.OK)
+        least, limit = np.min(self._largest_tension(found, good)[good], initial=np.inf), self.settings.tension_limit
+        if limit is not None and limit < least < np.inf:
+            raise InputError(
+                f"cables of {self.robot.name} pull {least:.3g} N and more without an action; {limit:g} N ends it",
+                where="tension_limit",
+                remedy="raise it, or leave it out",
+            )
 
     def _begin(self, waiting: Mapping[int, Mapping[str, float] | None]) -> Observation:
         """Start lanes, with the parameters that are given or with draws."""

@@ -110,6 +110,28 @@ def test_a_stop_is_never_worth_more_than_holding_still(away) -> None:
     assert (min(totals[None]) < FLOOR) == (away < 0.01)
 
 
+@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf])
+def test_a_limit_that_is_no_positive_number_is_refused(limit) -> None:
+    with pytest.raises(InputError, match=r"tension_limit = .* give a positive number"):
+        make_episodes(REACH, 1, **OPTIONS, tension_limit=limit)
+
+
+def test_a_limit_below_the_tension_at_rest_is_refused_and_another_changes_nothing() -> None:
+    """The arm pulls 1.6 N without an action."""
+    told = {}
+    for limit in (None, 1.7):
+        lanes = make_episodes(REACH, 2, **OPTIONS, tension_limit=limit)
+        for lane in range(2):
+            lanes.seed(lane, lane)
+        lanes.reset([0, 1])
+        told[limit] = lanes.act(np.zeros((2, CHANNELS)))
+    np.testing.assert_array_equal(told[1.7].observation, told[None].observation)
+    np.testing.assert_array_equal(told[1.7].tension, told[None].tension)
+    assert not told[1.7].stopped.any()
+    with pytest.raises(InputError, match=r"cables of smooth_arm pull 1\.6 N and more without an action; 1 N"):
+        make_episodes(REACH, 2, **OPTIONS, tension_limit=1.0).reset([0, 1])
+
+
 @pytest.mark.parametrize("peak", [None, np.array([[1.0, np.nan, 1.0, 1.0]])])
 def test_a_limit_where_no_tension_is_told_is_refused(monkeypatch, peak) -> None:
     lanes = make_episodes(REACH, 1, **OPTIONS, tension_limit=10.0)
