@@ -90,7 +90,9 @@ def evaluate(
     if episodes < 1:
         raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for one at least")
     opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
-    model = with_training(model, {**(_task_of(policies) if model.settings.training is None else {}), **keys})
+    inherited = _task_of(policies) if model.settings.training is None else {}
+    unwatched = _drop_limit(inherited) if not model.robot.cable_names and "tension_limit" not in keys else []
+    model = with_training(model, {**inherited, **keys})
     table, task, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, posterior)
     loaded = dict(zip(_names(policies), opened, strict=True))
@@ -112,7 +114,7 @@ def evaluate(
             if film:
                 _film(batch, found[name], cases, out / f"{name}.gif")
         content = _judged(found, cases, seed) | {"tension_limit_n": table.tension_limit}
-        content["otherwise_trained"] = _otherwise_trained(loaded, steps_of(simulator))
+        content["otherwise_trained"] = [*_otherwise_trained(loaded, steps_of(simulator)), *unwatched]
         with whole(out / CSV) as partial:
             episode_table(found, cases).to_csv(partial, index=False)
         success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
@@ -127,6 +129,15 @@ def _task_of(policies: Sequence[Path]) -> dict[str, Any]:
     if not (first / CONFIG).is_file():
         return {}
     return {key: value for key, value in read_tables(first / CONFIG).get("training", {}).items() if key in OF_EPISODES}
+
+
+def _drop_limit(inherited: dict[str, Any]) -> list[str]:
+    """Take the limit on tension out of what a training says of episodes, for a model that tells no tensions: a
+    sentence about it, or none if there was no limit."""
+    limit = inherited.pop("tension_limit", None)
+    if limit is None:
+        return []
+    return [f"The training's tension_limit of {limit:g} N is left out: the model has no cables."]
 
 
 def _episodes_for(

@@ -105,12 +105,19 @@ def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(t
 
 @pytest.mark.slow
 def test_a_policy_is_trained_evaluated_and_filmed(tmp_path):
-    model = model_of(tmp_path, mechanisms=("actuator_lag",))
+    model = model_of(tmp_path, mechanisms=("actuator_lag",), cables={"b": "b"})
     sizes = {"steps": 2048, "environments": 8, "evaluate_every": 2048, "evaluation_episodes": 8}
     drawn = {"randomisation": "uniform", "ranges": {"damping": [0.005, 0.02], "actuator_lag": [0.0, 0.05]}}
-    summary = rb.train(model, tmp_path / "policy", show=False, **REACH, **sizes, **drawn)
+    summary = rb.train(model, tmp_path / "policy", show=False, tension_limit=50.0, **REACH, **sizes, **drawn)
     assert summary["integrator"].startswith("mujoco ")
     assert (tmp_path / "policy" / "report.html").stat().st_size > 10_000
-    found = rb.evaluate(model, [tmp_path / "policy"], tmp_path / "evaluation", episodes=8, **REACH)
+    found = rb.evaluate(model, [tmp_path / "policy"], tmp_path / "evaluation", episodes=8)
     assert found["policies"]["policy"]["diverged"] == 0
+    assert (found["tension_limit_n"], found["otherwise_trained"]) == (50.0, [])
     assert (tmp_path / "evaluation" / "policy.gif").stat().st_size > 1000
+    model = model_of(tmp_path, mechanisms=("actuator_lag",))
+    found = rb.evaluate(model, [tmp_path / "policy"], tmp_path / "no_cables", episodes=8, film=False)
+    assert found["tension_limit_n"] is None
+    assert "tension_limit of 50 N is left out: the model has no cables" in found["otherwise_trained"][0]
+    with pytest.raises(InputError, match="tells no cable tensions"):
+        rb.evaluate(model, [tmp_path / "policy"], tmp_path / "asked", episodes=8, film=False, tension_limit=50.0)
