@@ -40,7 +40,7 @@ class TrainingTable(BaseModel):
     tension_limit: float | None = Field(
         default=None,
         gt=0.0,
-        description="an episode ends, unsuccessful, once any cable pulls more [N], as drives stop then; none by default",
+        description="an episode fails and ends once any cable pulls more [N], as drives then stop; none by default",
     )
     algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
     options: dict[str, Any] = Field(
