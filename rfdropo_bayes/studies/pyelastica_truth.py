@@ -241,13 +241,11 @@ class ElasticaArm(EngineArm):
         """The undeformed rod, with the sections of the robot's file."""
         shape, modulus = self.robot.body, self.values["young_modulus"]
         within, nodes = partial(integral, self.robot), _nodes(self.robot, self.elements)
-        ends = np.maximum(nodes, 0.0)
-        elements, pieces = (ends[:-1], ends[1:]), (np.arange(self.elements), 1.0 + np.arange(self.elements))
-        pieces = tuple(at * nodes[-1] / self.elements for at in pieces)
+        elements, pieces = np.maximum(nodes, 0.0), np.linspace(0.0, nodes[-1], self.elements + 1)  # their ends
 
-        def yields(table: Any, length: Any, parts: Any) -> np.ndarray:
-            """Stiffness of elements or nodes of a length: the layers of each part yield one after the other."""
-            return length / np.array([within(1.0 / np.asarray(table), *part) for part in zip(*parts, strict=True)])
+        def yields(table: Any, length: Any, ends: np.ndarray) -> np.ndarray:
+            """Stiffness of parts of the rod, each of a length: layers between its ends yield one after the other."""
+            return length / np.array([within(1.0 / np.asarray(table), *part) for part in pairwise(ends)])
 
         lengths = np.diff(nodes)
         area = yields(shape.axial_area_m2, lengths, elements)  # half of the first element is the base's
@@ -260,7 +258,7 @@ class ElasticaArm(EngineArm):
             normal=np.array([1.0, 0.0, 0.0]),
             base_length=nodes[-1] - nodes[0],
             position=np.stack([0.0 * nodes, 0.0 * nodes, nodes]),
-            base_radius=np.sqrt(yields(shape.axial_area_m2, np.diff(ends), elements) / np.pi),
+            base_radius=np.sqrt(yields(shape.axial_area_m2, np.diff(elements), elements) / np.pi),
             density=density,
             youngs_modulus=modulus,
             shear_modulus=shear,
