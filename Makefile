@@ -21,7 +21,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PYTHONDONTWRITEBYTECODE =
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable test-compiler test-all matrix lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
+.PHONY: help demo test test-slow test-portable test-compiler test-all matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
@@ -32,17 +32,28 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 
 test: $(DEV) ## the tests that are not slow
 	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
+	$(BIN)/python tools/yardstick.py
+
+test-slow: $(ALL) ## the slow tests, those of optional packages included, without matrix and notebooks
+	$(PYTEST) -n $(WORKERS) -m "slow and not notebook" --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
 
 # The rooms that compute. `make test-portable ROOMS="policies audit"` runs some of them: those that learn, sample and
 # search are where a test that rests on one processor shows, because a last bit becomes another curve there.
 test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
 	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)
 
-test-all: $(ALL) ## every test, the slow ones, the notebooks and those of optional packages too
-	$(PYTEST) -n $(WORKERS)
+test-all: test test-slow test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/verbs/test_matrix.py tests/verbs/test_commands_matrix.py
+
+COMMIT = $(shell git rev-parse HEAD 2>/dev/null || echo none)
+
+matrix-drawn: $(DEV) ## a tenth of the matrix, drawn by the commit
+	$(PYTEST) -n $(WORKERS) --dist loadgroup --drawn 10% --by $(COMMIT) tests/verbs/test_matrix.py tests/verbs/test_commands_matrix.py
+
+notebook-drawn: $(DEV) ## one notebook, drawn by the commit
+	$(PYTEST) -m notebook --drawn 1 --by $(COMMIT) tests/test_notebooks.py
 
 test-compiler: $(DEV) ## the layered engine, its kernels compiled by Numba's own compilers (docs/native.md)
 	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_layered.py tests/fem/test_native_session.py tests/fem/test_compilers.py

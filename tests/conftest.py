@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import hashlib
 import os
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import numpy as np
 import psutil
 import pytest
 from jaxtyping import install_import_hook
+
+from tests.costs import Costs, spent
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -36,6 +39,30 @@ def checked_modules() -> list[str]:
 
 
 install_import_hook(checked_modules(), "beartype.beartype")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--drawn", metavar="COUNT", help="run so many of the tests, or so many percent, drawn by --by")
+    parser.addoption("--by", metavar="SEED", default="", help="seed of --drawn")
+    parser.addoption("--costs", metavar="FILE", help="write the processor seconds of every test to FILE, dearest first")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.spent_so_far = spent()
+    config.pluginmanager.register(Costs(config.getoption("--costs")), "costs")
+
+
+@pytest.hookimpl(trylast=True)  # after -m and -k
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    count = config.getoption("--drawn")
+    if count is None or not items:
+        return
+    wanted = max(1, round(len(items) * float(count[:-1]) / 100.0)) if count.endswith("%") else int(count)
+    seed = config.getoption("--by")
+    order = sorted(items, key=lambda item: hashlib.sha256(f"{seed} {item.nodeid}".encode()).digest())
+    kept = set(order[:wanted])
+    config.hook.pytest_deselected(items=order[wanted:])
+    items[:] = [item for item in items if item in kept]
 
 
 MOST_MEMORY = 1.0e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
