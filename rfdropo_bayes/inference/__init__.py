@@ -8,7 +8,6 @@ Other rooms import from here, and the modules `methods` and `sbc`; a name's modu
 | where SMC starts, how it goes on, how its particles move | `smc.start`, `smc.sampler`, `smc.moves` |
 | where modes are searched | `modes.mode_search` |
 | RF-DROPO | `rfdropo.phi_search` |
-| plain numpyro models | `plain.plain_problem` |
 """
 
 from importlib import import_module
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.modes.targets import Target as Target
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
-    from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro as problem_from_numpyro
     from rfdropo_bayes.inference.progress import Checkpoint as Checkpoint
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
@@ -58,7 +56,6 @@ PUBLIC = {
     "Target": "modes.targets",
     "NestedConfig": "nested",
     "NutsConfig": "nuts",
-    "problem_from_numpyro": "plain.plain_problem",
     "Progress": "progress",
     "InferenceResult": "result",
     "RfdropoConfig": "rfdropo.phi_search",

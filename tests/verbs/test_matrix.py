@@ -30,8 +30,8 @@ SETTINGS = {
     "smc": ["inference.rollouts=600", "inference.particles=50", "inference.blocks=2"],
     "laplace": ["inference.rollouts=300", "inference.starts=1", "inference.draws=40"],
     "bridge": ["inference.rollouts=400", "inference.particles=50", "inference.replicates=2"],
-    "nested": ["inference.live=20", "inference.slices=2", "inference.draws=40"],
-    "nuts": ['simulator.engine="jax"', "inference.warmup=2", "inference.draws=8"],
+    "nested": ["inference.live=20"],
+    "nuts": ['simulator.engine="jax"', "inference.draws=4"],
     "bayessim": ["inference.rollouts=100", "inference.max_epochs=5", "inference.draws=40"],
     "npdr": ["inference.rollouts=200", "inference.rounds=2", "inference.max_epochs=5", "inference.draws=40"],
 }

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
-from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, TraceableProblem, WarmStart
+from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, WarmStart
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
@@ -43,9 +43,7 @@ from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasti
 from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
-    SmoothTarget,
     Target,
-    log_likelihood_derivatives,
     make_target,
     prior_derivatives,
 )
@@ -318,7 +316,6 @@ def survey(
     sampling = sampler.SmcConfig(
         rollouts=whole,
         particles=config.survey,
-        kernel="crank_nicolson",
         blocks=len(horizons),
         spacing="linear",
         max_moves=SURVEY_MOVES,
@@ -469,25 +466,14 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
     """Horizons to climb at, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
-    if isinstance(problem, ResidualProblem):
-        prior = prior_derivatives(problem)
+    if not isinstance(problem, ResidualProblem):
+        raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
+    prior = prior_derivatives(problem)
 
-        def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
-            return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
+    def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
+        return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
 
-        return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
-    if isinstance(problem, TraceableProblem):
-        derivatives, slopes = log_likelihood_derivatives(problem), prior_derivatives(problem)
-
-        def by_hessians(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
-            return SmoothTarget(problem, ledger, derivatives, *slopes, noise=np.zeros(len(u), dtype=bool))
-
-        return (problem.n_rows,), by_hessians
-    raise InputError(
-        "this problem has no residuals, and no likelihood that JAX can differentiate",
-        where="[inference] method",
-        remedy='use method = "smc"',
-    )
+    return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
 
 
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:

@@ -58,22 +58,17 @@ class Tuning(NamedTuple):
 
     Attributes:
         target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        kernel: ``"crank_nicolson"`` or ``"hamiltonian"``.
-        degrees: degrees of freedom of the Student-t behind ``crank_nicolson``.
+        degrees: degrees of freedom of the Student-t behind the proposals.
         acceptance: acceptance that step sizes are adapted to.
         correlation: moves go on until no direction is more correlated than this with where the stage began.
         max_moves: and no longer than this.
-        follow: proposals of ``"hamiltonian"``: from the generator, positions, progress, references, second half and
-            scale.
     """
 
     target_ess: float
-    kernel: str
     degrees: float
     acceptance: float
     correlation: float
     max_moves: int
-    follow: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
 
 
 class StageInfo(NamedTuple):
@@ -208,7 +203,7 @@ def move(
         references: location and spread that shape the proposals of the two halves.
         second: particles that belong to the second half.
         evaluate: proposals to (base, rows).
-        tuning: kernel and stopping rule.
+        tuning: proposals and stopping rule.
         moves: most moves the budget allows; at least one is made.
 
     Returns:
@@ -219,12 +214,7 @@ def move(
     correlation = 1.0
     for count in range(max(1, min(moves, tuning.max_moves))):
         generator = host_generator(jax.random.fold_in(key, count))
-        if tuning.follow is None:
-            proposal, ratio = _by_halves(generator, population.position, references, second, scale, tuning)
-        else:
-            proposal, ratio = tuning.follow(
-                generator, population.position, population.progress, references, second, scale
-            )
+        proposal, ratio = _by_halves(generator, population.position, references, second, scale, tuning)
         base, rows = evaluate(proposal)
         proposed = base + path_density(rows, population.progress)
         chosen = accept(generator, ratio + proposed - density)
@@ -235,7 +225,7 @@ def move(
         )
         density = np.where(chosen, proposed, density)
         rates.append(float(chosen.mean()))
-        scale = adapt_scale(tuning.kernel, scale, rates[-1], tuning.acceptance)
+        scale = adapt_scale(scale, rates[-1], tuning.acceptance)
         correlation = slowest_correlation(first, population.position, references[0])
         if correlation <= tuning.correlation:
             break
