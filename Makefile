@@ -21,7 +21,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PYTHONDONTWRITEBYTECODE =
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-portable test-compiler test-all matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
+.PHONY: help demo test test-slow test-studies test-portable test-compiler test-all matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
@@ -31,18 +31,21 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 	@echo "The report: reports/demo/report.html"
 
 test: $(DEV) ## the tests that are not slow
-	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
+	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook" --ignore=tests/studies
 	$(BIN)/python tools/yardstick.py
 
-test-slow: $(ALL) ## the slow tests, those of optional packages included, without matrix and notebooks
-	$(PYTEST) -n $(WORKERS) -m "slow and not notebook" --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
+test-slow: $(DEV) ## the slow tests, without those of studies, matrix and notebooks
+	$(PYTEST) -n $(WORKERS) -m "slow and not notebook" --ignore=tests/studies --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
+
+test-studies: $(ALL) ## the tests of what is run for papers, in studies/
+	$(PYTEST) -n $(WORKERS) tests/studies
 
 # The rooms that compute. `make test-portable ROOMS="policies audit"` runs some of them: those that learn, sample and
 # search are where a test that rests on one processor shows, because a last bit becomes another curve there.
 test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
 	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)
 
-test-all: test test-slow test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
+test-all: test test-slow test-studies test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/verbs/test_matrix.py tests/verbs/test_commands_matrix.py
@@ -108,9 +111,9 @@ $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable '.[dev]'
 	@touch $(CORE) $@
 
-# Apart from what `make test` needs: PyTorch is large.
-$(ALL): pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable '.[dev,sbi,cluster]'
+# Apart from what `make test` needs.
+$(ALL): pyproject.toml constraints.txt studies/requirements.txt | $(BIN)/python
+	$(PIP) --editable '.[dev]' --requirement studies/requirements.txt
 	@touch $(CORE) $(DEV) $@
 
 $(SITE): pyproject.toml constraints.txt | $(BIN)/python

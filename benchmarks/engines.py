@@ -27,9 +27,9 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.studies.engine_study import FITTED, REPEATS, TRUTHS, Truth, drawn_arm, seed_of
-from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, experiment_tables
-from rfdropo_bayes.studies.mujoco_truth import CABLE
+from studies.engine_study import FITTED, REPEATS, TRUTHS, Truth, drawn_arm, seed_of
+from studies.hidden_effects import MEMORY, NOISE, experiment_tables
+from studies.mujoco_truth import CABLE
 
 MECHANISMS = ("cable_compliance", "payload", "base_tilt")
 STEPS = {"trunk_mass": 1e-4, "cable_compliance": 1e-6, "payload_mass": 2e-4, "base_tilt_x": 5e-3, "base_tilt_z": 5e-3}

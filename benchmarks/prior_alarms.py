@@ -31,9 +31,9 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.files import read_lines
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.studies.fits import Job, run_fits
-from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, REPEATS, Setting, experiment_tables, hide
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from studies.fits import Job, run_fits
+from studies.hidden_effects import MEMORY, NOISE, REPEATS, Setting, experiment_tables, hide
 
 DRAWS = 1000  # as many as an audit's
 _WORKSHOP: Workshop = {}  # of this process

@@ -33,8 +33,8 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable
-from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, Hidden, Setting, hide
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from studies.hidden_effects import MEMORY, NOISE, Hidden, Setting, hide
 
 WITHIN = 1.645  # deviations of a normal to the ends of its central 90 %
 LEARNT = 0.5  # of a prior's deviation that a size is known better than, to count

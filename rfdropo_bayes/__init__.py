@@ -61,15 +61,12 @@ _HOMES = {
 }
 """Where each name is defined: ``module`` under the same name, or ``module:name``."""
 _METHODS = {
-    "BayesSim": "bayessim",
     "Bridge": "bridge",
     "Laplace": "laplace",
-    "NPDR": "npdr",
     "NUTS": "nuts",
     "Nested": "nested",
     "RFDROPO": "rfdropo",
     "SMC": "smc",
-    "UDR": "udr",
 }
 """Options of each method of inference, by the method's name in an experiment file."""
 

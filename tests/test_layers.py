@@ -34,7 +34,6 @@ MAY_IMPORT: dict[str, set[str]] = {
 MAY_IMPORT["model"] = set(MAY_IMPORT)
 MAY_IMPORT["results"] = set(MAY_IMPORT)
 MAY_IMPORT["verbs"] = set(MAY_IMPORT)
-MAY_IMPORT["studies"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 

@@ -118,38 +118,3 @@ def design(
     commands = folder / COMMANDS
     content = {**found.content, "commands": str(commands)}
     say(content, found.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)
-
-
-def benchmark_audit(
-    datasets: Annotated[int, typer.Option(help="data sets per condition")] = 100,
-    seed: Annotated[int, typer.Option(help="seed of the study")] = 0,
-    condition: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="only this condition; may be repeated")
-    ] = None,
-    hide: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="mechanism to hide; may be repeated; all by default")
-    ] = None,
-    exclude: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="mechanism to leave out; may be repeated")
-    ] = None,
-    cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
-    truth: Annotated[
-        str, typer.Option("--truth", help="engine that makes recordings: own, mujoco or pyelastica")
-    ] = "own",
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
-) -> None:
-    """Count how often audits are right. Effects are hidden in recordings; a study goes on where it was stopped."""
-    if truth not in ("own", "mujoco", "pyelastica"):
-        raise InputError(f"unknown engine {truth!r}", where="--truth", remedy="own, mujoco or pyelastica")
-    if truth != "own":
-        from rfdropo_bayes.studies.engine_study import TABLE as ENGINES
-        from rfdropo_bayes.studies.engine_study import run_engine_study
-
-        run_engine_study(out, datasets, seed, engine=truth, effects=hide or [])
-        typer.echo((out / ENGINES).read_text(encoding="utf-8"))
-        return
-    from rfdropo_bayes.studies.audit_study import TABLE, run_study
-
-    chosen = {"conditions": condition or [], "mechanisms": hide or [], "exclude": exclude or []}
-    run_study(out, datasets, seed, cluster=cluster, **chosen)
-    typer.echo((out / TABLE).read_text(encoding="utf-8"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +21,6 @@ from rfdropo_bayes.cli.options import (
 )
 from rfdropo_bayes.cli.terminal_summary import say
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.model.run_folder import check_folder
 
 
 def train(
@@ -112,54 +110,3 @@ def evaluate(
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}
-VIRTUAL = Path("experiments/virtual")
-
-
-def table2(
-    experiments: Annotated[
-        list[Path] | None, typer.Argument(metavar="EXPERIMENT.toml", help="one file for each task")
-    ] = None,
-    target: Annotated[Path, typer.Option(help="experiment file of the robot that policies are evaluated on")] = VIRTUAL
-    / "truth.toml",
-    audited: Annotated[Path, typer.Option("--audit", help="experiment file of the audit")] = VIRTUAL / "audit.toml",
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table2"),
-    seeds: Annotated[int, typer.Option(help="number of policies trained for each row")] = 3,
-    steps: Annotated[int, typer.Option(help="number of environment steps of a training")] = 1_000_000,
-    episodes: Annotated[int, typer.Option(help="number of episodes of an evaluation, the same for all policies")] = 200,
-    budget: Annotated[int, typer.Option(help="number of rollouts of a fit")] = 10_000,
-    minutes: Annotated[float, typer.Option(help="time limit of the audit, in minutes")] = 65.0,
-    exact_oracle: Annotated[
-        bool, typer.Option("--exact-oracle", help="train the oracle on the target's own mesh and time step; slower")
-    ] = False,
-    rows: Annotated[
-        list[str] | None, typer.Option("--row", metavar="NAME", help="only this row; may be repeated")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with an interrupted study")] = False,
-    only_done: Annotated[
-        bool, typer.Option("--only-done", help="write the tables of an interrupted study as far as it is done")
-    ] = False,
-    overwrite: Overwrite = False,
-) -> None:
-    """Make the paper's Table II. Plays policies of every method on a robot that they never touched."""
-    check_folder(out, "benchmark table2", resume=resume or only_done, overwrite=overwrite)
-    from rfdropo_bayes.studies.table2 import Table2Size, run_table2
-
-    content = run_table2(
-        experiments or [VIRTUAL / "push.toml", VIRTUAL / "reach.toml"],
-        target,
-        audited,
-        out,
-        Table2Size(seeds, steps, episodes, budget, minutes, exact_oracle),
-        rows=rows or (),
-        resume=resume,
-        only_done=only_done,
-        overwrite=overwrite,
-        command=shlex.join(["rfdropo", *sys.argv[1:]]),
-    )
-    for claim in content["claims"]:
-        typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.2f}")
-    for cell, why in content["failed"].items():
-        typer.echo(f"failed: {cell}: {why}")
-    if content["not_done"]:
-        typer.echo(f"{content['not_done']} cells are not done: go on with --resume")
-    typer.echo(f"table: {out / 'table2.md'}")

@@ -1,6 +1,6 @@
 """Inference methods. They see a `Problem` and nothing of the simulator behind it.
 
-Other rooms import from here, and the modules `methods` and `sbc`; a name's module is loaded when it is first used.
+Other rooms import from here, and the module `methods`; a name's module is loaded when it is first used.
 
 | to find | look in |
 |---|---|
@@ -34,10 +34,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
     from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RfdropoConfig
-    from rfdropo_bayes.inference.rivals import BayesSimConfig as BayesSimConfig
-    from rfdropo_bayes.inference.rivals import NpdrConfig as NpdrConfig
-    from rfdropo_bayes.inference.rivals import UdrConfig as UdrConfig
-    from rfdropo_bayes.inference.rivals import import_sbi as import_sbi
     from rfdropo_bayes.inference.smc.bridge import BridgeConfig as BridgeConfig
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SmcConfig
     from rfdropo_bayes.inference.smc.tempering import next_step as next_step
@@ -59,10 +55,6 @@ PUBLIC = {
     "Progress": "progress",
     "InferenceResult": "result",
     "RfdropoConfig": "rfdropo.phi_search",
-    "BayesSimConfig": "rivals",
-    "NpdrConfig": "rivals",
-    "UdrConfig": "rivals",
-    "import_sbi": "rivals",
     "next_step": "smc.tempering",
     "BridgeConfig": "smc.bridge",
     "SmcConfig": "smc.sampler",

@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, check_problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import nested, nuts, rivals
+from rfdropo_bayes.inference import nested, nuts
 from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
@@ -44,9 +44,6 @@ METHODS: dict[str, Method] = {
     "bridge": Method(bridge.BridgeConfig, bridge.run),
     "nuts": Method(nuts.NutsConfig, nuts.run),
     "nested": Method(nested.NestedConfig, nested.run),
-    "bayessim": Method(rivals.BayesSimConfig, rivals.run_bayessim),
-    "npdr": Method(rivals.NpdrConfig, rivals.run_npdr),
-    "udr": Method(rivals.UdrConfig, rivals.run_udr, posterior=False),
 }
 
 

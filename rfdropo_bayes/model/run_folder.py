@@ -49,7 +49,6 @@ class RunKind(NamedTuple):
 COMMANDS = {
     "calibrate": RunKind(("summary.json", "posterior.nc", PAGE), resumable=True),
     "adapt": RunKind(("summary.json", "posterior.nc", PAGE)),
-    "check": RunKind(("sbc.json", "sbc.jsonl"), resumable=True),
     "simulate": RunKind(("simulation.json",)),
     "predict": RunKind(("prediction.json", "prediction.nc", "prediction.csv")),
     "audit": RunKind(("audit.json", "extended.toml", PAGE), resumable=True),
@@ -57,8 +56,6 @@ COMMANDS = {
     "design": RunKind(("design.json", "next_commands.csv")),
     "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl", PAGE), resumable=True),
     "evaluate": RunKind(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
-    "benchmark table1": RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True, shared=True),
-    "benchmark table2": RunKind(("table2.json", "table2.md", "table2.png"), resumable=True, shared=True),
 }
 
 

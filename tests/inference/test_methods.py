@@ -11,8 +11,8 @@ from rfdropo_bayes.inference import methods
 
 from .toys import Decay, Spring
 
-# Those that need an optional package, no rollouts or a gradient have tests of their own.
-OTHERS = ("bayessim", "npdr", "udr", "nuts", "nested")
+# Those that need a gradient or a trace have tests of their own.
+OTHERS = ("nuts", "nested")
 
 
 @pytest.mark.parametrize(

@@ -83,12 +83,6 @@ def test_a_folder_in_which_another_program_is_running_is_refused_until_that_has_
     finish(tmp_path, overwrite=True)
 
 
-def test_programs_of_one_study_share_its_folder(tmp_path):
-    with run_folder(tmp_path, "benchmark table2"), run_folder(tmp_path, "benchmark table2", resume=True):
-        pass
-    assert json.loads((tmp_path / "run.json").read_text())["status"] == "done"
-
-
 def test_results_without_a_record_are_not_replaced_either(tmp_path):
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InputError, match="holds a finished run"):

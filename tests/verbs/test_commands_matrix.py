@@ -142,7 +142,7 @@ def bench(request, tmp_path_factory, bar_mesh) -> Bench:
 def test_every_command_is_in_the_matrix() -> None:
     """Those of a calibration; lists, training and motors have tests of their own."""
     source = Path(__file__).read_text()
-    elsewhere = {"robots", "mechanisms", "formats", "methods", "benchmark", "reference"}
+    elsewhere = {"robots", "mechanisms", "formats", "methods", "reference"}
     elsewhere |= {"train", "evaluate", "drives", "deploy", "doctor", "home"}
     names = {command.name or command.callback.__name__ for command in app.registered_commands}
     assert {name for name in names - elsewhere if f'"{name}"' not in source} == set()

@@ -28,8 +28,8 @@ from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
-from rfdropo_bayes.studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
 
 REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
 MOTIONS = 4  # rollouts after which a law of the motion has the motion that it makes

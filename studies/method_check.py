@@ -1,4 +1,4 @@
-"""``rfdropo calibrate --check sbc``: is the method calibrated for this experiment's robot, commands and priors?"""
+"""``python -m studies sbc``: is the method calibrated for this experiment's robot, commands and priors?"""
 
 from __future__ import annotations
 
@@ -13,21 +13,19 @@ from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
-from rfdropo_bayes.inference import sbc
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import LOG, hashes, run_folder
 from rfdropo_bayes.verbs.calibrate import inference_options
+from studies import sbc
 
-CHECKS = ("sbc",)
 MOST_FAILURES = 100
 
 
 def run_check(
     model: Model,
     out: Path,
-    check: str,
     *,
     datasets: int = 200,
     resume: bool = False,
@@ -41,17 +39,14 @@ def run_check(
         the content of ``sbc.json``.
 
     Raises:
-        InputError: bad input, an unknown check, or a prior that hardly ever gives a rollout that ends well.
+        InputError: bad input, or a prior that hardly ever gives a rollout that ends well.
     """
-    if check not in CHECKS:
-        raise InputError(f"unknown check {check!r}", where="--check", remedy=f"one of {', '.join(CHECKS)}")
     chosen, fitted = model.settings, model.recordings("fit")
     problem = model.problem(fitted)
     options = inference_options(chosen.inference)
     make_config(chosen.inference.method, options)
     settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes(fitted)}
-    settings["options"] = {"check": check}
-    with run_folder(out, "check", **settings, resume=resume, overwrite=overwrite) as out:
+    with run_folder(out, "sbc", **settings, resume=resume, overwrite=overwrite) as out:
         with Progress("sbc", show=None, log=out / LOG) as progress:
             found = sbc.calibrate(
                 problem,

@@ -22,9 +22,9 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Mechanism
-from rfdropo_bayes.studies.fresh_laws import LAWS, CableEffect, HystereticCable, LaggingCable
-from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, arm_xml, write_arm
 from rfdropo_bayes.verbs.simulate import simulate
+from studies.fresh_laws import LAWS, CableEffect, HystereticCable, LaggingCable
+from studies.mujoco_truth import ENGINE_EFFECTS, arm_xml, write_arm
 
 KINDS = ("library", "unknown", "mujoco")
 FROM_LIBRARY, UNKNOWN = 3, 2  # effects of a target; MuJoCo's has as many as one with unknown laws

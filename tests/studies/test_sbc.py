@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import methods, sbc
+from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 from rfdropo_bayes.posteriors import central_interval
-
-from .toys import LinearGaussian
+from studies import sbc
+from tests.inference.toys import LinearGaussian
 
 KEY, DATASETS = jax.random.key(3), 100
 

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.studies.mujoco_truth import (
+from studies.mujoco_truth import (
     CABLE,
     CABLE_DAMPING,
     CONTROL,
@@ -144,7 +144,7 @@ def _elastica() -> Any:
     try:
         import elastica
     except ImportError:
-        remedy = 'install it: pip install "rfdropo_bayes[peers]"'
+        remedy = "install it: pip install -r studies/requirements.txt"
         raise InputError("PyElastica is not installed", where="--truth pyelastica", remedy=remedy) from None
     return elastica
 

@@ -1,4 +1,4 @@
-"""``rfdropo benchmark audit``: how often the audit is right, on data sets with effects hidden in them."""
+"""``python -m studies audit``: how often the audit is right, on data sets with effects hidden in them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from rfdropo_bayes.interrupts import running
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import CommandsTable
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.studies.fits import Job, run_fits
-from rfdropo_bayes.studies.hidden_effects import EARLIER, Hidden, Setting, hide
 from rfdropo_bayes.verbs.audit import JOURNAL, Workshop, audit
+from studies.fits import Job, run_fits
+from studies.hidden_effects import EARLIER, Hidden, Setting, hide
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden
@@ -132,7 +132,7 @@ def run_study(
     chosen = _conditions(conditions)
     unknown = [name for name in [*mechanisms, *exclude] if name not in REGISTRY]
     if unknown:
-        raise InputError(f"unknown mechanism {unknown[0]!r}", where="benchmark audit")
+        raise InputError(f"unknown mechanism {unknown[0]!r}", where="--hide")
     library = [name for name in (mechanisms or REGISTRY) if name not in exclude]
     jobs = [{"condition": c.name, "index": k, "seed": seed} for k in range(datasets) for c in chosen]
     one = partial(_one, library=library, exclude=list(exclude), folder=out / "data")

@@ -1,4 +1,4 @@
-"""``rfdropo benchmark table1``: the paper's Table I with its rivals and with truths that its table lacks."""
+"""``python -m studies table1``: the paper's Table I with its rivals and with truths that its table lacks."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
-from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.model.run_folder import LOG, run_folder
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.studies.comparison import RIVALS, ROWS, fit, misleads
-from rfdropo_bayes.studies.fits import finished, run_fits
-from rfdropo_bayes.studies.virtual_tasks import TASKS
+from studies.comparison import RIVALS, ROWS, fit, misleads
+from studies.fits import finished, run_fits
+from studies.rivals import import_sbi
+from studies.virtual_tasks import TASKS
 
 PAPER = {  # mean squared error and its deviation, Table I
     "TrunkReach": {"BayesSim": (16.60, 0.30), "NPDR": (8.38, 3.22), "RF-DROPO": (1.70, 1.93)},
@@ -74,7 +74,7 @@ class Table1Size:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if value < (0 if name == "seed" else 1):
-                raise InputError(f"{name} = {value} is too small", where="benchmark table1")
+                raise InputError(f"{name} = {value} is too small", where="table1")
 
 
 def run_table1(
@@ -103,7 +103,7 @@ def run_table1(
     # A study may grow: more truths, rows and tasks go on with the fits that are there.
     options = {"budget": size.budget, "actions": size.actions, "seed": size.seed}
     going_on = resume or only_done
-    with run_folder(out, "benchmark table1", options=options, resume=going_on, overwrite=overwrite) as out:
+    with run_folder(out, "table1", options=options, resume=going_on, overwrite=overwrite) as out:
         left_out = _without_sbi(rows)
         jobs = list_jobs(size, [row for row in rows if row not in left_out], tasks)
         ledger = out / "fits.jsonl"

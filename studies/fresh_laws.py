@@ -1,5 +1,5 @@
 """Effects of single drives that no mechanism of the library has, for robots that policies have never met. An experiment
-file asks for one as ``rfdropo_bayes.studies.fresh_laws:Crosstalk``; audits do not know them."""
+file asks for one as ``studies.fresh_laws:Crosstalk``; audits do not know them."""
 
 from __future__ import annotations
 

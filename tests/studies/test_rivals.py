@@ -14,9 +14,8 @@ import pytest
 from rfdropo_bayes.bayes.problem import RolloutDefaults
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.rivals import StandardPrior, cross_correlation_summary, informative, thinned_summary
-
-from .toys import LinearGaussian, Spring
+from studies.rivals import StandardPrior, cross_correlation_summary, informative, thinned_summary
+from tests.inference.toys import LinearGaussian, Spring
 
 KEY = jax.random.key(9)
 needs_sbi = pytest.mark.skipif(importlib.util.find_spec("sbi") is None, reason="the optional package sbi")
@@ -85,7 +84,7 @@ def test_without_the_package_the_remedy_is_named(monkeypatch):
         return real(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(InputError, match=r'pip install "rfdropo_bayes\[sbi\]"'):
+    with pytest.raises(InputError, match=r"studies/requirements.txt"):
         methods.run(Spring(), "bayessim", {}, KEY)
 
 

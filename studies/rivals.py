@@ -4,7 +4,7 @@
 - NPDR (Muratore et al. 2021): sequential neural posterior estimation (SNPE-C) with a masked autoregressive flow.
 - UDR: uniform domain randomisation over random sub-ranges; it looks at no data.
 
-The first two come from the package ``sbi``, the optional extra of that name. They see simulated trajectories with the
+The first two come from the package ``sbi`` (studies/requirements.txt). They see simulated trajectories with the
 observation noise of the model on them and infer all parameters, in unconstrained coordinates standardised by the prior.
 """
 
@@ -179,7 +179,7 @@ def import_sbi() -> tuple[Any, Any]:
         raise InputError(
             f"BayesSim and NPDR need the package sbi ({error})",
             where="[inference] method",
-            remedy='install it: pip install "rfdropo_bayes[sbi]"',
+            remedy="install it: pip install -r studies/requirements.txt",
         ) from None
     return torch, sbi
 

@@ -1,4 +1,4 @@
-"""``rfdropo benchmark table2``: the paper's Table II. Policies of every method meet a robot they never touched.
+"""``python -m studies table2``: the paper's Table II. Policies of every method meet a robot they never touched.
 
 The robot is a simulated one that differs from its model: the target. A row of the table is a way to choose the
 parameters that a policy is trained under. A cell is one row, task and seed: a fit, a training and an evaluation, each
@@ -107,7 +107,7 @@ class Table2Size:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if name != "exact_oracle" and value <= 0:
-                raise InputError(f"{name} = {value} is too small", where="benchmark table2")
+                raise InputError(f"{name} = {value} is too small", where="table2")
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def run_table2(
             raise InputError(f"unknown row {name!r}", where="--row", remedy=f"some of {', '.join(ROWS)}")
     options = {"episodes": size.episodes, "budget": size.budget, "target": target.name}
     going_on = resume or only_done
-    with run_folder(out, "benchmark table2", options=options, resume=going_on, overwrite=overwrite) as out:
+    with run_folder(out, "table2", options=options, resume=going_on, overwrite=overwrite) as out:
         study = Study({path.stem: path for path in experiments}, target, audit, out, size)
         if overwrite:
             _clear(study)

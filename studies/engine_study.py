@@ -1,4 +1,4 @@
-"""``rfdropo benchmark audit --truth ENGINE``: effects in an arm that another engine moves, audited with our body.
+"""``python -m studies audit --truth ENGINE``: effects in an arm that another engine moves, audited with our body.
 
 The two engines differ where nothing is hidden, too. That difference is audited once, on recordings of its own, and what
 the audit names is adopted: the model with it is the base of all audits that follow. Three repeats of one random
@@ -29,12 +29,12 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.studies.fits import Job, run_fits
-from rfdropo_bayes.studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
-from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, EngineArm, EngineEffect, MuJoCoArm
-from rfdropo_bayes.studies.pyelastica_truth import ELASTICA_EFFECTS, ElasticaArm
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.audit import Workshop, audit, build_problem
+from studies.fits import Job, run_fits
+from studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
+from studies.mujoco_truth import ENGINE_EFFECTS, EngineArm, EngineEffect, MuJoCoArm
+from studies.pyelastica_truth import ELASTICA_EFFECTS, ElasticaArm
 
 REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
 FITTED = REPEATS + OTHERS

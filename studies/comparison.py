@@ -15,7 +15,7 @@ from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.posteriors import central_interval
-from rfdropo_bayes.studies.virtual_tasks import TASKS, InferenceTask, draw_truth, excited, task_problem
+from studies.virtual_tasks import TASKS, InferenceTask, draw_truth, excited, task_problem
 
 WIDTH = 4.0  # the paper's error is measured with every search range scaled to [0, 4]
 PREDICTED = 64  # draws behind a prediction

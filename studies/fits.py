@@ -78,7 +78,7 @@ def _client(cluster: str) -> Any:
         from distributed import Client, LocalCluster
     except ImportError:
         raise InputError(
-            "Dask is not installed", where="--cluster", remedy='install it: pip install "rfdropo_bayes[cluster]"'
+            "Dask is not installed", where="--cluster", remedy="install it: pip install -r studies/requirements.txt"
         ) from None
     try:
         # One thread to a worker: a fit uses the processors itself.
