@@ -1,4 +1,4 @@
-"""Commands around the audit: what the simulator lacks, what to measure next, how often the audit is right."""
+"""Commands around the audit: what the simulator lacks, and what to measure next."""
 
 from __future__ import annotations
 
@@ -36,10 +36,6 @@ def audit(
         tuple[str, str] | None,
         typer.Option("--between", metavar="GROUP GROUP", help="name what differs between two of [model.groups]"),
     ] = None,
-    separate: Annotated[
-        bool,
-        typer.Option("--separate", help="only say which mechanisms of [separation] the recordings tell apart"),
-    ] = False,
     seed: Seed = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -49,19 +45,8 @@ def audit(
 ) -> None:
     """Name what the simulator lacks. Writes audit.json, extended.toml and report.html."""
     see_calibration(base, "--base")
-    if separate and between is not None:
-        raise InputError("groups are compared by the search only", where="--separate", remedy="leave --between out")
-    command = "separate" if separate else "audit"
-    folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
+    folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
-
-    if separate:
-        from rfdropo_bayes.verbs.separate import TABLE, separate_mechanisms
-
-        model, said = Model.read(experiment, overrides), say_progress(quiet)
-        told = separate_mechanisms(model, folder, base=base, seed=seed, resume=resume, overwrite=overwrite, report=said)
-        say(told, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
-        return
     from rfdropo_bayes.verbs.audit import audit as ask
 
     found = ask(

@@ -94,9 +94,6 @@ def calibrate(
 def simulate(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    balance: Annotated[
-        bool, typer.Option("--balance", help="also write base reaction, energies and work to the NetCDF")
-    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -109,7 +106,7 @@ def simulate(
     from rfdropo_bayes.verbs.simulate import simulate_all
 
     say_step(f"simulating the recordings of {experiment}", show=False if quiet or as_json else None)
-    found = simulate_all(Model.read(experiment, overrides), folder, balance=balance, overwrite=overwrite)
+    found = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
     show_simulation(found, quiet=quiet, as_json=as_json)
 
 

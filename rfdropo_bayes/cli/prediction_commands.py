@@ -37,9 +37,6 @@ def predict(
     start: Annotated[
         str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
     ] = None,
-    rows: Annotated[
-        str | None, typer.Option("--rows", metavar="FIRST:LAST", help="observation rows, counted from 0, both included")
-    ] = None,
     episode: Episode = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
     group: PredictedGroup = None,
@@ -67,7 +64,6 @@ def predict(
         _from_here(commands),
         out,
         start=None if start is None else _from_here(start),
-        rows=_window(rows),
         episode=episode,
         seed=seed,
         group=group,
@@ -88,9 +84,6 @@ def adapt(
         float | None, typer.Option(help="length of the beginning that is used, in seconds; all by default")
     ] = None,
     group: Group = None,
-    experiment: Annotated[
-        Path | None, typer.Option("--experiment", help="the experiment file, where DIR holds a posterior alone")
-    ] = None,
     seed: Annotated[int | None, typer.Option(help="seed; that of the experiment by default")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -110,7 +103,7 @@ def adapt(
     )
     found = run_adaptation(
         run,
-        fitted_model(run, experiment, overrides),
+        fitted_model(run, overrides),
         entry,
         out,
         seconds=seconds,
@@ -125,12 +118,3 @@ def adapt(
 def _from_here(name: str) -> str:
     """A path that counts from the current folder, where there is such a recording; else as the experiment has it."""
     return str(Path(name).resolve()) if Path(name).exists() else name
-
-
-def _window(rows: str | None) -> tuple[int, int] | None:
-    if rows is None:
-        return None
-    first, _, last = rows.partition(":")
-    if not (first.isdecimal() and last.isdecimal()):
-        raise InputError(f"{rows!r} is not FIRST:LAST", where="--rows", remedy="e.g. --rows 10000:15000")
-    return int(first), int(last)

@@ -120,7 +120,7 @@ def self_contained(
     placed = copy.deepcopy(dict(tables))
     if "robot" in placed and placed["robot"] not in made:
         placed["robot"] = _robot_placed(str(placed["robot"]), folder, out)
-    for table, key in (("model", "mechanisms"), ("audit", "candidates"), ("separation", "mechanisms")):
+    for table, key in (("model", "mechanisms"), ("audit", "candidates")):
         if key in placed.get(table, {}):
             placed[table][key] = [code_placed(name, folder, out) for name in placed[table][key]]
     mesh = placed.get("simulator", {}).get("tetrahedra", {})

@@ -52,7 +52,6 @@ COMMANDS = {
     "simulate": RunKind(("simulation.json",)),
     "predict": RunKind(("prediction.json", "prediction.nc", "prediction.csv")),
     "audit": RunKind(("audit.json", "extended.toml", PAGE), resumable=True),
-    "separate": RunKind(("separation.json", "separation.md", "separation.png"), resumable=True),
     "design": RunKind(("design.json", "next_commands.csv")),
     "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl", PAGE), resumable=True),
     "evaluate": RunKind(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),

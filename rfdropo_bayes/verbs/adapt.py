@@ -369,16 +369,15 @@ def run_adaptation(
     return adapt(fit, found[0], out=out, **options)
 
 
-def fitted_model(run: Path, experiment: Path | None = None, overrides: Sequence[str] | None = None) -> Model:
-    """The model of a run's folder, or of the experiment file where the folder holds a posterior alone.
+def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
+    """The model of a run's folder.
 
     Raises:
         InputError: no file says which model.
     """
-    path = run / CONFIG if experiment is None else experiment
-    if not path.is_file():
-        raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
-    return Model.read(path, overrides)
+    if not (run / CONFIG).is_file():
+        raise InputError(f"holds no {CONFIG}", where=str(run), remedy="name the folder of a calibration")
+    return Model.read(run / CONFIG, overrides)
 
 
 def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:

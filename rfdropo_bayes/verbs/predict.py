@@ -201,7 +201,6 @@ def run_prediction(
     out: Path,
     *,
     start: str | None = None,
-    rows: tuple[int, int] | None = None,
     episode: int | None = None,
     seed: int | None = None,
     group: str | None = None,
@@ -218,7 +217,6 @@ def run_prediction(
         posterior: folder of its calibration.
         commands, start: see `data.load_unseen`.
         out: folder to write to.
-        rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
         episode: of a LeRobotDataset.
         seed: of the draws; that of the experiment by default.
         group: see `predict`.
@@ -232,10 +230,10 @@ def run_prediction(
     if read.data is None:
         raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN), episode)
+    unseen = load_unseen(read.data, folder, commands, start, begun=record.attrs.get(BEGUN), episode=episode)
     fit = Calibration(record, {}, "", model, Path(posterior))
     found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
-    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "seed": seed}
     options |= {"group": group, "episode": episode}
     settings: dict[str, Any] = {
         "tables": model.tables(),

@@ -121,7 +121,7 @@ def test_replicates_that_disagree_are_named():
 def test_stages_say_that_particles_stayed_and_where_a_budget_ran_out():
     """A run of one row, as from around optima, has no row to name."""
     moved = {"budget_exhausted": False, "progress": 1.0, "ess": 0.6, "correlation": 0.2}
-    settings = 3743.15, 0.3
+    settings = (3743.15,)
     assert stage_cautions([moved, moved | {"final": True}], *settings) == []
     (stuck,) = stage_cautions([moved | {"correlation": 0.9}, moved | {"correlation": 0.97, "final": True}], *settings)
     assert stuck.sentence.startswith("the last moves left the particles 0.97 correlated")

@@ -227,7 +227,6 @@ def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkey
         ["calibrate", "none.toml"],
         ["audit", "none.toml"],
         ["design", "none.toml"],
-        ["audit", "none.toml", "--separate"],
         ["simulate", "none.toml"],
         ["predict", str(DEMO), "--posterior", "none", "--commands", "x.nc", "--out", "next"],
         ["calibrate", str(DEMO), "--set", 'data.fit=["none.nc"]'],

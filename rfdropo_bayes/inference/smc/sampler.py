@@ -62,9 +62,6 @@ class SmcConfig(MethodOptions, called="SMC"):
         blocks: number of times the horizon is lengthened.
         spacing: of the blocks: "geometric" or "linear".
         target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
-        degrees: degrees of freedom of the Student-t behind the proposals.
-        acceptance: acceptance rate that the step size is adapted to.
-        correlation: moves of a stage end once no direction is more correlated than this with its start.
         max_moves: most moves in a stage.
         start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
         draws: fewer particles, of all replicates together, move on with the rest of a budget: see `tempering.prolong`.
@@ -76,9 +73,6 @@ class SmcConfig(MethodOptions, called="SMC"):
     blocks: int = 6
     spacing: str = "geometric"
     target_ess: float = 0.5
-    degrees: float = 8.0
-    acceptance: float = 0.3
-    correlation: float = 0.3
     max_moves: int = 20
     start: str = "auto"
     draws: int = 400
@@ -89,17 +83,16 @@ class SmcConfig(MethodOptions, called="SMC"):
             raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"one of {', '.join(STARTS)}")
         if self.spacing not in SPACINGS:
             raise InputError(f"unknown spacing {self.spacing!r}", where=where, remedy=f"one of {', '.join(SPACINGS)}")
-        for name in ("target_ess", "acceptance", "correlation"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise InputError(f"{name} = {getattr(self, name)} is not between 0 and 1", where=where)
+        if not 0.0 < self.target_ess < 1.0:
+            raise InputError(f"target_ess = {self.target_ess} is not between 0 and 1", where=where)
         for name in ("replicates", "blocks", "max_moves", "draws"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
         if self.particles is not None and self.particles < 10:
             raise InputError(f"particles = {self.particles} is less than 10", where=where)
-        if self.degrees <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
-            raise InputError("degrees and rollouts must be positive", where=where)
+        if self.rollouts is not None and self.rollouts <= 0.0:
+            raise InputError("rollouts must be positive", where=where)
 
     @property
     def chains(self) -> int:
@@ -109,7 +102,7 @@ class SmcConfig(MethodOptions, called="SMC"):
     @property
     def tuning(self) -> Tuning:
         """What a stage needs of this."""
-        return Tuning(self.target_ess, self.degrees, self.acceptance, self.correlation, self.max_moves)
+        return Tuning(self.target_ess, self.max_moves)
 
 
 class ReplicatePlan(NamedTuple):
@@ -377,7 +370,7 @@ def _result(problem: Problem, config: SmcConfig, plan: ReplicatePlan, states: li
         cautions=[
             *prior_cautions(problem, draws),
             *exclusion_cautions(spent.excluded, spent.evaluations),
-            *stage_cautions(trace, config.rollouts, config.correlation),
+            *stage_cautions(trace, config.rollouts),
             *replicate_cautions(draws, values),
         ],
         seconds=sum(state.seconds for state in states),
