@@ -43,7 +43,7 @@ COMMANDS = (
     "rfdropo check finger/experiment.toml",
     "rfdropo check finger/experiment.toml --out reports/again",
     "rfdropo calibrate finger/experiment.toml --set inference.method=laplace --out reports/arm",
-    "rfdropo audit finger/experiment.toml --base reports/arm --out reports/audit --set audit.minutes=300",
+    "rfdropo audit finger/experiment.toml --from reports/arm --out reports/audit --set audit.minutes=300",
     "rfdropo calibrate reports/audit/extended.toml --set inference.method=laplace --out reports/mended",
     "rfdropo predict reports/mended --commands data/trial_03.csv --out reports/next",
 )

@@ -118,9 +118,9 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.found.terms))
         words = f"Look at {looks}: the library has no mechanism that acts so."
     elif not answer.fitted:
-        words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--base)."
+        words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--from)."
     elif not answer.converged:
-        words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
+        words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --from."
     elif answer.doubts.suspected is not None:
         words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
     elif answer.target.noise.doubtful:

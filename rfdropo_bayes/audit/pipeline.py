@@ -399,7 +399,7 @@ def base_model(
         raise InputError(
             "the time was up before the base model was fitted",
             where=(deadline or Deadline()).where,
-            remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
+            remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--from)",
         ) from None
 
 

@@ -137,7 +137,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         left = answer.base.residual
         return (
             f"No verdict: the fit of the base model has not converged (sum of squares {left @ left:.3g} for "
-            f"{np.count_nonzero(left)} values, and better points beside it). Start from a calibration with --base, "
+            f"{np.count_nonzero(left)} values, and better points beside it). Start from a calibration with --from, "
             "narrow the priors, or shorten [simulator] time_step."
         )
     if answer.verdict == NO_DISCREPANCY:

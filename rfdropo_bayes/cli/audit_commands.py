@@ -17,21 +17,20 @@ from rfdropo_bayes.cli.options import (
     Resume,
     Seed,
     folder_for,
-    say_progress,
     see_calibration,
 )
 from rfdropo_bayes.cli.terminal_summary import say, show_audit
 from rfdropo_bayes.errors import InputError
 
-Base = Annotated[
-    Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
+Fit = Annotated[
+    Path | None, typer.Option("--from", help="folder of an earlier calibration, to start the base model from")
 ]
 
 
 def audit(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    base: Base = None,
+    fit: Fit = None,
     between: Annotated[
         tuple[str, str] | None,
         typer.Option("--between", metavar="GROUP GROUP", help="name what differs between two of [model.groups]"),
@@ -44,7 +43,7 @@ def audit(
     overrides: Overrides = None,
 ) -> None:
     """Name what the simulator lacks. Writes audit.json, extended.toml and report.html."""
-    see_calibration(base, "--base")
+    see_calibration(fit, "--from")
     folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.audit import audit as ask
@@ -52,12 +51,12 @@ def audit(
     found = ask(
         Model.read(experiment, overrides),
         out=folder,
-        base=base,
+        fit=fit,
         between=between,
         seed=seed,
         resume=resume,
         overwrite=overwrite,
-        report=say_progress(quiet),
+        show=not quiet,
     )
     show_audit(found.content, folder, quiet=quiet, as_json=as_json)
 
@@ -65,7 +64,7 @@ def audit(
 def design(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    base: Base = None,
+    fit: Fit = None,
     adapt: Annotated[
         bool, typer.Option("--adapt", help="propose the shortest recording of another day that rfdropo adapt needs")
     ] = False,
@@ -84,9 +83,9 @@ def design(
     overrides: Overrides = None,
 ) -> None:
     """Propose commands that tell causes apart. Writes next_commands.csv and design.json."""
-    see_calibration(base, "--base")
-    if adapt and base is None:
-        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --base")
+    see_calibration(fit, "--from")
+    if adapt and fit is None:
+        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --from")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.results.calibrated import Calibration
@@ -95,11 +94,11 @@ def design(
     from rfdropo_bayes.verbs.design_day import design_day
 
     model = Model.read(experiment, overrides)
-    options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "report": say_progress(quiet)}
-    if adapt and base is not None:
-        found = design_day(Calibration.of_posterior(base, model), seconds=seconds, group=group, **options)
+    options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "show": not quiet}
+    if adapt and fit is not None:
+        found = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
     else:
-        found = propose(model, base=base, **options)
+        found = propose(model, fit=fit, **options)
     commands = folder / COMMANDS
     content = {**found.content, "commands": str(commands)}
     say(content, found.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)

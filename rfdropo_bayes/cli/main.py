@@ -73,21 +73,21 @@ def calibrate(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
-    start: Annotated[
+    fit: Annotated[
         Path | None,
         typer.Option("--from", help="folder of an earlier calibration of this robot, to start climbs from"),
     ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Fit the simulator to recordings. Writes posterior.nc, summary.json and report.html."""
-    see_calibration(start, "--from")
+    see_calibration(fit, "--from")
     folder = folder_for("calibrate", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
-    from rfdropo_bayes.verbs.calibrate import calibrate as fit
+    from rfdropo_bayes.verbs.calibrate import calibrate as run_fit
 
     shown = False if quiet else None
     model = Model.read(experiment, overrides)
-    found = fit(model, out=folder, start=start, resume=resume, overwrite=overwrite, show=shown)
+    found = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite, show=shown)
     show_calibration(found, experiment, quiet=quiet, as_json=as_json)
 
 

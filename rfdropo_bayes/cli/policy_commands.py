@@ -27,7 +27,7 @@ def train(
     experiment: Annotated[
         Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; not beside --from")
     ] = None,
-    calibration: Annotated[
+    fit: Annotated[
         Path | None, typer.Option("--from", help="folder of a calibration: its model, under draws of its posterior")
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="reach or push; that of the experiment by default")] = None,
@@ -42,11 +42,11 @@ def train(
     overrides: Overrides = None,
 ) -> None:
     """Train a policy and play it. Writes report.html, policy.onnx, its card and its learning curve."""
-    if (experiment is None) == (calibration is None):
+    if (experiment is None) == (fit is None):
         raise InputError("takes an experiment file or --from DIR", where="train", remedy="give one of them")
-    see_calibration(calibration, "--from")
-    if calibration is not None:
-        experiment, out = calibration / "config.toml", out or calibration.with_name(f"{calibration.name}_train")
+    see_calibration(fit, "--from")
+    if fit is not None:
+        experiment, out = fit / "config.toml", out or fit.with_name(f"{fit.name}_train")
     assert experiment is not None
     overrides = [*(overrides or []), *_task_and_goal(task, goal)]
     folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
@@ -56,9 +56,9 @@ def train(
     from rfdropo_bayes.verbs.train import train as learn
 
     model = Model.read(experiment, overrides)
-    if calibration is not None:
+    if fit is not None:
         model = with_training(model, {"randomisation": "posterior"})
-    found = learn(model, folder, posterior=calibration, resume=resume, overwrite=overwrite)
+    found = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
     done = f"after {found['steps']} steps in {found['seconds']:.0f} s: {learnt(found)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")

@@ -31,9 +31,7 @@ def predict(
     ],
     commands: Annotated[str, typer.Option("--commands", help="file of commands, in the format of the experiment")],
     out: Annotated[Path, typer.Option("--out", help="folder to write to")],
-    posterior: Annotated[
-        Path | None, typer.Option("--posterior", help="folder of its calibration; DIR by default")
-    ] = None,
+    fit: Annotated[Path | None, typer.Option("--from", help="folder of its calibration; DIR by default")] = None,
     start: Annotated[
         str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
     ] = None,
@@ -47,20 +45,20 @@ def predict(
 ) -> None:
     """Predict the motion under new commands. Writes mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
     if experiment.is_dir():
-        posterior, experiment = posterior or experiment, experiment / "config.toml"
-    if posterior is None:
-        raise InputError("no posterior was named", where="predict", remedy="add --posterior, or give a run's folder")
-    see_calibration(posterior, "--posterior")
+        fit, experiment = fit or experiment, experiment / "config.toml"
+    if fit is None:
+        raise InputError("no calibration was named", where="predict", remedy="add --from, or give a run's folder")
+    see_calibration(fit, "--from")
     look_through(experiment, overrides or [])
     check_folder(out, "predict", overwrite=overwrite)
     from rfdropo_bayes.inference.progress import say_step
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.predict import run_prediction
 
-    say_step(f"predicting {commands} with draws of {posterior}", show=False if quiet or as_json else None)
+    say_step(f"predicting {commands} with draws of {fit}", show=False if quiet or as_json else None)
     facts = run_prediction(
         Model.read(experiment, overrides),
-        posterior,
+        fit,
         _from_here(commands),
         out,
         start=None if start is None else _from_here(start),

@@ -71,7 +71,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
             console.print(sentence, soft_wrap=True)
     ready = experiment is None or found.verdict == "safe"
     words = (
-        ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--base", str(folder)]
+        ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--from", str(folder)]
     )
     console.print(f"next: {shlex.join(['rfdropo', *words, '--out', 'OUT'])}", soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import source_of
@@ -81,13 +82,13 @@ def audit(
     *,
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
-    base: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     noise: Mapping[str, float] | None = None,
     out: Path | str | None = None,
     resume: bool = False,
     overwrite: bool = False,
     workshop: Workshop | None = None,
-    report: Callable[[str], None] = lambda line: None,
+    show: bool | None = None,
     between: Between | None = None,
     **keys: Any,
 ) -> Audit:
@@ -99,14 +100,14 @@ def audit(
         runs: recordings that are fitted and screened.
         test: unseen recordings, which measure the gain.
         seed: of all that is random, 0 where no file says. The same seed gives the same answer.
-        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
         noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
             nothing was repeated.
         out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
         resume: go on from what an interrupted audit has left in ``out``.
         overwrite: start anew whatever ``out`` holds.
         workshop: see `build_problem`.
-        report: called with a line of words now and then.
+        show: whether to say now and then what is done, as in `calibrate`.
         between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
             Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
             What both lack is named, too.
@@ -124,20 +125,20 @@ def audit(
         groups = groups_at_hand(spec.groups, runs, test)
     else:
         groups, runs, test = find_groups(between, spec.groups, runs, test)
-    start = start_values(base)
+    start = start_values(fit)
     problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
     tables = model.record({"title": model.title, "seed": chosen}, {})
 
     def found(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
-        answer = ask(problem, report, journal, deadline)
+        answer = ask(problem, say_lines(show), journal, deadline)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
         return _audited(answer, model, tables, data, out)
 
     if out is None:
         return found(None)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
-    given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": chosen}
+    given: dict[str, Any] = {"from": fit.folder if isinstance(fit, Calibration) else fit, "seed": chosen}
     if groups is not None and groups.compared:
         given |= {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
@@ -431,11 +432,11 @@ def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stack
     return Stacked(tuple(parts))
 
 
-def start_values(base: Calibration | Path | None) -> dict[str, float] | None:
+def start_values(fit: Calibration | Path | None) -> dict[str, float] | None:
     """Posterior means of an earlier calibration, or of its folder."""
-    if base is None:
+    if fit is None:
         return None
-    content = base.content if isinstance(base, Calibration) else read_summary(Path(base) / SUMMARY)
+    content = fit.content if isinstance(fit, Calibration) else read_summary(Path(fit) / SUMMARY)
     return {name: float(row["mean"]) for name, row in content["parameters"].items()}
 
 

@@ -78,7 +78,7 @@ def calibrate(
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
     out: Path | str | None = None,
-    start: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
     show: bool | None = None,
@@ -92,7 +92,7 @@ def calibrate(
         test: recordings that no fit sees; the report says how well they are predicted.
         seed: of all that is random, 0 where no file says. The same seed gives the same draws.
         out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
-        start: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
+        fit: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
             recordings: climbs start from its optimum and draws. What is inferred, and from which data, does not change.
         resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
         overwrite: start anew whatever ``out`` holds.
@@ -106,20 +106,20 @@ def calibrate(
     table = model.settings.inference
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
-    problem = model.problem(runs, earlier_draws(start, name))
+    problem = model.problem(runs, earlier_draws(fit, name))
     options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
     said = {"method": name, **options}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
         {"seed": seed, "inference": None if method is None else said},
     )
-    fit = partial(_fit, Fitting(model, problem, config, runs, test, chosen))
+    work = partial(_fit, Fitting(model, problem, config, runs, test, chosen))
     if out is None:
-        return fit(None, describe(tables), resume=False, show=show)
+        return work(None, describe(tables), resume=False, show=show)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
-    settings |= {"options": {"from": start.folder if isinstance(start, Calibration) else start}, "texts": model.texts()}
+    settings |= {"options": {"from": fit.folder if isinstance(fit, Calibration) else fit}, "texts": model.texts()}
     with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
-        found = fit(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
+        found = work(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
         say_step("the fit is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
         found.save(folder)
     return found
@@ -152,7 +152,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
-def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None:
+def earlier_draws(fit: Calibration | Path | None, method: str) -> Batch | None:
     """What an earlier calibration, or its folder, says of where climbs may start; None without one.
 
     Its optimum where it has one, the first of the rows, and as often its draws: of many parameters that rollouts do not
@@ -161,7 +161,7 @@ def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None
     Raises:
         InputError: a folder that holds no posterior, or a method that does not climb.
     """
-    if start is None:
+    if fit is None:
         return None
     if method not in CLIMBING:
         raise InputError(
@@ -169,11 +169,11 @@ def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
         )
-    if isinstance(start, Calibration):
-        record, content = start.record, start.content
+    if isinstance(fit, Calibration):
+        record, content = fit.record, fit.content
     else:
-        record = PosteriorRecord.load(Path(start) / POSTERIOR)
-        content = read_summary(Path(start) / SUMMARY) if (Path(start) / SUMMARY).is_file() else {}
+        record = PosteriorRecord.load(Path(fit) / POSTERIOR)
+        content = read_summary(Path(fit) / SUMMARY) if (Path(fit) / SUMMARY).is_file() else {}
     draws = thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
     optimum = content.get("optimum") or {}
     if not set(draws) <= set(optimum):

@@ -291,7 +291,7 @@ def _markers(
     if known is None:
         raise InputError(
             "the posterior does not hold the noise of the positions",
-            where="--posterior",
+            where="--from",
             remedy="predict with the experiment that was calibrated",
         )
     recalled = Autoregression.from_dict(known)
@@ -332,7 +332,7 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec], of_gr
     if missing:
         raise InputError(
             f"the posterior holds {missing[0]!r}, which the experiment's model lacks",
-            where="--posterior",
+            where="--from",
             remedy="predict with the experiment that was calibrated, mechanisms included",
         )
     recordings = sorted({recording for names in scopes.values() for recording in names})

@@ -45,7 +45,7 @@ def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
     assert not content["base_fit_converged"]
     assert content["findings"] == []
     assert "the fit of the base model has not converged" in content["sentence"]
-    assert "--base" in content["next_experiment"]["sentence"]
+    assert "--from" in content["next_experiment"]["sentence"]
     assert "has not converged" in render_audit(shown(answer), content, "rough", "")
 
 

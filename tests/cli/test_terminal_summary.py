@@ -47,7 +47,7 @@ def test_a_calibration_is_shown_as_it_is(capsys):
 
 @pytest.mark.parametrize(
     ("verdict", "words"),
-    [("safe", "predict fit --commands FILE --out OUT"), ("unsafe", "audit 'own arm.toml' --base fit --out OUT")],
+    [("safe", "predict fit --commands FILE --out OUT"), ("unsafe", "audit 'own arm.toml' --from fit --out OUT")],
 )
 def test_a_calibration_says_what_to_type_next(capsys, verdict, words):
     content = {"headline": [], "details": {}, "parameters": {"modulus": ROW}, "method": "laplace"}

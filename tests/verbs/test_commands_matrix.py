@@ -189,7 +189,7 @@ def test_predict_says_where_new_commands_lead(bench, tmp_path) -> None:
         *(
             "predict",
             bench.experiment,
-            "--posterior",
+            "--from",
             bench.run,
             "--commands",
             bench.unseen,
@@ -255,7 +255,7 @@ def test_two_groups_of_recordings_are_compared(bench, tmp_path) -> None:
 @pytest.mark.parametrize("bench", ["demo"], indirect=True)
 def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
     rfdropo(
-        *("design", bench.experiment, "--base", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
+        *("design", bench.experiment, "--from", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
         overrides=[*bench.overrides, "model.per_group.young_modulus=1e5"],
     )
     proposed = pd.read_csv(tmp_path / "day" / "next_commands.csv")

@@ -169,7 +169,7 @@ def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
     assert "<img" in shown
     assert fit.report(tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
     back = rb.load(fit.folder)
-    np.testing.assert_array_equal(back.posterior.posterior["gain"], fit.posterior.posterior["gain"])
+    np.testing.assert_array_equal(back.idata.posterior["gain"], fit.idata.posterior["gain"])
     with pytest.raises(InputError, match=r"has no model: .*'lag'.*rb.load\(folder, model=model\)"):
         fitted_parts(back)  # no file describes a function
     back = rb.load(fit.folder, model=fit.model)
