@@ -40,7 +40,7 @@ test-slow: $(DEV) ## the slow tests, without those of studies, matrix and notebo
 test-studies: $(ALL) ## the tests of what is run for papers, in studies/
 	$(PYTEST) -n $(WORKERS) tests/studies
 
-# The rooms that compute. `make test-portable ROOMS="policies audit"` runs some of them: those that learn, sample and
+# The rooms that compute. `make test-portable ROOMS="policies discrepancy"` runs some of them: those that learn, sample and
 # search are where a test that rests on one processor shows, because a last bit becomes another curve there.
 test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
 	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)

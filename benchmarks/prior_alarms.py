@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
-from rfdropo_bayes.audit.fit import FitTarget, climb
-from rfdropo_bayes.audit.prior_ends import decided_by_priors
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
+from rfdropo_bayes.discrepancy.fit import FitTarget, climb
+from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
 from rfdropo_bayes.files import read_lines
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.model.model_spec import spec_of

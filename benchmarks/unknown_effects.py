@@ -29,9 +29,9 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.audit.law_search import law_search
-from rfdropo_bayes.audit.pipeline import base_model
-from rfdropo_bayes.audit.verdict import DESCRIBED
+from rfdropo_bayes.discrepancy.law_search import law_search
+from rfdropo_bayes.discrepancy.pipeline import base_model
+from rfdropo_bayes.discrepancy.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.robots import Robot

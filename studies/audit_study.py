@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
-from rfdropo_bayes.audit.audit_record import STIFFNESS
-from rfdropo_bayes.audit.fit import climb
-from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
+from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
+from rfdropo_bayes.discrepancy.audit_record import STIFFNESS
+from rfdropo_bayes.discrepancy.fit import climb
+from rfdropo_bayes.discrepancy.pipeline import Answer
+from rfdropo_bayes.discrepancy.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import output_folder, read_lines, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress

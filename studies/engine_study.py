@@ -18,8 +18,8 @@ import jax
 import numpy as np
 from scipy.stats import binomtest
 
-from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.discrepancy.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, read_lines, write_text
 from rfdropo_bayes.inference.progress import Progress

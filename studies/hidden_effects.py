@@ -18,15 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
-from rfdropo_bayes.audit.fit import FitTarget, climb
-from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.channels.tension import reading_size
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
+from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
+from rfdropo_bayes.discrepancy.fit import FitTarget, climb
+from rfdropo_bayes.discrepancy.score import project_out, span
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable

@@ -23,7 +23,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
-from rfdropo_bayes.audit.verdict import NO_VERDICT
+from rfdropo_bayes.discrepancy.verdict import NO_VERDICT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress

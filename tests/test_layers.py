@@ -25,9 +25,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "mechanisms": {"robots", "fem", "simulators"},
     "bayes": {"data", "posteriors", "robots", "simulators", "mechanisms"},
     "inference": {"posteriors", "bayes"},
-    "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
+    "discrepancy": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
     "prediction": {"data", "posteriors", "simulators", "bayes", "inference"},
-    "report": {"data", "posteriors", "bayes", "inference", "audit"},
+    "report": {"data", "posteriors", "bayes", "inference", "discrepancy"},
     "policies": {"posteriors", "robots", "simulators", "mechanisms", "inference", "report"},
     "deployment": {"data", "robots"},
 }
@@ -98,11 +98,11 @@ def test_every_room_is_in_the_table() -> None:
 
 def test_the_parser_sees_every_way_to_import() -> None:
     source = (
-        "import rfdropo_bayes.fem.layered\nfrom rfdropo_bayes import audit\nfrom . import cables\n"
+        "import rfdropo_bayes.fem.layered\nfrom rfdropo_bayes import discrepancy\nfrom . import cables\n"
         "from ..data import Trajectory\nfrom .. import report\ndef late():\n    from rfdropo_bayes.cli import main\n"
     )
     imported = imported_modules(source, ["rfdropo_bayes", "robots"])
-    assert forbidden_rooms("robots", imported) == {"fem", "audit", "data", "report", "cli"}
+    assert forbidden_rooms("robots", imported) == {"fem", "discrepancy", "data", "report", "cli"}
 
 
 def test_imports_come_from_above() -> None:

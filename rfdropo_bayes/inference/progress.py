@@ -151,14 +151,13 @@ def say_lines(show: bool | None = None) -> Callable[[str], None]:
     """A function that says on stderr what a run has found so far, with the seconds since now, and answers Ctrl-C.
 
     Args:
-        show: False says nothing, see `Progress`; None says it where stderr is a terminal.
+        show: False says nothing, see `Progress`.
     """
     began = time.monotonic()
-    shown = sys.stderr.isatty() if show is None else show
 
     def say(line: str) -> None:
         check_interrupt()
-        if shown:
+        if show is not False:
             print(f"  {time.monotonic() - began:5.0f} s  {line}", file=sys.stderr, flush=True)
 
     return say

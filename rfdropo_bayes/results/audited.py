@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import xarray as xr
 
-from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, whole, write_json, write_text
 from rfdropo_bayes.model.experiment import Experiment

@@ -11,26 +11,26 @@ from typing import Any
 import jax
 import numpy as np
 
-from rfdropo_bayes.audit.audit_problem import AuditProblem
-from rfdropo_bayes.audit.audit_record import next_experiment, record
-from rfdropo_bayes.audit.candidates import Candidate
-from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.audit.deadline import Deadline
-from rfdropo_bayes.audit.differences import Groups, with_differences
-from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
-from rfdropo_bayes.audit.fit import widening
-from rfdropo_bayes.audit.fixed_quantities import OwnParameter, with_fixed_quantities
-from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
-from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.law_words import law_tables
-from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.audit.pipeline import audit as ask
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
+from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
+from rfdropo_bayes.discrepancy.candidates import Candidate
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.deadline import Deadline
+from rfdropo_bayes.discrepancy.differences import Groups, with_differences
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Rules
+from rfdropo_bayes.discrepancy.fit import widening
+from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, with_fixed_quantities
+from rfdropo_bayes.discrepancy.forward import Lanes, RoutedLanes
+from rfdropo_bayes.discrepancy.journal import Journal
+from rfdropo_bayes.discrepancy.law_words import law_tables
+from rfdropo_bayes.discrepancy.pipeline import Answer
+from rfdropo_bayes.discrepancy.pipeline import audit as ask
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named

@@ -15,19 +15,19 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.audit_problem import AuditProblem
-from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
-from rfdropo_bayes.audit.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
-from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
-from rfdropo_bayes.audit.fit import Fit, FitTarget
-from rfdropo_bayes.audit.inadequacy import seen_under
-from rfdropo_bayes.audit.law_search import Refit, law_search
-from rfdropo_bayes.audit.pipeline import base_model
-from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
+from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime
+from rfdropo_bayes.discrepancy.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, ExtensionSearch
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.inadequacy import seen_under
+from rfdropo_bayes.discrepancy.law_search import Refit, law_search
+from rfdropo_bayes.discrepancy.pipeline import base_model
+from rfdropo_bayes.discrepancy.screen import Screen
 from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
