@@ -92,49 +92,42 @@ def without_names(lines: Sequence[str], separator: str) -> bool:
     )
 
 
-def units_below(lines: Sequence[str], separator: str) -> list[str] | None:
-    """The units that the second line of a table tells, one for each column; None if it tells none."""
-    if len(lines) < 3:
+def units_above(rows: Sequence[str], separator: str) -> list[str] | None:
+    """The units that the line below the names tells, one for each column; None if it is a row of values."""
+    if len(rows) < 2:
         return None
-    cells = [cell.strip().strip('"').strip("[]() ") for cell in cells_of(lines[1], separator)]
+    cells = [cell.strip().strip('"').strip("[]() ") for cell in cells_of(rows[0], separator)]
     told = [cell for cell in cells if cell]
     known = sum(bool(_UNITS.fullmatch(cell)) for cell in told)
     words = [cell for cell in told if not is_value(cell)]
-    below = cells_of(lines[2], separator)
+    below = cells_of(rows[1], separator)
     numbered = len(below) == len(cells) and 2 * sum(is_value(cell) for cell in below) >= len(cells)
     return cells if numbered and words and 2 * known >= len(told) and 2 * len(words) > len(told) else None
 
 
-def check_given_names(path: Path, lines: Sequence[str], separator: str, names: Sequence[str] | None) -> None:
-    """Compare the names that a user gives with the first line of a file.
+def header_of(path: Path, lines: Sequence[str], separator: str, names: Sequence[str] | None) -> list[str]:
+    """The names of the columns: those in the first line, or ``names`` if the first line holds values.
 
     Raises:
-        InputError: a file without names and none given, names given for a file with names, or another number of them.
+        InputError: a first line of values and no names for them, or another number of names.
     """
-    first = cells_of(lines[0], separator)
-    missing = without_names(lines, separator)
-    if missing and names is None:
+    first = [cell.strip() for cell in cells_of(lines[0], separator)]
+    if not without_names(lines, separator):
+        return first
+    if names is None:
         raise InputError(
-            f"the first line holds numbers, not the names of its {len(first)} columns: {first_rows(lines[:2])}",
+            f"the first line holds values, not the names of its {len(first)} columns: {first_rows(lines[:2])}",
             where=str(path),
             remedy=f"write a line of {len(first)} names above it, or give names = [...] in [data.columns] (init: "
             '--names "t,c1,c2,tip_x,tip_y,tip_z")',
         )
-    if names is None:
-        return
-    if not missing:
-        shown = ", ".join(cell.strip() for cell in first)
-        raise InputError(
-            f"the first line holds names already: {shown[:MOST_SHOWN]}",
-            where=str(path),
-            remedy="drop names in [data.columns]",
-        )
     if len(names) != len(first):
         raise InputError(
-            f"{len(names)} names for {len(first)} columns; {first_rows(lines[:2])}",
-            where=f"{path}, [data.columns] names",
+            f"has {len(first)} columns, and names has {len(names)}; {first_rows(lines[:2])}",
+            where=str(path),
             remedy="give one name for each column",
         )
+    return list(names)
 
 
 def first_rows(lines: Sequence[str]) -> str:

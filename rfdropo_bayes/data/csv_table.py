@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.data.csv_layout import cells_of, check_given_names, dialect_of, is_value, units_below
+from rfdropo_bayes.data.csv_layout import cells_of, dialect_of, header_of, is_value, units_above, without_names
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
@@ -79,7 +79,7 @@ class CsvTable:
     Args:
         path: the file, plain or gzipped.
         required: columns that must be there.
-        names: of the columns of a file whose first line holds values.
+        names: of the columns, if the first line holds values.
         machine_written: the format has a writer and columns of its own: it ends every line with a newline, so a last
             line without one was cut. Else a table [data.columns] names the columns.
 
@@ -127,10 +127,9 @@ class CsvTable:
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
         _check_first_line(self.path, lines, dialect.separator)
-        check_given_names(self.path, lines, dialect.separator, names)
-        header = [name.strip() for name in names or cells_of(lines[0], dialect.separator)]
-        rows = lines if names else lines[1:]
-        units = units_below([lines[0], *rows[:2]], dialect.separator) or []
+        header = header_of(self.path, lines, dialect.separator, names)
+        rows = lines if without_names(lines, dialect.separator) else lines[1:]
+        units = units_above(rows, dialect.separator) or []
         self.units = {name: unit for name, unit in zip(header, units, strict=bool(units)) if unit}
         rows = rows[1:] if units else rows
         _check_names(self.path, header)

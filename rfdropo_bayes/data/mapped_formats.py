@@ -11,7 +11,7 @@ from typing import NamedTuple
 from rfdropo_bayes.data import lerobot, motive_csv, named_columns, rosbag
 from rfdropo_bayes.data.csv_table import MOTIVE, CsvTable
 from rfdropo_bayes.data.named_columns import CsvColumns, command_clock, coordinates, read_tables
-from rfdropo_bayes.data.plain_csv import command_table
+from rfdropo_bayes.data.plain_csv import command_table, csv_table
 from rfdropo_bayes.data.recorded import Origin
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -84,7 +84,7 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
         file.table.require(places)
         unit = file.length_unit or columns.position_unit
         return Observed(file.table, changed(_in_seconds(columns, path), where=str(path), position_unit=unit))
-    return Observed(CsvTable(path, places, machine_written=False), columns)
+    return Observed(csv_table(path, columns), columns)
 
 
 def _in_seconds(columns: CsvColumns, path: Path) -> CsvColumns:
