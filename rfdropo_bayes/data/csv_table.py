@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.data.csv_layout import cells_of, dialect_of, header_of, is_value, units_above, without_names
+from rfdropo_bayes.data.csv_layout import SAMPLED, cells_of, dialect_of, header_of, is_value, units_above, without_names
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
@@ -68,6 +68,19 @@ def _decoded(raw: bytes) -> str:
         if "\n" in text or not marked:
             return text
     return raw.decode("latin-1")
+
+
+def unnamed_rows(path: Path) -> list[list[str]] | None:
+    """The cells of the first rows of a CSV that has no names of columns; None if it has names.
+
+    Raises:
+        InputError: see `read_text`.
+    """
+    lines = read_text(path).splitlines()[: SAMPLED + 1]
+    separator = dialect_of(lines).separator if lines else ","
+    if len(lines) < 2 or not without_names(lines, separator):
+        return None
+    return [[cell.strip() for cell in cells_of(line, separator)] for line in lines[:3]]
 
 
 class CsvTable:

@@ -137,8 +137,8 @@ class CsvColumns(BaseModel):
     axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(
         ("x", "y", "z"),
         description="the base frame's x, y, z in terms of the file's axes, e.g. "
-        '["x", "z", "-y"] for a trunk that hangs in a frame with y up; of a left-handed file, such as Unity\'s, axes that '
-        "make a left-handed frame",
+        '["x", "z", "-y"] for a trunk that hangs in a frame with y up; if the file\'s frame is left-handed, '
+        "as Unity's is, axes that are left-handed as well",
     )
     origin: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0),

@@ -223,8 +223,8 @@ def rounded_notes(stamps: Stamps, time: Float[np.ndarray, " rows"]) -> list[str]
     if not on_grid or grain < GRAIN * usual or np.ptp(gaps) < 0.5 * grain:
         return []
     return [
-        f"times have single precision: they are told to {1e3 * grain / stamps.per_second:.3g} ms, where rows come every "
-        f"{1e3 * usual / stamps.per_second:.4g} ms; for rows that were measured evenly give sample_time = "
+        f"times have single precision: they go in steps of {1e3 * grain / stamps.per_second:.3g} ms, and rows come "
+        f"every {1e3 * usual / stamps.per_second:.4g} ms; for rows that were measured evenly give sample_time = "
         f"{float(time[-1]) / (len(time) - 1):.4g} in place of time, or record double precision"
     ]
 

@@ -96,7 +96,7 @@ def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     status, told = init(monkeypatch, capsys, "arm", "--recording", "Prüfung *.csv")
     assert status == 0
-    assert "look over in the experiment file: sample_time = 0.05: no column was recognised as times" in told
+    assert 'look over in the experiment file: time = "rows": no column was recognised as times' in told
     assert "columns that are not used: nummer" in told
     text = (tmp_path / "arm" / "experiment.toml").read_text(encoding="utf-8")
     assert '"../Prüfung 1.csv"' in text
