@@ -60,9 +60,9 @@ class Questions:
         raise InputError(
             f"the first line holds values, not the names of its {len(rows[0])} columns: {'; '.join(shown[:2])}",
             where=str(file),
-            remedy=f'if they are in this order, give --names "{likely}"'
+            remedy=f'if they are in this order, write {likely} above it, or give --names "{likely}"'
             if likely
-            else 'name all of them, e.g. --names "t,c1,c2,c3,c4,tip_x,tip_y,tip_z"',
+            else 'write a line of names above it, or give --names "t,c1,c2,c3,c4,tip_x,tip_y,tip_z" with all of them',
         )
 
     def counts(self, guess: Any, given: float | None) -> float | None:

@@ -72,7 +72,7 @@ def _columns(name: str, array: np.ndarray, rows: int) -> list[tuple[str, np.ndar
 
 def _of_npz(path: Path) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         for name in file.files:
             with suppress(ValueError):  # an array of Python objects
                 found[name] = file[name]
