@@ -12,6 +12,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from rfdropo_bayes.data import lerobot, motive_csv, named_arrays, named_columns, rosbag
+from rfdropo_bayes.data.csv_layout import is_value
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.streams import side_by_side
@@ -108,18 +109,18 @@ class Guess(NamedTuple):
     markers: list[str]
     tensions: list[str]
     motor_angles: list[str]
+    motor_angle_unit: str
     left: list[str]
-    format: str = named_columns.FORMAT
-    command_time: str | None = None
-    command_time_unit: str = "s"
-    motor_angle_unit: str = "rad"
+    format: str
+    command_time: str | None
+    command_time_unit: str
+    units: Mapping[str, str]
+    names: list[str] | None
+    command_names: list[str] | None
+    evidence: Mapping[str, str]
+    start: Float[np.ndarray, "marker 3"]
     counts_per_turn: float | None = None
-    units: Mapping[str, str] = {}
-    names: list[str] | None = None
-    command_names: list[str] | None = None
     sample_time: float | None = None
-    evidence: Mapping[str, str] = {}
-    start: Float[np.ndarray, "marker 3"] = np.zeros((0, 3))
 
     @property
     def counts(self) -> bool:
@@ -144,60 +145,60 @@ def guess_columns(
         InputError: a file that cannot be read, or in which no positions or commands are found.
     """
     format = recognised_format(path)
+    own = format == named_columns.FORMAT or format in named_arrays.FORMATS
     whole, unit = _measured(format, path, names)
     table = whole.numeric().head(LOOKED_AT)
-    columns = [str(name) for name in table.columns]
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
-    unclocked = [name for name in columns if name != time]
-    triples = _markers(_array_triples(unclocked) if format in named_arrays.FORMATS else _triples(unclocked))
+    columns = [str(name) for name in table.columns if name != time]
+    triples, tensions, angles, free = _parts(columns, format)
     positions = list(triples.values())
-    rest = [name for name in unclocked if not any(name in triple for triple in positions)]
-    tensions = [name for name in rest if FORCE.search(name)]
-    angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
-    source, sending, clock, free = table, whole, None, [name for name in rest if name not in (*tensions, *angles)]
-    own = format == named_columns.FORMAT or format in named_arrays.FORMATS
+    source, sending, clock = table, whole, None
     if sent is not None:
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
         source, clock = sending.numeric().head(LOOKED_AT), _clock_of(sending)
-        commands = _commands(source, [str(name) for name in source.columns if name != clock], any_name=True)
-    else:
-        commands = _commands(table, free, any_name=own)
+        free = [str(name) for name in source.columns if name != clock]
+    commands = _commands(source, free, any_name=own or sent is not None)
     _check_found(path, format, columns, positions, commands)
-    sized = command_unit(sending, source, commands)
-    places = Unit(unit) if unit else told_unit(whole, names_of(positions), named_columns.METRES)
-    places = places or length_unit(table[names_of(positions)])
-    angles, turned = _measured_angles(whole, table, angles if len(angles) == len(commands) else [], sized.unit)
-    seen = table[names_of(positions)].to_numpy()
-    timed = Unit("s") if format == rosbag.FORMAT else time_unit(whole, time, seen)
-    sending_timed = command_time_unit(sending, clock, _seconds(whole, time, timed.unit))
-    guessed = {
-        "time_unit": timed,
-        "command_unit": sized,
-        "position_unit": places,
-        "command_time_unit": sending_timed,
-        "motor_angle_unit": turned,
+    tensions = tensions if len(tensions) == len(commands) else []
+    units = {
+        "command_unit": command_unit(sending, source, commands),
+        "position_unit": (Unit(unit) if unit else told_unit(whole, names_of(positions), named_columns.METRES))
+        or length_unit(table[names_of(positions)]),
+        "time_unit": Unit("s")
+        if format == rosbag.FORMAT
+        else time_unit(whole, time, table[names_of(positions)].to_numpy()),
     }
+    units["command_time_unit"] = command_time_unit(sending, clock, _seconds(whole, time, units["time_unit"].unit))
+    angles, units["motor_angle_unit"] = _measured_angles(
+        whole, table, angles if len(angles) == len(commands) else [], units["command_unit"].unit
+    )
+    used = {*commands, *names_of(positions), *tensions, *angles}
     return Guess(
-        time,
-        timed.unit,
-        commands,
-        sized.unit,
-        positions,
-        places.unit,
-        _marker_names(list(triples), None if own else STRUCTURE),
-        tensions if len(tensions) == len(commands) else [],
-        angles,
-        [name for name in free if name not in commands],
-        format,
-        clock,
-        sending_timed.unit,
-        turned.unit,
-        units={**sized.others, **places.others},
+        time=time,
+        commands=commands,
+        positions=positions,
+        markers=_marker_names(list(triples), None if own else STRUCTURE),
+        tensions=tensions,
+        motor_angles=angles,
+        left=[name for name in columns if name not in used],
+        format=format,
+        command_time=clock,
+        units={**units["command_unit"].others, **units["position_unit"].others},
         names=None if names is None else list(names),
         command_names=None if command_names is None else list(command_names),
-        evidence={key: unit.evidence for key, unit in guessed.items() if unit.evidence},
+        evidence={key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
+        **{key: unit.unit for key, unit in units.items()},
     )
+
+
+def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[str], list[str], list[str]]:
+    """Columns in x, y and z of each marker, of forces, of measured angles, and those that may be commands."""
+    places = _array_triples(columns) if format in named_arrays.FORMATS else _triples(columns)
+    rest = [name for name in columns if SENT.search(name) or not any(name in triple for triple in places.values())]
+    tensions = [name for name in rest if FORCE.search(name)]
+    angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
+    return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *angles)]
 
 
 def _check_found(path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]) -> None:
@@ -235,7 +236,8 @@ def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers
     """
     width, places = len(rows[0]), [f"{marker}_{axis}" for marker in markers for axis in "xyz"]
     rest = width - len(places)
-    clock = len(rows) > 1 and rest > 1 and float(rows[0][0]) < float(rows[1][0])
+    stamps = pd.to_numeric(pd.Series([row[0] for row in rows]), errors="coerce")
+    clock = rest > 1 and (bool(stamps.diff().iloc[1] > 0.0) or (stamps.isna().all() and is_value(rows[0][0])))
     clock = clock if commands is None else rest == commands + 1
     if not places or rest < 1 + clock or (commands is not None and rest != commands + clock):
         return None
@@ -278,7 +280,9 @@ def _clock_of(table: CsvTable) -> str | None:
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
     """Those of the columns in x, y and z that are places of markers."""
-    places = {common: names for common, names in triples.items() if not NO_PLACE.search(common)}
+    places = {
+        common: names for common, names in triples.items() if not (NO_PLACE.search(common) or SENT.search(common))
+    }
     for chosen in (BODY, MARKER):
         found = {common: names for common, names in places.items() if chosen.search(common)}
         if found:
