@@ -108,8 +108,9 @@ def find_faults(
         "breaks": breaks,
     } | {kind: each.sum(axis=0).tolist() for kind, each in (("zero", zero), ("renamed", renamed)) if each.any()}
     names = names or [f"marker {number}" for number in range(1, position.shape[1] + 1)]
+    mask = ~(missing | held | jumping | renamed)
     notes = clock_notes(time) + _zero_notes(zero, doubtful, names) + _name_notes(renamed, changes, names)
-    return Faults(~(missing | held | jumping | renamed), counts, notes)
+    return Faults(mask, counts, notes + _mostly_masked(mask, counts, names))
 
 
 def _check_rows(time: np.ndarray, position: np.ndarray, where: str) -> None:
@@ -157,6 +158,20 @@ def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) ->
         for marker in np.flatnonzero(kind.any(axis=0)).tolist():
             rows = np.flatnonzero(kind[:, marker])
             said.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
+    return said
+
+
+def _mostly_masked(mask: np.ndarray, counts: dict[str, list[int]], names: Sequence[str]) -> list[str]:
+    """Markers of which more positions are masked than kept: what was found is hardly a fault then."""
+    said, rows = [], len(mask)
+    for marker in np.flatnonzero(2 * mask.sum(axis=0) < rows).tolist():
+        kinds = ", ".join(
+            f"{each[marker]} {kind}" for kind, each in counts.items() if each[marker] and kind != "breaks"
+        )
+        said.append(
+            f"{int((~mask[:, marker]).sum())} of {rows} positions of {names[marker]} are masked ({kinds}): if most of "
+            "them were measured, look at the unit of times, at the unit of positions and at the marker's columns"
+        )
     return said
 
 

@@ -95,13 +95,35 @@ def from_arrays(
     )
 
 
-def from_pandas(
-    frame: pd.DataFrame, columns: CsvColumns | Mapping[str, Any], name: str, mask_missing: bool
-) -> Recorded:
+def from_pandas(frame: Any, columns: CsvColumns | Mapping[str, Any], name: str, mask_missing: bool) -> Recorded:
     """A recording from a table; see `Trajectory.from_pandas`."""
+    frame = _table(frame, name)
     if not isinstance(columns, CsvColumns):
         columns = parse_table(CsvColumns, _as_lists(columns), where="columns")
     return read_frame(frame, columns, name, mask_missing=mask_missing)
+
+
+def _table(frame: Any, name: str) -> pd.DataFrame:
+    """A table of pandas from one of pandas, Polars or PyArrow.
+
+    Raises:
+        InputError: something else.
+    """
+    if isinstance(frame, pd.DataFrame):
+        return frame
+    for convert in ("collect", "to_pandas"):  # a lazy table of Polars is computed first
+        if hasattr(frame, convert):
+            try:
+                frame = getattr(frame, convert)()
+            except ImportError as error:
+                raise InputError(f"{error}", where=name, remedy="pip install pyarrow") from None
+    if isinstance(frame, pd.DataFrame):
+        return frame
+    raise InputError(
+        f"a {type(frame).__name__} is no table",
+        where=name,
+        remedy="give a DataFrame of pandas, or a table that has to_pandas(), as those of Polars and PyArrow",
+    )
 
 
 def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:

@@ -8,6 +8,8 @@ import re
 import textwrap
 from typing import Any, ClassVar
 
+from rfdropo_bayes.tables import plain
+
 _ENTRY = re.compile(r" {4}([a-z0-9_]+(?:, [a-z0-9_]+)*): (.*)")
 _WIDTH = 110
 
@@ -70,7 +72,7 @@ def attributes_of(kind: type) -> dict[str, str]:
 def settings_text(value: Any) -> str:
     """Options as the digest of a run has them: every field by name, in words that checkpoints of all versions share."""
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        return repr(value)
+        return repr(plain(value))
     fields = ", ".join(
         f"{field.name}={settings_text(getattr(value, field.name))}" for field in dataclasses.fields(value)
     )

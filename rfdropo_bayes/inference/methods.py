@@ -20,7 +20,7 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc import start as starts
-from rfdropo_bayes.tables import nearest
+from rfdropo_bayes.tables import nearest, plain
 
 
 class Method(NamedTuple):
@@ -125,6 +125,7 @@ def _build(kind: type, options: Mapping[str, Any], where: str, beside: Sequence[
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
     """Value of an option as its field wants it; TOML has lists for tuples and writes 20000 for 20000.0."""
+    value = plain(value)
     if dataclasses.is_dataclass(hint):
         if isinstance(value, hint):  # type: ignore[arg-type]
             return value

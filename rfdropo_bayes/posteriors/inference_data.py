@@ -15,6 +15,7 @@ from jaxtyping import Float
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
 from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
+from rfdropo_bayes.tables import plain
 
 with warnings.catch_warnings():  # 0.23 announces its successor on import
     warnings.simplefilter("ignore", FutureWarning)
@@ -118,6 +119,7 @@ def _draws_dataset(values: Mapping[str, np.ndarray]) -> xr.Dataset:
 
 
 def _attribute(value: Any) -> str | int | float:
+    value = plain(value)
     return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
 
 
