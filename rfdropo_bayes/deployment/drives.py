@@ -152,7 +152,7 @@ class Drive:
         try:
             with self._sdo:
                 data = self.node.sdo.upload(index, subindex)
-        except (SdoError, can.CanError, OSError) as error:
+        except (SdoError, can.CanError) as error:
             raise InputError(f"cannot be read ({error})", where=where, remedy=_SDO_REMEDY) from None
         if 8 * len(data) < len(variable):
             raise InputError(
@@ -180,7 +180,7 @@ class Drive:
         try:
             with self._sdo:
                 self.node.sdo.download(index, subindex, data)
-        except (SdoError, can.CanError, OSError) as error:
+        except (SdoError, can.CanError) as error:
             raise InputError(f"does not take {value} ({error})", where=where, remedy=_SDO_REMEDY) from None
         if read_back and variable.readable and (kept := self.read(index, subindex)) != value:
             raise InputError(f"keeps {kept} where {value} was written", where=where, remedy="look into its manual")
@@ -418,7 +418,7 @@ class Drive:
                 pdo.cob_id, pdo.trans_type, pdo.enabled = cob, kind, True
                 pdo.save()
                 pdo.read()
-        except (SdoError, can.CanError, OSError, KeyError) as error:
+        except (SdoError, can.CanError, KeyError) as error:
             raise InputError(f"cannot be mapped ({error})", where=where, remedy=_SDO_REMEDY) from None
         found = [(variable.index, variable.subindex, variable.length) for variable in pdo.map]
         if found != wanted or pdo.cob_id != cob or pdo.trans_type != kind or not pdo.enabled:

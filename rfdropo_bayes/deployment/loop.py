@@ -132,8 +132,8 @@ class ControlLoop:
             self.drives.exchange(_ANSWER * self.period, meanwhile)
         except can.CanError as error:
             raise Stop(Cause.SEND_ERROR, str(error)) from None
-        self.markers.update(self.pulse)
         try:
+            self.markers.update(self.pulse)
             if phase is not Phase.BRAKED:
                 if self.demanded is not None:  # what follows from a stop by another thread is not its cause
                     raise self.demanded
@@ -186,12 +186,8 @@ class ControlLoop:
         try:
             phases(self)
             stop = Stop(Cause.FINISHED)
-        except Stop as raised:
-            stop = raised
-        except InputError as error:
-            stop = Stop(Cause.PROGRAM_ERROR, str(error))
         except Exception as error:  # the drives must come to rest before anything else
-            stop = Stop(Cause.PROGRAM_ERROR, f"{type(error).__name__}: {error}")
+            stop = _as_stop(error)
         return self._come_to_rest(stop)
 
     def find(self) -> None:
@@ -328,7 +324,8 @@ class ControlLoop:
                 if stop.cause is Cause.FINISHED and self.safety.after == "release":
                     self._release()
                     return stop
-            except Stop as second:
+            except Exception as error:
+                second = _as_stop(error)
                 self._say(f"while stopping: {second}")
                 stop = stop if stop.cause is not Cause.FINISHED else second
         self._brake(began)
@@ -353,9 +350,9 @@ class ControlLoop:
         while time.monotonic() < end:
             try:
                 self.cycle(Phase.BRAKED, self._hold_where_it_is())
-            except Stop as error:
+            except Exception as error:
                 if not failed:
-                    self._say(f"while braking: {error}; the drives' own guards stop them")
+                    self._say(f"while braking: {_as_stop(error)}; the drives' own guards stop them")
                 failed = True
             if self.stop_time is None and all(_stands(drive) for drive in self.drives.all):
                 self.stop_time = time.monotonic() - began
@@ -378,6 +375,15 @@ class ControlLoop:
             return False
         self.command = length
         return True
+
+
+def _as_stop(error: Exception) -> Stop:
+    """The stop that an exception of any part of a session stands for."""
+    if isinstance(error, Stop):
+        return error
+    return Stop(
+        Cause.PROGRAM_ERROR, str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    )
 
 
 def _stands(drive: Drive) -> bool:

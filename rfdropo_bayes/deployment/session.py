@@ -230,7 +230,7 @@ class _Session:
         return SimulationTable(self.settings.robot, hub, table.plant, table.settings, table.own_process, address)
 
     def _leave(self) -> None:
-        with contextlib.suppress(can.CanError, OSError):
+        with contextlib.suppress(can.CanError):
             self.network.disconnect()
 
     def prepare(self, commands: CommandSource | Path | str | None) -> None:
