@@ -32,7 +32,7 @@ import numpy as np
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
-from rfdropo_bayes.deployment.bench.simulated_drive import SimulatedFault
+from rfdropo_bayes.deployment.bench.simulated_node import SimulatedFault
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.cia402 import DriveState, state_of
 from rfdropo_bayes.deployment.objects import Object

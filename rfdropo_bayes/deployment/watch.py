@@ -51,7 +51,7 @@ class Watch:
         self._short = [drive.short_frames for drive in self._drives.all]
         self._drives.emergencies.clear()
         self._started = time.monotonic()
-        self._lagging: dict[int, float] = {}  # node -> since when
+        self._lagging: dict[Drive, float] = {}  # since when
 
     def check(self, tick: Tick, expected: DriveState | None, tension: bool = True) -> None:
         """Look at a cycle after its exchange.
@@ -81,15 +81,16 @@ class Watch:
     def _check_emergencies(self) -> None:
         while self._drives.emergencies:
             emergency = self._drives.emergencies.popleft()
+            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not say which axis it means
             if emergency.code == 0x8611:
-                raise Stop(Cause.FOLLOWING_ERROR, f"drive {emergency.channel!r} does not follow its set-points")
+                raise Stop(Cause.FOLLOWING_ERROR, f"{drive} does not follow its set-points")
             if emergency.code:
-                raise Stop(Cause.EMERGENCY_MESSAGE, f"drive {emergency.channel!r} says 0x{emergency.code:04X}")
+                raise Stop(Cause.EMERGENCY_MESSAGE, f"{drive} says 0x{emergency.code:04X}")
 
     def _check_life(self, drive: Drive, now: float) -> None:
-        quiet = now - max(drive.heartbeat, self._started)
-        if drive.nmt not in (None, NmtState.OPERATIONAL):
-            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.nmt})")
+        quiet = now - max(drive.node.heartbeat, self._started)
+        if drive.node.nmt not in (None, NmtState.OPERATIONAL):
+            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.node.nmt})")
         if quiet > self._patience.heartbeat_s:
             raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
         if drive.unanswered > self._patience.stale_cycles:
@@ -113,8 +114,8 @@ class Watch:
             return
         lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre
         if lag <= self._patience.following_error_m:
-            self._lagging.pop(drive.motor.node, None)
-        elif now - self._lagging.setdefault(drive.motor.node, now) > self._patience.following_time_s:
+            self._lagging.pop(drive, None)
+        elif now - self._lagging.setdefault(drive, now) > self._patience.following_time_s:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} is {1e3 * lag:.1f} mm behind its set-point")
 
     def _check_deadlines(self, tick: Tick) -> None:

@@ -16,7 +16,7 @@ from rfdropo_bayes.deployment.bench.hub import Hub, HubBus
 from rfdropo_bayes.deployment.bench.plant import PlantHere, SpringCables
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulatedDrives, SimulationTable
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork
-from rfdropo_bayes.deployment.drives import Drive, Drives, Guards
+from rfdropo_bayes.deployment.drives import Drives, Guards, drives_of
 from rfdropo_bayes.deployment.log import SessionLog
 from rfdropo_bayes.deployment.loop import ControlLoop
 from rfdropo_bayes.deployment.sensors import MarkerView, SensorTable, SimulatedMarkers
@@ -67,7 +67,8 @@ class Rig:
     ) -> Drives:
         """The master's side."""
         network = self.network if network is None else network  # an empty network is false
-        made = [Drive(network, motor, eds, motor.offset_counts, answer) for motor in self.robot.motors]
+        offsets = [motor.offset_counts for motor in self.robot.motors]
+        made = drives_of(network, self.robot.motors, offsets, eds, answer)
         return Drives(network, made, guards or Guards())
 
     @contextlib.contextmanager
