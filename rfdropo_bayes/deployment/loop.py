@@ -23,7 +23,7 @@ from rfdropo_bayes.deployment.policy import CommandSource, PolicyScene
 from rfdropo_bayes.deployment.sensors import MarkerView
 from rfdropo_bayes.deployment.setpoints import SetPoints
 from rfdropo_bayes.deployment.settings import SafetyTable
-from rfdropo_bayes.deployment.watch import Watch
+from rfdropo_bayes.deployment.watch import AfterStop, Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
@@ -307,8 +307,7 @@ class ControlLoop:
         self._say(str(stop))
         began = time.monotonic()
         if self._expected is None:  # nothing was enabled, so that nothing needs a ramp
-            self._brake(began)
-            return stop
+            return self._brake(began, stop)
         if stop.cause.reaction is Reaction.RAMP:
             self._pulling = stop.cause is Cause.TENSION
             try:
@@ -328,8 +327,7 @@ class ControlLoop:
                 second = _as_stop(error)
                 self._say(f"while stopping: {second}")
                 stop = stop if stop.cause is not Cause.FINISHED else second
-        self._brake(began)
-        return stop
+        return self._brake(began, stop)
 
     def _release(self) -> None:
         """Switch the drives off, one state down at a time."""
@@ -340,9 +338,14 @@ class ControlLoop:
             if time.monotonic() > end:
                 raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
 
-    def _brake(self, began: float) -> None:
-        """Quick stop, and look on until the drives have shown that they stand."""
+    def _brake(self, began: float, stop: Stop) -> Stop:
+        """Quick stop, and look on: the drives must show that they stand, and go on holding.
+
+        Returns:
+            The stop, with the drives that did not hold; these are the cause of a session that had ended as planned.
+        """
         self._wanted = DriveState.QUICK_STOP_ACTIVE
+        after = AfterStop(self.drives)
         for failure in self.drives.quick_stop():
             self._say(f"quick stop not sent: {failure}")
         end = time.monotonic() + self.safety.hold_s
@@ -354,17 +357,22 @@ class ControlLoop:
                 if not failed:
                     self._say(f"while braking: {_as_stop(error)}; the drives' own guards stop them")
                 failed = True
+            for line in after.look():
+                self._say(line)
             if self.stop_time is None and all(_stands(drive) for drive in self.drives.all):
                 self.stop_time = time.monotonic() - began
-        if self.stop_time is None:
-            for drive in self.drives.all:
-                if not _stands(drive):
-                    self._say(f"{drive.name} has not shown that it stands")
+        if moving := [drive for drive in self.drives.all if not _stands(drive)]:
+            for drive in moving:
+                self._say(f"{drive.name} has not shown that it stands")
             try:  # the last word that the bus has; nodes that are lost quick-stop by object 0x6007
                 self.drives.manage(Nmt.STOP)
             except can.CanError:
                 self._say("the bus is lost: the drives' heartbeat guards stop them")
         self.pulse = None
+        if not after.found:
+            return stop
+        cause = Cause.DRIVE_STATE if stop.cause is Cause.FINISHED else stop.cause
+        return Stop(cause, "; ".join(filter(None, [stop.detail, *after.found])))
 
     def _hold_where_it_is(self) -> bool:
         """Let the command be where the drives have come to, as they no longer follow one; whether it is another now."""

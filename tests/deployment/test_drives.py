@@ -221,3 +221,9 @@ def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig
     heard(left, bytearray(objects.EMERGENCY.pack(0x2310, 1, b"")), 0.0)
     with pytest.raises(Stop, match="drive 'left' says 0x2310"):
         watch.check(tick, None)
+
+
+def test_a_drive_whose_first_status_is_late_is_waited_for(rig) -> None:
+    """A loaded machine has no answer yet in the first cycle; nobody may read a tension of it."""
+    drives = rig.drives()
+    Watch(drives, Patience()).check(Tick(1, 0.0, 0.0, 0), None)

@@ -20,6 +20,7 @@ from rfdropo_bayes.deployment.cia402 import (
 from rfdropo_bayes.deployment.objects import EmergencyCode, Object, of_axis
 from rfdropo_bayes.deployment.vendors import told_counts
 
+_HELD = 0.05  # [s]: a faulty drive holds for so long after a quick stop
 _LAG = 0.004  # [s]: time constant of a tuned position loop of 40 Hz
 
 
@@ -55,6 +56,8 @@ class SimulatedDrive:
         self.velocity = 0.0
         self.target = self.demand = round(self.position)
         self.jammed = False
+        self.after_stop: DriveState | None = None  # state that a faulty drive takes some time after a quick stop
+        self._stood_for = 0.0  # [s] in quick stop
         self._error_since: float | None = None
         self._time = now
 
@@ -86,7 +89,7 @@ class SimulatedDrive:
         """Obey a controlword."""
         number = obey(self.state, controlword, self.controlword)
         self.controlword = controlword
-        if number is None:
+        if number is None or self._stood_for > _HELD:
             return
         if number == 15:
             self.error_code, self._error_since = 0, None
@@ -127,6 +130,10 @@ class SimulatedDrive:
         else:
             self._slow_down(duration)
             self._error_since = None
+            if self.state is DriveState.QUICK_STOP_ACTIVE and self.after_stop is not None:
+                self._stood_for += duration
+                if self._stood_for > _HELD:  # and obeys no more
+                    self.state = self.after_stop
             if not self.state.powered:
                 self.target = self.demand = round(self.position)
 

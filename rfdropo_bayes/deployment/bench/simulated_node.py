@@ -36,8 +36,14 @@ class SimulatedFault(IntEnum):
     CRASH = 6
     FROZEN_STATUS = 7
     REBOOT = 8
+    ENABLES_ITSELF = 9  # some time after a quick stop
+    LETS_GO = 10
 
 
+_AFTER_STOP = {
+    SimulatedFault.ENABLES_ITSELF: DriveState.OPERATION_ENABLED,
+    SimulatedFault.LETS_GO: DriveState.SWITCH_ON_DISABLED,
+}
 _ABORT_PDO_ACTIVE = 0x08000022
 _ABORT_NOT_MAPPABLE = 0x06040041
 _ABORT_PDO_LENGTH = 0x06040042
@@ -338,6 +344,7 @@ class SimulatedNode:
         self.fault = SimulatedFault(fault) if fault in set(SimulatedFault) else SimulatedFault.NONE
         for drive in self.drives:
             drive.jammed = self.fault is SimulatedFault.JAMMED
+            drive.after_stop = _AFTER_STOP.get(self.fault)
         if self.fault is SimulatedFault.CRASH:
             self.crashed = True
         elif self.fault is SimulatedFault.OVER_CURRENT:
