@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import re
 import textwrap
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from rfdropo_bayes.tables import plain
@@ -52,6 +53,19 @@ class MethodOptions:
             for name, value in rows
         ]
         return "\n".join([self.call, head, *lines])
+
+
+def options_table(options: Any) -> dict[str, Any]:
+    """Options as a table of an experiment file: TOML has no word for None, so that such options are left out."""
+    return _entry({field.name: getattr(options, field.name) for field in dataclasses.fields(options)})
+
+
+def _entry(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return options_table(value)
+    if isinstance(value, Mapping):
+        return {name: _entry(each) for name, each in value.items() if each is not None}
+    return [_entry(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def attributes_of(kind: type) -> dict[str, str]:

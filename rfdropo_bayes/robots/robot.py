@@ -145,9 +145,14 @@ class Robot(RobotTable):
         driven = tuple(motor.channel for motor in self.motors)
         if driven and driven != self.channels.names:
             raise ValueError(f"motors drive {', '.join(driven)}; the channels are {', '.join(self.channels.names)}")
-        nodes = [motor.node for motor in self.motors]
-        if len(set(nodes)) != len(nodes):
-            raise ValueError("two motors share a node")
+        at: dict[tuple[int, int], str] = {}
+        for motor in self.motors:
+            if motor.place in at:
+                raise ValueError(
+                    f"two motors share a node and an axis: {at[motor.place]} and {motor.channel} are on axis "
+                    f"{motor.axis} of node {motor.node}"
+                )
+            at[motor.place] = motor.channel
 
     def _check_inside(self) -> None:
         station = np.array(self.body.station_m)

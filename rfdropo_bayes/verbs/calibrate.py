@@ -18,6 +18,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
+from rfdropo_bayes.inference.method_options import options_table
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
@@ -107,8 +108,7 @@ def calibrate(
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
     problem = model.problem(runs, earlier_draws(fit, name))
-    options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
-    said = {"method": name, **options}
+    said = {"method": name, **options_table(config)}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
         {"seed": seed, "inference": None if method is None else said},
