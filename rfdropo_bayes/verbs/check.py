@@ -41,7 +41,7 @@ from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
-from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
+from rfdropo_bayes.verbs.motion_check import measure_motion
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import NEAR, far_from_rest, placement_hints
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
@@ -153,14 +153,12 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
 
 
 def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What the nominal model shows: errors of time step and mesh, and motions in another direction."""
+    """What the nominal model shows: errors of time step and mesh, and motions of another direction, order or size."""
     say_step(f"simulating {runs[0].name} with a finer time step and a finer mesh")
     spec = spec_of(experiment, folder)
     found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
-    direction = _try(found, partial(measure_direction, spec, runs))
-    doubt = None if direction is None else direction_doubt(direction, None if columns is None else columns.axes)
-    found.doubts += [] if doubt is None else [doubt]
+    found.doubts += [caution.sentence for caution in _try(found, partial(measure_motion, spec, runs, columns)) or []]
 
 
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
