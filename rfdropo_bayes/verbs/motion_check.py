@@ -82,7 +82,7 @@ def motion_cautions(
     said = direction_doubt(direction, None if columns is None else columns.axes)
     found = []
     if said is not None:
-        other = "" if order is None else f"; so would {_order_words(order, columns, names)}"
+        other = "" if order is None else f". {_order_words(order, columns, names)} would explain it as well"
         found.append(Caution(Code.FRAME_DOUBTFUL, said + other))
     elif order is not None:
         sentence = (
@@ -107,7 +107,7 @@ def _order_words(order: Reordered, columns: CsvColumns | None, names: Sequence[s
     own = names if columns is None else columns.commands
     listed = ", ".join(f'"{own[k]}"' for k in order.columns)
     if columns is None:
-        return f"the channels in the order {listed}"
+        return f"channels in the order {listed}"
     return f"commands = [{listed}] in [data.columns]"
 
 
@@ -130,7 +130,8 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
         found = _explained(spec, runs[0], likely_units(units, None))
         if found is None:
             raise
-        words = f"{error.what} under the commands as they were read; {unit_words(columns, found)}, as is measured"
+        measured = f"the markers moved by {1e3 * found[1].measured:.3g} mm"
+        words = f"{error.what} under the commands as they were read, and {measured}; {unit_words(columns, found)}"
         return [Caution(Code.UNIT_DOUBTFUL, words)]
     direction, size = direction_of(paths), size_of(paths)
     order = _order(spec, runs, direction) if direction.straight < AGREES else None

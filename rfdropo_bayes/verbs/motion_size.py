@@ -66,12 +66,19 @@ class Unit(NamedTuple):
 
 
 def other_units(columns: CsvColumns | None, command_unit: str) -> list[Unit]:
-    """Units that commands may have been in. Without a table of columns they have no name, but powers of ten."""
-    own = None if columns is None else columns.command_unit
-    if own is None or own not in COMMAND_UNITS:
-        return [Unit("", 10.0**power) for power in (-3, -2, -1, 1, 2, 3)] if command_unit == "m" else []
-    kind, size = COMMAND_UNITS[own]
-    return [Unit(name, s / size) for name, (k, s) in COMMAND_UNITS.items() if k == kind and name != own and s != size]
+    """Units that commands may have been in: those that have a name first, and powers of ten; none for forces."""
+    if command_unit not in IMPOSED:
+        return []
+    own = None if columns is None else COMMAND_UNITS.get(columns.command_unit)
+    named = (
+        [] if own is None else [Unit(n, size / own[1]) for n, (kind, size) in COMMAND_UNITS.items() if kind == own[0]]
+    )
+    powers = [Unit("", 10.0**power) for power in (-3, -2, -1, 1, 2, 3)]
+    known = [unit.factor for unit in named]
+    return [
+        *(unit for unit in named if unit.factor != 1.0),
+        *(unit for unit in powers if not np.isclose(known, unit.factor).any()),
+    ]
 
 
 def likely_units(units: Sequence[Unit], size: Size | None) -> list[Unit]:
@@ -103,5 +110,9 @@ def unit_words(columns: CsvColumns | None, explained: tuple[Unit, Size] | None) 
         more = "" if known else ", counts_per_turn"
         return f"look at command_unit{more} and position_unit, and at spool_radius and gain of the robot file"
     unit, then = explained
-    line = f'command_unit = "{unit.name}" in [data.columns]' if unit.name else f"commands {unit.factor:g} times as large"
-    return f"{line} would make it {1e3 * then.nominal:.3g} mm"
+    moved = f"would make it {1e3 * then.nominal:.3g} mm"
+    if unit.name:
+        return f'command_unit = "{unit.name}" in [data.columns] {moved}'
+    return (
+        f"commands {unit.factor:g} times as large {moved}: look at their unit, and at the gain of the robot's channels"
+    )
