@@ -1,9 +1,8 @@
-"""Recordings beside the nominal model: frame, order and unit of the commands, each doubted only if physics explains it."""
+"""Recordings beside the nominal model: doubts of the frame, and of the order and the unit of the commands."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -233,4 +232,4 @@ def _pull(spec: ModelSpec, runs: Sequence[Trajectory]) -> Float[np.ndarray, " ch
         largest = max(float(np.abs(run.command).max()) for run in runs)
         return np.full(len(robot.channel_names), largest or 1.0)
     travel = np.abs(np.asarray(robot.channel_matrix(robot.nominal()))).max(axis=0)
-    return STRETCH * float(robot.body.station_m[-1] - robot.body.station_m[0]) / travel
+    return STRETCH * robot.length / travel
