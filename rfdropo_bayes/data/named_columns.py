@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data.command_notes import command_notes
+from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
@@ -158,6 +159,11 @@ class CsvColumns(BaseModel):
         default=None, description="columns of the measured motor angles, one for each command; empty cells are left out"
     )
     motor_angle_unit: Literal["rad", "deg", "counts"] = Field(default="rad", description="unit of the motor angles")
+    unwrap: dict[str, float] = Field(
+        {},
+        description="turn of the counter of each column of commands or motor angles that begins anew after a turn, in "
+        "the unit of the column, by its name: 4096 of an encoder, 360 of an angle in degrees",
+    )
     object_pose: list[str] | None = Field(
         default=None,
         min_length=7,
@@ -213,6 +219,11 @@ class CsvColumns(BaseModel):
             raise ValueError("object_pose needs axes of a right-handed frame: quaternions have no mirror image")
         for name in self.units:
             self._factor(name)
+        for name, turn in self.unwrap.items():
+            if name not in (*self.commands, *(self.motor_angles or ())):
+                raise ValueError(f"unwrap names {name!r}, which is no column of commands or motor_angles")
+            if not (np.isfinite(turn) and turn > 0.0):
+                raise ValueError(f"unwrap gives {name!r} a turn of {turn:g}, which must be positive")
         return self
 
     def sized(self, unit: CommandUnit) -> tuple[str, float]:
@@ -285,12 +296,12 @@ def read_tables(
     faults = find_faults(time, position, where=str(table.path), names=markers)
     command = _commands(table, source, columns)
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
-    angle = None
-    if columns.motor_angles is not None:
-        angle = columns.sized(columns.motor_angle_unit)[1] * table.numbers(columns.motor_angles, allow_missing=True)
+    angle = _angles(table, columns)
     notes = [*faults.notes, *_timing_notes(table, columns, time)]
     if columns.command_time is not None:
         notes += command_notes(sent, command)
+    seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)
+    notes += _counter_notes(table, source, columns, Motion(sent, time, seen))
     settings = faults._replace(notes=notes).settings
     settings |= {} if angle is None else {"motor_angle_hold": hold_time(time, angle)}
     return Recorded(
@@ -396,9 +407,33 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
     return sent
 
 
+def _angles(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"] | None:
+    """Motor angles [rad], if they were measured."""
+    if columns.motor_angles is None:
+        return None
+    values = table.numbers(columns.motor_angles, allow_missing=True)
+    return columns.sized(columns.motor_angle_unit)[1] * read_on(values, columns.motor_angles, columns.unwrap)
+
+
+def _counter_notes(table: CsvTable, source: CsvTable, columns: CsvColumns, motion: Motion) -> list[str]:
+    """Jumps of counters, of commands and of motor angles, that no marker follows."""
+    sent = (columns.commands, columns.command_unit, source.numbers(columns.commands), motion)
+    names, found = columns.motor_angles or [], motion._replace(sent=motion.time)
+    read = (names, columns.motor_angle_unit, table.numbers(names, allow_missing=True) if names else None, found)
+    notes = []
+    for names, unit, values, seen in (sent, read):
+        if values is not None:
+            values = read_on(values, names, columns.unwrap)
+            own = [
+                Column(n, v, turns_of(unit, columns.counts_per_turn, v)) for n, v in zip(names, values.T, strict=True)
+            ]
+            notes += counter_notes(own, seen, unit)
+    return notes
+
+
 def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
     factors = columns.sized(columns.command_unit)[1] * columns.factors(columns.commands)
-    values = factors * source.numbers(columns.commands)
+    values = factors * read_on(source.numbers(columns.commands), columns.commands, columns.unwrap)
     if columns.command_time is None and len(values) not in (len(table), len(table) - 1):
         raise InputError(
             f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",

@@ -9,6 +9,7 @@ import numpy as np
 
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
 from rfdropo_bayes.bayes.space import force_power
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
@@ -30,8 +31,18 @@ REFINE = "raise [simulator] refine and shorten its time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
 
 
-def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
-    """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so."""
+def record(
+    answer: Answer,
+    *,
+    versions: dict[str, str],
+    data_sha256: str,
+    next_experiment: Any,
+    doubts: Sequence[Caution] = (),
+) -> dict[str, Any]:
+    """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so.
+
+    ``doubts`` are those of its recordings.
+    """
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
     base_rms = _rms(answer, answer.base.residual)
@@ -70,7 +81,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "residual_in_noise_deviations": base_rms,
         "remainder": _remainder(answer),
         "where": _where(answer),
-        "cautions": [caution.as_dict() for caution in answer.doubts.priors],
+        "cautions": [caution.as_dict() for caution in (*doubts, *answer.doubts.priors)],
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
         **unknown_record(answer),
         "next_experiment": next_experiment,

@@ -214,7 +214,7 @@ class Robot(RobotTable):
         return parse_table(cls, outlined_tables(outlined), where="outline")
 
     def __repr__(self) -> str:
-        long = 1e3 * (self.body.station_m[-1] - self.body.station_m[0])
+        long = 1e3 * self.length
         commands = f"{len(self.channel_names)} commands [{self.command_unit}] ({', '.join(self.channel_names)})"
         markers = f"markers {', '.join(marker.name for marker in self.markers)}"
         return f"<Robot {self.name}: {long:.4g} mm long, {len(self.cables)} cables, {commands}, {markers}>"
@@ -289,6 +289,11 @@ class Robot(RobotTable):
     def guides(self) -> list[Float[np.ndarray, "guide 3"]]:
         """Guide points of each cable in the undeformed body [m]; cables may have different numbers of them."""
         return [cable.guides() for cable in self.cables]
+
+    @property
+    def length(self) -> float:
+        """Of the body along its axis [m]."""
+        return float(self.body.station_m[-1] - self.body.station_m[0])
 
     def displacement_limits(self) -> Float[np.ndarray, "cable 2"]:
         """Least and greatest displacement of each cable [m], pull > 0."""

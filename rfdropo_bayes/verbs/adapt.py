@@ -58,6 +58,7 @@ from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
+from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
 DRAWS = 100
 MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
@@ -530,7 +531,8 @@ def _record(
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
     predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
     record = PosteriorRecord(infos, draws, {**prior, **drawn}, tuple(predictions), attrs=attributes)
-    return with_ratios(record, problem.names)
+    doubts = cautions_after(asked.fit.record, asked.model, [asked.head, *asked.tested])
+    return with_doubts(with_ratios(record, problem.names), doubts)
 
 
 def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:

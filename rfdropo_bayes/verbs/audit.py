@@ -16,6 +16,7 @@ from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
@@ -68,6 +69,8 @@ from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.between import Between, confine_laws, extend_groups, find_groups, groups_at_hand
+from rfdropo_bayes.verbs.motion_direction import Paths
+from rfdropo_bayes.verbs.recording_doubts import cautions_of_audit
 
 Workshop = dict[str, Lanes]
 
@@ -128,12 +131,13 @@ def audit(
     start = start_values(fit)
     problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
     tables = model.record({"title": model.title, "seed": chosen}, {})
+    doubts = cautions_of_audit(model, [*runs, *test], nominal_paths(problem))
 
     def found(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
         answer = ask(problem, say_lines(show), journal, deadline)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
-        return _audited(answer, model, tables, data, out)
+        return _audited(answer, model, tables, data, out, doubts)
 
     if out is None:
         return found(None)
@@ -148,10 +152,31 @@ def audit(
     return answered
 
 
-def _audited(answer: Answer, model: Model, tables: Mapping[str, Any], data_sha256: str, out: Path | None) -> Audit:
-    """What an audit found as an object, with its page."""
+def nominal_paths(problem: AuditProblem) -> list[Paths]:
+    """The fitted recordings beside the nominal model; empty where an object is pushed, or a rollout ends badly."""
+    if "object_pose" in problem.lanes.fields:
+        return []
+    recordings = problem.model.recordings.of(range(len(problem.trajectories)))
+    values = {**problem.coordinates.nominal, **problem.coordinates.fixed}
+    theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
+    found, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
+    valid = np.asarray(recordings.line.valid)
+    paths = zip(found["position"], recordings.position, valid, strict=True)
+    return [] if np.any(status) else [Paths(*each) for each in paths]
+
+
+def _audited(
+    answer: Answer,
+    model: Model,
+    tables: Mapping[str, Any],
+    data_sha256: str,
+    out: Path | None,
+    doubts: Sequence[Caution],
+) -> Audit:
+    """What an audit found as an object, with its page; ``doubts`` are those of its recordings."""
     versions, following = software_versions(), next_experiment(answer)
-    content = record(answer, versions=versions, data_sha256=data_sha256, next_experiment=following)
+    given: dict[str, Any] = {"versions": versions, "data_sha256": data_sha256, "next_experiment": following}
+    content = record(answer, **given, doubts=doubts)
     seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
     page = render_audit(seen, content, model.title, describe(tables), shape)
     extended = extended_tables(dict(tables), answer, model.folder, out, model.texts())

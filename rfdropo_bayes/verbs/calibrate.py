@@ -62,6 +62,7 @@ from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
+from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
@@ -148,6 +149,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     problem = problem.holding(result.held)
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
+    record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
     facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
@@ -345,7 +347,14 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        cautions=[*result.cautions, *unmatched, *undriven, *strange, *residual_cautions(checks, problem.model.noise)],
+        cautions=[
+            *recorded_doubts(record),
+            *result.cautions,
+            *unmatched,
+            *undriven,
+            *strange,
+            *residual_cautions(checks, problem.model.noise),
+        ],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),

@@ -93,7 +93,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
         columns: the table by which it was read. A hint says what to write in its place.
     """
     start = start_of(robot, trajectory)
-    length = robot.body.station_m[-1] - robot.body.station_m[0]
+    length = robot.length
     if not start.names:
         return []
     hints = _stretched(start)
@@ -116,7 +116,7 @@ def frame_lines(robot: Robot, trajectory: Trajectory, columns: CsvColumns) -> li
         trajectory: the recording, as ``columns`` read it.
         columns: the table by which it was read.
     """
-    start, length = start_of(robot, trajectory), robot.body.station_m[-1] - robot.body.station_m[0]
+    start, length = start_of(robot, trajectory), robot.length
     if not start.names or _rms(start.first - start.rest) <= FAR * length:
         return []
     found, read = _frame(start, length), Read.by(columns)

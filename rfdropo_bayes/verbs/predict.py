@@ -59,6 +59,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, of_unseen_days
+from rfdropo_bayes.verbs.recording_doubts import cautions_after
 
 DRAWS = 200
 SCHEMA_VERSION = 1
@@ -128,7 +129,7 @@ def predict(
     bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
     group = bands.attrs["group"] = group_of(unseen.name, groups)
     known = {p.recording for p in space.parameters if p.added_to}
-    cautions = match_cautions(found)
+    cautions = cautions_after(record, model, [unseen]) + match_cautions(found)
     if isinstance(simulator, RobotSimulator):
         cautions += simulator.robot.unstated([unseen.name])
     said = [day_sentence(error) for error in slow.values() if not error.shown and group not in known]
