@@ -104,7 +104,7 @@ def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wr
     usual = float(size[short].max(initial=0.0))
     if np.count_nonzero(size[short]) < FEWEST:
         return None
-    turn = float(np.median([size[k] + _towards(step, k, short) for k in np.flatnonzero(jump)]))
+    turn = float(np.median([size[k] + _towards(step, int(k), short) for k in np.flatnonzero(jump)]))
     extent = float(np.ptp(values[rows]))
     near = [each for each in turns if abs(each - turn) <= max(usual, 0.01 * turn) and extent <= each]
     turn = min(near, key=lambda each: abs(each - turn)) if near else float(f"{turn:.3g}")

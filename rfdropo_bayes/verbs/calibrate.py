@@ -333,8 +333,10 @@ def gather_facts(
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
     slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
-    undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
-    strange = [] if robot is None else implausible_fit(robot, problem.model.fixed, record)
+    strange = recorded_doubts(record)
+    if robot is not None:
+        strange += robot.unstated(run.name for run in (*fitted, *tested))
+        strange += implausible_fit(robot, problem.model.fixed, record)
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -347,14 +349,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        cautions=[
-            *recorded_doubts(record),
-            *result.cautions,
-            *unmatched,
-            *undriven,
-            *strange,
-            *residual_cautions(checks, problem.model.noise),
-        ],
+        cautions=[*strange, *result.cautions, *unmatched, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),

@@ -98,6 +98,7 @@ class Guess(NamedTuple):
         sample_time: time from row to row [s], as it was given; None for rows with times, or without any.
         evidence: why a unit was guessed, by its key in [data.columns]; no entry for a unit that the file tells.
         start: where each marker is first seen, as the file has it.
+        sent: commands of the first rows; seen: positions of the markers in the first rows, both as the file has them.
     """
 
     time: str | None
@@ -119,6 +120,8 @@ class Guess(NamedTuple):
     command_names: list[str] | None
     evidence: Mapping[str, str]
     start: Float[np.ndarray, "marker 3"]
+    sent: Float[np.ndarray, "command channel"]
+    seen: Float[np.ndarray, "row marker 3"]
     counts_per_turn: float | None = None
     sample_time: float | None = None
 
@@ -188,6 +191,8 @@ def guess_columns(
         command_names=None if command_names is None else list(command_names),
         evidence={key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
+        sent=source[commands].to_numpy(dtype=float),
+        seen=table[names_of(positions)].to_numpy(dtype=float).reshape(len(table), -1, 3),
         **{key: unit.unit for key, unit in units.items()},
     )
 

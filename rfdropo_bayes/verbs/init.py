@@ -11,15 +11,17 @@ from typing import Any
 
 from rfdropo_bayes.data import lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
-from rfdropo_bayes.data.named_columns import COUNTS, ROWS
+from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.outline import RobotOutline, robot_text
+from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_text
+from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
-from rfdropo_bayes.verbs.column_units import unit_of_places
+from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.placement import frame_lines
+from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 PRIORS = (
     ("young_modulus", "how stiff"),
@@ -107,15 +109,27 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
-    """A guess with what the robot says of it: the unit of positions, and no tensions of motors that move two cables."""
+    """A guess with what the robot says of it: units of positions and commands, and no tensions of motors that move two
+    cables."""
     if outline.pairs and guess.tensions:
         guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
-    if "position_unit" not in guess.evidence or "markers" in outline.assumed:
+    if "markers" in outline.assumed:
         return guess
-    unit = unit_of_places(guess.start, outline.markers)
-    if unit is None:
+    unit = unit_of_places(guess.start, outline.markers) if "position_unit" in guess.evidence else None
+    if unit is not None:
+        guess = guess._replace(position_unit=unit.unit, evidence={**guess.evidence, "position_unit": unit.evidence})
+    return _moved(guess, outline) if "command_unit" in guess.evidence and not guess.units else guess
+
+
+def _moved(guess: Guess, outline: RobotOutline) -> Guess:
+    """A guess with the unit of the commands that bends the robot as far as its markers moved."""
+    robot = parse_table(Robot, outlined_tables(outline), where="outline")
+    if len(guess.commands) != len(robot.channel_names) or len(guess.positions) != len(outline.markers):
         return guess
-    return guess._replace(position_unit=unit.unit, evidence={**guess.evidence, "position_unit": unit.evidence})
+    seen = METRES[guess.position_unit] * guess.seen
+    guessed = Unit(guess.command_unit, evidence=guess.evidence["command_unit"])
+    unit = unit_of_motion(robot, guess.sent, seen, outline.markers, guessed)
+    return guess._replace(command_unit=unit.unit, evidence={**guess.evidence, "command_unit": unit.evidence})
 
 
 def write_first_files(

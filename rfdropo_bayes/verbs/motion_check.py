@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -214,8 +214,8 @@ def pull_responses(spec: ModelSpec, runs: Sequence[Trajectory]) -> Float[np.ndar
     time, channels = np.linspace(0.0, PULLED, 21), len(size)
     still = np.zeros(channels)
     grid = stack_commands([simulator.commands(time[:1], own[None], still, time) for own in np.diag(size)])
-    values = physical_values(spec, simulator)
-    found = jax.jit(jax.vmap(lambda own: simulator.rollout(values, own)))(grid)
+    values: Any = physical_values(spec, simulator)
+    found = jax.jit(jax.vmap(simulator.rollout, in_axes=(None, 0)))(values, grid)
     position = np.asarray(found.position)
     if np.any(np.asarray(found.status)) or not np.isfinite(position).all():
         raise InputError("a pull of a single channel cannot be simulated", where="[simulator]")

@@ -16,6 +16,7 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy import held_out as held_out_module
 from rfdropo_bayes.discrepancy import pipeline
@@ -342,7 +343,11 @@ def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp
     assert "fit of the base model is not done" in content["sentence"]
     assert "--resume" in content["sentence"]
     assert "--resume" in content["next_experiment"]["sentence"]
-    page = render_audit(shown(answer), content, "", "")
+    doubt = Caution(Code.RECORDING_DOUBTFUL, "run: markers change names")
+    doubtful = record(answer, versions={}, data_sha256="", next_experiment=None, doubts=[doubt])
+    assert doubtful["cautions"][0] == {"code": "recording_doubtful", "sentence": doubt.sentence, "grave": False}
+    page = render_audit(shown(answer), doubtful, "", "")
+    assert "<li>run: markers change names</li>" in page
     assert "no_verdict" in page.replace(" ", "_")
     assert ("No candidate was screened" in page) == (content["candidates"] == [])
     if stated and share > 0.5:
