@@ -19,6 +19,8 @@ from rfdropo_bayes.data.csv_layout import SAMPLED, cells_of, dialect_of, header_
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
+HEAD = 100_000
+"""Letters of a file that hold its first rows."""
 MOTIVE = "Format Version"
 """How the first line of an export of Motive's begins."""
 
@@ -76,7 +78,7 @@ def unnamed_rows(path: Path) -> list[list[str]] | None:
     Raises:
         InputError: see `read_text`.
     """
-    lines = read_text(path).splitlines()[: SAMPLED + 1]
+    lines = read_text(path)[:HEAD].splitlines()[: SAMPLED + 1]
     separator = dialect_of(lines).separator if lines else ","
     if len(lines) < 2 or not without_names(lines, separator):
         return None
