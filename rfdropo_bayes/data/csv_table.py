@@ -19,6 +19,8 @@ from rfdropo_bayes.data.csv_layout import SAMPLED, cells_of, dialect_of, header_
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
+HEAD = 100_000
+"""Letters of a file that hold its first rows."""
 MOTIVE = "Format Version"
 """How the first line of an export of Motive's begins."""
 
@@ -76,7 +78,7 @@ def unnamed_rows(path: Path) -> list[list[str]] | None:
     Raises:
         InputError: see `read_text`.
     """
-    lines = read_text(path).splitlines()[: SAMPLED + 1]
+    lines = read_text(path)[:HEAD].splitlines()[: SAMPLED + 1]
     separator = dialect_of(lines).separator if lines else ","
     if len(lines) < 2 or not without_names(lines, separator):
         return None
@@ -110,7 +112,9 @@ class CsvTable:
         if machine_written:
             self.missing_remedy = "rename the column, or use format = 'csv' with a [data.columns] mapping"
         text = read_text(path)
+        ended = text.endswith("\n")
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        del text  # of a long recording as large as the lines
         if lines[0].lower().startswith("sep="):  # spreadsheets write so which separator follows
             lines.pop(0)
         if lines and lines[0].startswith(MOTIVE):
@@ -118,7 +122,7 @@ class CsvTable:
                 "is Motive's own export, whose header has several lines", where=str(path), remedy='use "motive-csv"'
             )
         self._parse(lines, names)
-        if machine_written and not text.endswith("\n"):
+        if machine_written and not ended:
             raise InputError(
                 "the last line does not end: the file is cut short",
                 where=f"{path}, row {len(self) - 1}",
@@ -248,10 +252,11 @@ class CsvTable:
         told = numbers.notna() | cells.isna()
         return read_stamps(numbers if told.all() else cells, unit, where=str(self.path), column=name)
 
-    def numeric(self) -> pd.DataFrame:
-        """The columns that hold nothing but numbers and empty cells, as numbers."""
-        values = self.frame.apply(self._number)
-        told = values.notna().any() & (values.notna() | self.frame.isna()).all()
+    def numeric(self, rows: int) -> pd.DataFrame:
+        """The columns that hold nothing but numbers and empty cells in the first rows, as numbers."""
+        cells = self.frame.head(rows)
+        values = cells.apply(self._number)
+        told = values.notna().any() & (values.notna() | cells.isna()).all()
         return values.loc[:, told]
 
     def _number(self, cells: pd.Series) -> pd.Series:
@@ -292,6 +297,8 @@ def _told_apart(header: Sequence[str]) -> list[str]:
 
 def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: int) -> None:
     for row, line in enumerate(rows):
+        if separator != " " and '"' not in line and line.count(separator) == fields - 1:
+            continue
         found = len(cells_of(line, separator))
         if found != fields:
             last = row == len(rows) - 1

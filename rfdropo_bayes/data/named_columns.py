@@ -350,8 +350,12 @@ def _largest(columns: CsvColumns) -> float | None:
 
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
     """Positions of the markers [m] in the base frame."""
-    names = coordinates(columns)
-    place = table.points(names, allow_missing=mask_missing) * columns.factors(names).reshape(-1, 3)
+    return in_base(table.points(coordinates(columns), allow_missing=mask_missing), columns)
+
+
+def in_base(place: Float[np.ndarray, "*rows marker 3"], columns: CsvColumns) -> Float[np.ndarray, "*rows marker 3"]:
+    """Positions [m] in the base frame of those that a file has."""
+    place = place * columns.factors(coordinates(columns)).reshape(-1, 3)
     return METRES[columns.position_unit] * (place - columns.origin) @ axes_matrix(columns.axes).T
 
 

@@ -21,6 +21,7 @@ from rfdropo_bayes.data import (
 )
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.data.thinning import looked_at, thinning_note
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json
 from rfdropo_bayes.groups import unmatched
@@ -47,6 +48,8 @@ from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 from rfdropo_bayes.verbs.recording_doubts import asked_pulls, cables_beyond, recording_cautions, shortened
 
 MILLIMETRES = 1e3
+LONG = 60.0
+"""Recordings of more seconds make whoever checks them wait for minutes."""
 IRREGULAR = 1.5
 """A gap longer than so many median sample times is said."""
 
@@ -134,10 +137,13 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         if named
     ]
     _say_model(found, experiment, folder, recordings["fit"])
+    notes = [thinning_note(trajectory) for trajectory in (*recordings["fit"], *recordings["test"])]
+    found.notes += [note for note in notes if note is not None]
     if ahead and recordings["fit"] and not found.problems:
+        fewer = [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
-            _say_motion(found, experiment, folder, recordings["fit"])
-        _say_ahead(found, experiment, folder, recordings["fit"])
+            _say_motion(found, experiment, folder, fewer)
+        _say_ahead(found, experiment, folder, fewer)
     if any(recordings.values()):
         out = output_folder(out)
     rest = robot_shape(robot) if isinstance(robot, Robot) else None
@@ -163,7 +169,9 @@ def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequen
 
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
     """What a fit could determine; a model that cannot be simulated is no problem of its description."""
-    say_step("simulating draws of the prior, to say what a fit could determine")
+    seconds = sum(float(run.time[-1]) for run in runs)
+    patience = "; this takes minutes, and --quick leaves it out" if seconds > LONG else ""
+    say_step(f"simulating {seconds:.3g} s under draws of the prior, to say what a fit could determine{patience}")
     try:
         found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
     except InputError as error:

@@ -150,7 +150,7 @@ def guess_columns(
     format = recognised_format(path)
     own = format == named_columns.FORMAT or format in named_arrays.FORMATS
     whole, unit = _measured(format, path, names)
-    table = whole.numeric().head(LOOKED_AT)
+    table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
     columns = [str(name) for name in table.columns if name != time]
     triples, tensions, angles, free = _parts(columns, format)
@@ -158,7 +158,7 @@ def guess_columns(
     source, sending, clock = table, whole, None
     if sent is not None:
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
-        source, clock = sending.numeric().head(LOOKED_AT), _clock_of(sending)
+        source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
     commands = _commands(source, free, any_name=own or sent is not None)
     _check_found(path, format, columns, positions, commands)
@@ -385,5 +385,5 @@ def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
 
 def _rises(table: CsvTable, name: str) -> bool:
     """Whether a column grows from every row to the next."""
-    numbers = table.numeric()
+    numbers = table.numeric(LOOKED_AT)
     return len(numbers) > 1 and name in numbers and bool((numbers[name].diff().iloc[1:] > 0.0).all())

@@ -201,7 +201,7 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
     ]
     unit = since[0] if since else _likeliest(interval, bool((stamps.ticks % 1 != 0).any()), _rate(places))
     seconds = interval / PER_SECOND[unit]
-    rate = f"{1.0 / seconds:.3g} a second" if seconds <= 1.0 else f"one every {seconds:.3g} s"
+    rate = f"{1.0 / seconds:.4g} a second" if seconds <= 1.0 else f"one every {seconds:.3g} s"
     words = f"{count / PER_SECOND[unit]:.3g} s of {len(table)} rows, {rate}"
     return Unit(unit, evidence=words + (", counted from 1970" if since else ""))
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rfdropo_bayes.data import lerobot, load_recordings, motive_csv, rosbag
+from rfdropo_bayes.data import lerobot, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
@@ -172,13 +172,13 @@ def write_first_files(
         outline.gravity,
         cables=outline.cable_names(),
     )
-    frame = _frame(write(tables()), made, folder)
+    frame = _frame(write(tables()), made, guess)
     if frame:
         write(tables(frame=frame))
     return robot, experiment
 
 
-def _frame(experiment: Experiment, robot: Robot, folder: Path) -> list[str]:
+def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
     """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
 
     Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
@@ -186,13 +186,9 @@ def _frame(experiment: Experiment, robot: Robot, folder: Path) -> list[str]:
     if experiment.data is None or experiment.data.columns is None:
         return []
     columns = experiment.data.columns
-    try:
-        first = load_recordings(experiment.data, folder)[0]
-    except InputError:  # what is wrong with it is said by check, which the user runs next
-        return []
-    found = frame_lines(robot, first, columns)
+    found = frame_lines(robot, guess.start, columns)
     turned = found and found[0] != f"axes = {quoted(columns.axes)}"
-    return [] if turned and experiment.data.format == motive_csv.FORMAT else found
+    return [] if turned and guess.format == motive_csv.FORMAT else found
 
 
 def _head(name: str) -> list[str]:

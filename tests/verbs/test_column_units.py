@@ -61,7 +61,7 @@ def test_times_are_in_the_unit_in_which_a_soft_body_moves_so(step, places, whole
 def test_stamps_since_1970_tell_their_unit_and_a_name_needs_no_evidence():
     found = time_unit(table(1_714_557_600_000 + 700 * np.arange(ROWS)), "t", held(1))
     assert found.unit == "ms"
-    assert found.evidence == "112 s of 161 rows, 1.43 a second, counted from 1970"
+    assert found.evidence == "112 s of 161 rows, 1.429 a second, counted from 1970"
     assert time_unit(table(np.arange(ROWS), "t [ms]"), "t [ms]", held(1)) == ("ms", {}, "")
 
 
