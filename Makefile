@@ -27,8 +27,8 @@ help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
 
 demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
-	$(BIN)/rfdropo calibrate experiments/demo.toml --out reports/demo --overwrite
-	@echo "The report: reports/demo/report.html"
+	$(BIN)/rfdropo calibrate experiments/demo.toml --out runs/demo --overwrite
+	@echo "The report: runs/demo/report.html"
 
 test: $(DEV) ## the tests that are not slow
 	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook" --ignore=tests/studies
@@ -94,7 +94,7 @@ notebook-outputs: $(DEV) ## run every notebook and keep its outputs in it
 demo-data: $(CORE) ## make the recordings of the bundled example again
 	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo --overwrite
 
-clean: ## remove the environment and what the tools cached; reports stay
+clean: ## remove the environment and what the tools cached; runs stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
 	find rfdropo_bayes tests -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -25,7 +25,7 @@ VIRTUAL = Path("experiments/virtual")
 
 
 def table1(
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table1"),
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("runs/table1"),
     truths: Annotated[int, typer.Option(help="number of true parameter sets of each kind, for our methods")] = 100,
     repeats: Annotated[
         int, typer.Option(help="number of data sets at the paper's true parameters, for our methods")
@@ -76,7 +76,7 @@ def table2(
     target: Annotated[Path, typer.Option(help="experiment file of the robot that policies are evaluated on")] = VIRTUAL
     / "truth.toml",
     audited: Annotated[Path, typer.Option("--audit", help="experiment file of the audit")] = VIRTUAL / "audit.toml",
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table2"),
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("runs/table2"),
     seeds: Annotated[int, typer.Option(help="number of policies trained for each row")] = 3,
     steps: Annotated[int, typer.Option(help="number of environment steps of a training")] = 1_000_000,
     episodes: Annotated[int, typer.Option(help="number of episodes of an evaluation, the same for all policies")] = 200,
@@ -133,7 +133,7 @@ def audit(
     truth: Annotated[
         str, typer.Option("--truth", help="engine that makes recordings: own, mujoco or pyelastica")
     ] = "own",
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("runs/audits"),
 ) -> None:
     """Count how often audits are right. Effects are hidden in recordings; a study goes on where it was stopped."""
     if truth not in ("own", "mujoco", "pyelastica"):

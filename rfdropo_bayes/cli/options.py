@@ -17,7 +17,7 @@ OutFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="folder to write to  [default: reports/EXPERIMENT_COMMAND; of calibrate reports/EXPERIMENT; "
+        help="folder to write to  [default: runs/EXPERIMENT_COMMAND; of calibrate runs/EXPERIMENT; "
         "of DIR/experiment.toml the name of DIR]",
     ),
 ]
@@ -56,7 +56,7 @@ def folder_for(
     look_through(experiment, overrides or [])
     title = experiment_name(experiment)
     name = title if command == "calibrate" else f"{title}_{command.split()[0]}"
-    folder = out or Path("reports") / name
+    folder = out or Path("runs") / name
     check_folder(folder, command, resume=resume, overwrite=overwrite)
     return folder
 

@@ -12,7 +12,7 @@ def view(
     source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="what to draw")],
     out: Annotated[
         Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
-    ] = Path("reports/view.png"),
+    ] = Path("runs/view.png"),
     recording: Annotated[
         str | None, typer.Option(help="which recording of an experiment; the first by default")
     ] = None,

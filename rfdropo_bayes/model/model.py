@@ -20,6 +20,7 @@ from rfdropo_bayes.model.assembly import (
     build_model,
     build_problem,
     build_simulator,
+    check_spec,
     expand_groups,
     fixed_values,
     integrator_of,
@@ -75,8 +76,7 @@ class Model:
         file: that it was read from, if any; a changed model has none.
 
     Raises:
-        InputError: an unknown robot, key or mechanism, or a distribution that cannot be a prior. What is wrong with a
-            prior's numbers is said when recordings are there.
+        InputError: an unknown robot, key, mechanism or parameter; or a prior that cannot be one of its parameter.
     """
 
     file: ExperimentFile | None = None
@@ -108,6 +108,7 @@ class Model:
         experiment = parse_table(Experiment, tables, where="Model")
         self.spec = spec_of(experiment, Path(folder), made, mechanisms)
         self.settings = RunSettings(title=title)
+        check_spec(self.spec, self.simulator)
 
     @classmethod
     def of(cls, spec: ModelSpec, settings: RunSettings | None = None) -> Model:

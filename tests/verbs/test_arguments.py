@@ -58,8 +58,8 @@ def test_one_recording_is_a_list_of_one():
 
 @pytest.mark.parametrize("call", [rb.predict, rb.adapt, rb.design_day], ids=["predict", "adapt", "design_day"])
 def test_the_folder_of_a_run_is_no_calibration(call):
-    with pytest.raises(rb.InputError, match=r"'reports/arm' is no calibration; .*rb\.load\(folder\)"):
-        call("reports/arm", RUN)
+    with pytest.raises(rb.InputError, match=r"'runs/arm' is no calibration; .*rb\.load\(folder\)"):
+        call("runs/arm", RUN)
 
 
 @pytest.mark.parametrize(
