@@ -16,7 +16,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads
+from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads, refuse_lost_threads
 
 limit_blas_threads()
 keep_callback_threads()
@@ -73,15 +73,21 @@ _METHODS = {
 }
 """Options of each method of inference, by the method's name in an experiment file."""
 
+_COMPUTING = ("model.", "simulators.", "verbs.")
+"""Rooms that make arrays of JAX when they are imported."""
+
 __all__ = ["__version__", *_HOMES, *_METHODS]
 
 
 def __getattr__(name: str) -> Any:
     """Load what a name stands for, once it is asked for."""
     if name in _METHODS:
+        refuse_lost_threads()
         found = import_module(f"{__name__}.inference.methods").METHODS[_METHODS[name]].config
     elif name in _HOMES:
         module, _, attribute = _HOMES[name].partition(":")
+        if module.startswith(_COMPUTING):
+            refuse_lost_threads()
         found = getattr(import_module(f"{__name__}.{module}"), attribute or name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
