@@ -15,7 +15,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads
+from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads, refuse_lost_threads
 
 if TYPE_CHECKING:
     from rfdropo_bayes.cautions import Caution as Caution
@@ -108,6 +108,9 @@ _HOMES = {
 }
 """Where each name is defined: ``module`` under the same name, or ``module:name``."""
 
+_COMPUTING = ("inference.", "model.", "simulators.", "verbs.")
+"""Rooms that make arrays of JAX when they are imported."""
+
 __all__ = [
     "NUTS",
     "RFDROPO",
@@ -164,6 +167,8 @@ if not TYPE_CHECKING:  # with this function every name would be Any to a type ch
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module, _, attribute = _HOMES[name].partition(":")
+        if module.startswith(_COMPUTING):
+            refuse_lost_threads()
         found = getattr(import_module(f"{__name__}.{module}"), attribute or name)
         globals()[name] = found
         return found

@@ -25,6 +25,8 @@ class Code(StrEnum):
     """Replicates differ in their log evidence."""
     REPLICATES_DISAGREE = "replicates_disagree"
     """Replicates differ in where parameters lie."""
+    MODES_UNSEEN = "modes_unseen"
+    """One replicate, or one climb, cannot show that a mode of the posterior was lost."""
     PASSES_DISAGREE = "passes_disagree"
     """Two passes over the data differ in their log evidence."""
     ROLLOUTS_EXCLUDED = "rollouts_excluded"

@@ -160,6 +160,23 @@ def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
     return found
 
 
+def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
+    """A caution where nothing would show a lost mode: particles of one replicate end in one mode of several.
+
+    Args:
+        replicates: independent repetitions of the sampler.
+        climbs: independent searches for the optima that all replicates start around; None for starts at the prior.
+    """
+    if replicates > 1 and climbs != 1:
+        return []
+    alone = "one replicate" if replicates == 1 else "one climb to an optimum"
+    sentence = (
+        f"{alone} cannot show whether other modes of the posterior were lost: allow more rollouts, state "
+        "replicates = 4, or compare seeds"
+    )
+    return [Caution(Code.MODES_UNSEEN, sentence)]
+
+
 def exclusion_cautions(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[Caution]:
     """A caution where more than ``share`` of the rollouts had to be left out."""
     total = sum(excluded.values())

@@ -33,6 +33,7 @@ from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe
 from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
 from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.signatures import with_keywords_of
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -197,8 +198,9 @@ class Model:
         """The model of these recordings as a numpyro model: a callable with sample sites for all that is inferred.
 
         Raises:
-            InputError: unknown names, or priors outside the bounds.
+            InputError: unknown names, priors outside the bounds, or a process in which JAX cannot compute.
         """
+        refuse_lost_threads()
         return build_model(self.spec, self.simulator, runs)
 
     def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:

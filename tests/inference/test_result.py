@@ -8,7 +8,7 @@ import pytest
 
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.result import prior_cautions, replicate_cautions, stage_cautions
+from rfdropo_bayes.inference.result import prior_cautions, replicate_cautions, stage_cautions, unseen_modes
 
 from .toys import LinearGaussian, Ratio
 
@@ -116,6 +116,16 @@ def test_replicates_that_disagree_are_named():
     assert "4 replicates scatter by 0.96" in scattered.sentence
     assert (scattered.code, apart.code) == (Code.EVIDENCE_SCATTERED, Code.REPLICATES_DISAGREE)
     assert apart.sentence.startswith("replicates disagree about b (R-hat 1.")
+
+
+@pytest.mark.parametrize(
+    ("replicates", "climbs", "alone"),
+    [(1, None, "one replicate"), (1, 4, "one replicate"), (4, 1, "one climb"), (2, None, None), (2, 2, None)],
+)
+def test_what_cannot_show_a_lost_mode_says_so(replicates, climbs, alone):
+    found = unseen_modes(replicates, climbs)
+    assert [caution.code for caution in found] == ([Code.MODES_UNSEEN] if alone else [])
+    assert not alone or found[0].sentence.startswith(alone)
 
 
 def test_stages_say_that_particles_stayed_and_where_a_budget_ran_out():

@@ -39,6 +39,7 @@ from rfdropo_bayes.inference.result import (
     prior_cautions,
     replicate_cautions,
     stage_cautions,
+    unseen_modes,
 )
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.moves import StraightProblem, host_generator, squared_distance
@@ -168,6 +169,8 @@ def sample_from_modes(
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
     kept = stage_cautions(sampled.trace, sampling.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
+    first = found.climbs.trace[0]["horizon"]
+    kept += unseen_modes(sampling.chains, sum(row["horizon"] == first for row in found.climbs.trace))
     kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
     return replace(
         sampled,

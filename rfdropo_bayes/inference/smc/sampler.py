@@ -36,6 +36,7 @@ from rfdropo_bayes.inference.result import (
     prior_cautions,
     replicate_cautions,
     stage_cautions,
+    unseen_modes,
 )
 from rfdropo_bayes.inference.smc.moves import initial_scale
 from rfdropo_bayes.inference.smc.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
@@ -372,6 +373,7 @@ def _result(problem: Problem, config: SmcConfig, plan: ReplicatePlan, states: li
             *exclusion_cautions(spent.excluded, spent.evaluations),
             *stage_cautions(trace, config.rollouts),
             *replicate_cautions(draws, values),
+            *unseen_modes(len(values)),
         ],
         seconds=sum(state.seconds for state in states),
         details={
