@@ -106,7 +106,11 @@ def test_the_parser_sees_every_way_to_import() -> None:
 
 
 def test_imports_come_from_above() -> None:
-    below = {relative(path): forbidden_rooms(room_of(path), imports_of(path)) for path in MODULES}
+    below = {
+        relative(path): forbidden_rooms(room_of(path), imports_of(path))
+        for path in MODULES
+        if room_of(path) != "__init__"  # the front door names what stands in every room
+    }
     wrong = {name: sorted(rooms) for name, rooms in below.items() if rooms}
     assert not wrong, f"imports from rooms below; see the table in docs/architecture.md: {wrong}"
 
