@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -238,14 +240,14 @@ def test_stamps_of_single_precision_are_noted_once_they_are_coarse(kind, tmp_pat
     for hours, step, noted in ((0.0, 0.02, False), (20.0, 0.02, True), (20.0, 1.0, False)):
         single = (3600.0 * hours + step * np.arange(200)).astype(np.float32)
         if kind == "file":
-            pd.DataFrame({"t": single}).to_csv(tmp_path / "run.csv", index=False)
+            pd.DataFrame({"t": single.astype(float)}).to_csv(tmp_path / "run.csv", index=False)
             single = pd.read_csv(tmp_path / "run.csv")["t"].to_numpy()
         stamps = read_stamps(single, where="run")
         notes = rounded_notes(stamps, stamps.since(stamps, "run"))
         assert [note.partition(":")[0] for note in notes] == ["times have single precision"] * noted
         if noted:
             assert "in steps of 7.81 ms, and rows come every" in notes[0]
-            assert "sample_time = 0.02 in" in notes[0]
+            assert re.search(r"sample_time = 0\.0(2|199\d) in", notes[0])
 
 
 def test_stamps_of_double_precision_jitter_unsaid():

@@ -26,16 +26,11 @@ def test_numbers_of_numpy_are_written_as_those_of_python(tmp_path):
 
 
 def test_numbers_of_numpy_are_options_and_keys():
-    one, other = make_config("udr", {"draws": np.int64(40)}), make_config("udr", {"draws": 40})
+    one, other = (make_config("smc", {"rollouts": number}) for number in (np.int64(4000), 4000))
     assert one == other
     assert settings_text(np.int64(40)) == settings_text(40)
-    spec = DataSpec.parse(
-        {
-            "format": "netcdf",
-            "fit": [{"observations": "a.nc", "rows": (np.int64(0), np.int64(9))}],
-            "resample": np.float32(0.5),
-        }
-    )
+    entry = {"observations": "a.nc", "rows": (np.int64(0), np.int64(9))}
+    spec = DataSpec.parse({"format": "netcdf", "fit": [entry], "resample": np.float32(0.5)})
     assert spec.fit[0].rows == (0, 9)
     assert spec.resample == 0.5
 
