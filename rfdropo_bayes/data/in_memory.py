@@ -10,11 +10,12 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
+from rfdropo_bayes.data.command_notes import command_notes
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.first_command import MEMORY, Rule
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS, METRES, CsvColumns, read_frame
 from rfdropo_bayes.data.recorded import AXES, Measured, Origin, Recorded, SentCommands
-from rfdropo_bayes.data.sample_times import PER_SECOND, check_times, read_stamps
+from rfdropo_bayes.data.sample_times import PER_SECOND, check_times, read_stamps, rounded_notes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest, parse_table
 
@@ -75,6 +76,12 @@ def from_arrays(
         wanted = f"({len(stamps)} times, {len(channels)} channels)"
         raise InputError(f"commands have the shape {sent.shape}, and not {wanted}", where=name)
     faults = find_faults(clock, place, where=name, names=markers)
+    notes = [
+        *faults.notes,
+        *rounded_notes(begins, clock),
+        *(() if command_time is None else command_notes(stamps, sent)),
+    ]
+    faults = faults._replace(notes=notes)
     pose = None
     if object_pose is not None:
         pose = _numbers(object_pose, "poses", rows | {"": 7}, name) * np.repeat([metres, 1.0], [3, 4])

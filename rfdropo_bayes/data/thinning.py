@@ -14,6 +14,8 @@ LOOKED_AT = 50_000
 LIKE_NOISE, CLOSE = 1.6, 5e-3
 """What lies between two rows is told if its error is at most so many times the error between every second row, or this
 share of the spread of the markers."""
+UNRESOLVED = 0.2
+"""Share of the spread by which every second row is missed in a motion that needs every row."""
 SLOWEST = 0.1
 """Longest time between rows [s] that is offered."""
 FACTORS = tuple(digit * 10**power for power in range(4) for digit in (1, 2, 5))
@@ -37,8 +39,10 @@ def needed_interval(run: Trajectory) -> float:
             squares.append(np.mean(np.sum((place[inside] - np.stack(lines, axis=1)) ** 2, axis=1)))
         return float(np.sqrt(np.mean(squares)))
 
-    allowed, longest = max(LIKE_NOISE * error(2), CLOSE * spread), 1
-    for every in FACTORS[1:]:
+    if error(2) > UNRESOLVED * spread:
+        return step
+    allowed, longest = max(LIKE_NOISE * error(2), CLOSE * spread), 2
+    for every in FACTORS[2:]:
         if every * step > SLOWEST or every > len(time) // 4 or error(every) > allowed:
             break
         longest = every

@@ -159,7 +159,9 @@ def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) ->
     if all(ANGLE.search(name) for name in names):
         return angle_unit(values, names)
     largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
-    return Unit("mm" if largest > METRES_UP_TO else "m", evidence=f"{_span(names)} reach {largest:.3g}")
+    whole = all(pd.api.types.is_integer_dtype(values[name]) for name in names)
+    evidence = f"{_span(names)} reach {largest:.3g}" + (" in whole numbers, as counts do" if whole else "")
+    return Unit("mm" if largest > METRES_UP_TO else "m", evidence=evidence)
 
 
 def angle_unit(values: pd.DataFrame, names: Sequence[str]) -> Unit:
