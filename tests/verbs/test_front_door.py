@@ -112,6 +112,22 @@ def test_every_name_leads_somewhere():
         rb.calibrat  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"priors": {"young_modulos": {}}}, "did you mean 'young_modulus'"),
+        ({"priors": {"young_modulus": {"distribution": "LogNormall"}}}, "did you mean 'LogNormal'"),
+        ({"priors": {"young_modulus": {"distribution": "LogNormal", "mediann": 3.0}}}, "did you mean 'median'"),
+        ({"fixed": {"trunk_maß": 0.1}}, r"\[model.fixed\]: unknown parameter"),
+        ({"per_recording": {"ofset": "all"}}, r"\[model.per_recording\]: unknown parameter 'ofset'"),
+        ({"fixed": {"actuator_lag": 0.1}}, "add 'actuator_lag' to \\[model\\] mechanisms"),
+    ],
+)
+def test_a_misspelt_parameter_or_prior_is_refused_where_it_is_written(wrong, said):
+    with pytest.raises(rb.InputError, match=said):
+        rb.Model("smooth_arm", **wrong)
+
+
 def test_what_is_no_model_is_told_so():
     with pytest.raises(rb.InputError, match="did you mean 'noise'"):
         rb.Model("smooth_arm", noize="white")
