@@ -1,4 +1,4 @@
-"""Which faults the tests see: each fault of `tools/mutants.toml` is put into a copy of the tree, and its tests run there.
+"""Which faults the tests see: each fault of `tools/mutants.toml` is put into a copy of the tree; its tests run there.
 
 A fault that survives is a test that is missing. Before tests are made cheaper, and after, the same faults must be
 killed; `reports/checks/mutants.csv` says which were, and at which commit.

@@ -73,9 +73,8 @@ class Toy:
         values = {s.name: jnp.asarray(s.nominal) for s in Toy.parameters} | dict(parameters)
         level = jnp.concatenate([commands.initial[None], commands.step])  # one step a row
         rate = jnp.diff(level, axis=0, prepend=level[:1])
-        time = STEP * jnp.arange(len(level))
-        age = time[:, None] - time
-        kernel = jnp.where(age >= 0.0, jnp.exp(-jnp.abs(age) / values["creep_time"]), 0.0)
+        age = jnp.arange(len(level))[:, None] - jnp.arange(len(level))  # in whole steps, whose signs are sure
+        kernel = jnp.where(age >= 0, jnp.exp(-STEP * jnp.abs(age) / values["creep_time"]), 0.0)
         slow = (STEP * kernel @ level[:, 1])[:, None]  # a convolution, which XLA would compute ten times slower
         shapes = (
             (values["gain"] + values["imitable"], level[:, 0]),
