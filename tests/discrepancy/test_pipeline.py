@@ -303,7 +303,9 @@ def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, shar
 @pytest.mark.parametrize("start", [None, {"gain": 1.0, "bend": 0.0}])
 def test_the_rollouts_that_are_announced_for_the_base_model_are_about_those_it_takes(start):
     lines: list[str] = []
-    target, _ = base_model(replace(problem(TRUTH, 1), start=start), 1, report=lines.append)
+    asked = replace(problem(TRUTH, 1), start=start)
+    target, base = base_model(asked, 1, report=lines.append)
+    assert asked.coordinates.named(base.x)["gain"] == pytest.approx(TRUTH["gain"], abs=0.02)
     (announced,) = [int(found[1]) for line in lines if (found := re.search(r"about (\d+) rollouts", line))]
     assert 0.5 < announced / target.forward.rollouts < 2.0
 
