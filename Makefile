@@ -9,6 +9,8 @@ BIN     = $(VENV)/bin
 # --no-compile: Python compiles the few modules that are used when it first meets them, which halves the set-up.
 PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 PYTEST  = $(BIN)/python -m pytest
+# Tests of one file share what they fit and compile: a worker takes whole files.
+BY_FILE = -n $(WORKERS) --dist loadfile
 CORE    = $(VENV)/core.stamp
 DEV     = $(VENV)/dev.stamp
 ALL     = $(VENV)/all.stamp
@@ -21,7 +23,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PYTHONDONTWRITEBYTECODE =
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-studies test-portable test-compiler test-all matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
+.PHONY: help demo test test-slow test-studies test-typed test-portable test-compiler test-all part mutants matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
@@ -31,21 +33,32 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 	@echo "The report: runs/demo/report.html"
 
 test: $(DEV) ## the tests that are not slow
-	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook" --ignore=tests/studies
+	$(PYTEST) $(BY_FILE) -m "not slow and not notebook" --ignore=tests/studies
 	$(BIN)/python tools/yardstick.py
 
 test-slow: $(DEV) ## the slow tests, without those of studies, matrix and notebooks
-	$(PYTEST) -n $(WORKERS) -m "slow and not notebook" --ignore=tests/studies --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
+	$(PYTEST) $(BY_FILE) -m "slow and not notebook" --ignore=tests/studies --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
+
+# The other tests leave this out: it doubles what the numerical rooms cost.
+test-typed: $(DEV) ## the tests of the numerical rooms with the shapes of all arrays checked at run time
+	$(PYTEST) $(BY_FILE) --typed -m "not slow and not notebook" tests/fem tests/bayes tests/inference tests/discrepancy tests/simulators
 
 test-studies: $(ALL) ## the tests of what is run for papers, in studies/
-	$(PYTEST) -n $(WORKERS) tests/studies
+	$(PYTEST) $(BY_FILE) tests/studies
 
 # The rooms that compute. `make test-portable ROOMS="policies discrepancy"` runs some of them: those that learn, sample and
 # search are where a test that rests on one processor shows, because a last bit becomes another curve there.
 test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
 	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)
 
-test-all: test test-slow test-studies test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
+test-all: test test-slow test-studies test-typed test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
+
+# `make part PART=test-slow`
+part: $(DEV) ## a part of test-all, with a line of what it found in reports/checks/parts.csv
+	$(BIN)/python tools/parts.py $(PART)
+
+mutants: $(DEV) ## faults that the tests must see, one at a time (tools/mutants.py; half an hour)
+	$(BIN)/python tools/mutants.py
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/verbs/test_matrix.py tests/verbs/test_commands_matrix.py
