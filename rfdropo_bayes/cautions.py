@@ -35,6 +35,8 @@ class Code(StrEnum):
     """The best climb stopped before its optimum."""
     SEVERAL_OPTIMA = "several_optima"
     """One normal distribution does not describe the posterior."""
+    NORMAL_DIFFERS = "normal_differs"
+    """Few draws of a normal approximation count under the exact posterior, or none were compared."""
     TRANSITIONS_DIVERGED = "transitions_diverged"
     """Hamiltonian steps could not follow the posterior."""
     EVIDENCE_UNFINISHED = "evidence_unfinished"

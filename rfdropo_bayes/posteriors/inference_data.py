@@ -27,7 +27,7 @@ if TYPE_CHECKING or not TREES:
 else:
     InferenceData = xr.DataTree
 
-SCHEMA = "rfdropo_bayes.posterior/1"
+SCHEMA = "rfdropo_bayes.posterior/2"
 
 Draws = Mapping[str, Float[np.ndarray, "chain draw"]]
 
@@ -39,6 +39,7 @@ def to_tree(
     posterior_predictive: xr.Dataset | None = None,
     prior_predictive: xr.Dataset | None = None,
     observed_data: xr.Dataset | None = None,
+    constant_data: xr.Dataset | None = None,
     sample_stats: xr.Dataset | None = None,
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None,
     parameters: Sequence[ParameterInfo] = (),
@@ -49,7 +50,8 @@ def to_tree(
     Args:
         posterior: draws of each parameter, physical (SI) units.
         prior: prior draws of each parameter.
-        posterior_predictive, prior_predictive, observed_data, sample_stats: groups as they shall be stored.
+        posterior_predictive, prior_predictive, observed_data, constant_data, sample_stats: groups as they shall be
+            stored.
         log_likelihood: of every data row at every draw.
         parameters: what is known of them, kept as attributes of the variables.
         attrs: attributes of the whole, numbers, strings or JSON-able objects (data hash, seed, versions, ...).
@@ -86,6 +88,7 @@ def to_tree(
         "posterior_predictive": posterior_predictive,
         "prior_predictive": prior_predictive,
         "observed_data": observed_data,
+        "constant_data": constant_data,
         "sample_stats": sample_stats,
         "log_likelihood": None,
     }

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -40,7 +40,14 @@ from rfdropo_bayes.inference.modes.climb import (
     normal_at,
 )
 from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
-from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
+from rfdropo_bayes.inference.modes.mixture import (
+    MIXTURES,
+    draw_mixture,
+    mixture_cautions,
+    mixture_weights,
+    rivals,
+)
+from rfdropo_bayes.inference.modes.reweighting import CANDIDATE_SHARE, Reweighted, reweighted, reweighting_cautions
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
     Target,
@@ -77,11 +84,11 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
-        draws: draws from the normal approximations.
+        draws: draws from the normal approximations, weighted by the exact posterior and resampled.
         mixture: weights of the optima that explain the data about as well as the best, see `mixture.rivals`: "equal",
             "evidence" (Laplace's), or "best" for the best alone.
         rollouts: budget in full-length rollouts, of which every climb gets its share, and a survey at most
-            `SURVEY_OF_CLIMBS`; None for no limit.
+            `SURVEY_OF_CLIMBS`; what climbs leave, a quarter at least, weights the draws. None for no limit.
     """
 
     starts: int = 4
@@ -543,47 +550,67 @@ def run(
     def explain_as_well(climbs: Climbs) -> Bool[np.ndarray, " start"]:
         return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
 
-    found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
+    allowed = None if config.rollouts is None else (1.0 - CANDIDATE_SHARE) * config.rollouts
+    climbing = replace(config, rollouts=allowed)
+    found = find_modes(problem, climbing, mode_key, checkpoint, logbook, chosen=explain_as_well)
     ledger, began = found.climbs.ledger, time.monotonic()
-    problem, found, lasting = _counted(problem, found, config)
-    modes, seconds = found.modes, found.climbs.seconds + time.monotonic() - began
+    problem, found, lasting = _counted(problem, found, climbing)
+    modes, exact, rows = found.modes, None, None
+    compared = not (isinstance(whole, Hierarchy) and held)
     if isinstance(whole, Hierarchy) and held:
         draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
     else:
         weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
-        draws = chains(problem, [draw_mixture(modes, weights, config.draws, draw_key)])
-    best = modes[0]
+        left = config.draws if config.rollouts is None else min(config.draws, int(config.rollouts - ledger.rollouts))
+        by_evidence = config.mixture == "evidence"
+        exact = reweighted(problem, modes, weights, left, draw_key, ledger, config.draws, by_evidence)
+        position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
+        draws = chains(problem, [position])
+        rows = exact.rows[None] if exact is not None and problem is whole else None
+    best, seconds = modes[0], found.climbs.seconds + time.monotonic() - began
     return InferenceResult(
         method="laplace",
         draws=draws,
         log_evidence=(float(logsumexp([mode.log_evidence for mode in modes])), float("nan")),
+        log_likelihood=rows,
         trace=found.climbs.trace,
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
         cautions=[
             *found.cautions,
-            *_several(weights, config.mixture),
+            *mixture_cautions(weights, config.mixture),
+            *(reweighting_cautions(exact) if compared else []),
             *lasting_cautions(lasting),
             *prior_cautions(whole, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
         seconds=seconds,
         optimum={**mode_values(problem, best), **held},
-        details={
-            "lasting": {
-                name: {"share": each.share, "rows": each.rows, "widened": each.widened.tolist()}
-                for name, each in lasting.items()
-            },
-            "covariance_unconstrained": best.covariance.tolist(),
-            "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
-            "optima": [
-                {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
-                for weight, mode in zip(weights, modes, strict=True)
-            ],
-            "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
-        },
+        details=_details(problem, found._replace(modes=modes), lasting, weights, exact),
     )
+
+
+def _details(
+    problem: Problem,
+    found: Modes,
+    lasting: Mapping[str, Lasting],
+    weights: Float[np.ndarray, " mode"],
+    exact: Reweighted | None,
+) -> dict[str, Any]:
+    """Further numbers of a result."""
+    modes = found.modes
+    return {
+        "effective_draws": None if exact is None else exact.effective,
+        "lasting": {name: {**each._asdict(), "widened": each.widened.tolist()} for name, each in lasting.items()},
+        "covariance_unconstrained": modes[0].covariance.tolist(),
+        "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
+        "optima": [
+            {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
+            for weight, mode in zip(weights, modes, strict=True)
+        ],
+        "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
+    }
 
 
 def _with_scales(
@@ -649,18 +676,6 @@ def _counted(problem: Problem, found: Modes, config: LaplaceConfig) -> tuple[Pro
     again = lasting_residuals(counted, target, moved[0][0])
     lasting = {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
     return counted, Modes([mode for mode, _ in moved], climbs, _unfinished(moved[0][1])), lasting
-
-
-def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
-    """A caution where more than one optimum explains the data about as well."""
-    if len(weights) == 1:
-        return []
-    use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
-    sentence = (
-        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does not describe "
-        "this posterior; use the bridge or SMC where the noise model is right"
-    )
-    return [Caution(Code.SEVERAL_OPTIMA, sentence)]
 
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:
