@@ -32,7 +32,7 @@ from rfdropo_bayes.mechanisms.actuation import (
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
     BaseTilt,
-    BendingStiffening,
+    FibreLaw,
     BendTwistCoupling,
     CableCompliance,
     CapstanFriction,
@@ -81,7 +81,7 @@ REGISTRY: dict[str, type] = {
         CapstanFriction,
         CableCompliance,
         ViscoelasticBranch,
-        BendingStiffening,
+        FibreLaw,
         PlaneAnisotropy,
         BendTwistCoupling,
         Softening,

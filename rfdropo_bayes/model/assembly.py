@@ -46,11 +46,11 @@ from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
-from rfdropo_bayes.simulators.body_engine import Engine, Integrator
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
-from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest, specs_of
+from rfdropo_bayes.simulators.robot_simulator import DAMPING, RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 Entry = TypeVar("Entry")
@@ -76,9 +76,14 @@ def robot_of(spec: ModelSpec) -> Robot:
     return spec.robot
 
 
-def integrator_of(spec: ModelSpec) -> Integrator | None:
-    """How time steps are taken: as [simulator] says, or else the robot; None for a black box."""
-    return None if isinstance(spec.robot, BlackBox) else spec.simulator.integrator or spec.robot.integrator
+def integrator_of(spec: ModelSpec) -> str | None:
+    """How time steps are taken: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
+    black box."""
+    if isinstance(spec.robot, BlackBox):
+        return None
+    if spec.simulator.motion == QUASI_STATIC:
+        return QUASI_STATIC
+    return spec.simulator.integrator or spec.robot.integrator
 
 
 def build_simulator(spec: ModelSpec) -> AnySimulator:
@@ -106,10 +111,11 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
         engine = Engine(bound, time_step, backend(table, False), integrator=integrator)
         trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step)
     else:
-        discretisation = Discretisation(time_step, table.nodes_across, table.refine)
+        discretisation = Discretisation(time_step, table.refine)
         assembly = assemble(robot, discretisation)
-        settled = robot.initial_state == "equilibrium"
-        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator)
+        rests = table.motion == QUASI_STATIC
+        settled = rests or robot.initial_state == "equilibrium"
+        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator, at_rest=rests)
         trunk = TrunkSimulator(robot, engine, assembly, discretisation)
     return _with_mechanisms(trunk.pushing() if table.push else trunk, spec)
 
@@ -190,6 +196,9 @@ def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *
     specs, chosen = model_specs(spec, simulator), asdict(spec.channels)
     known = [each.name for each in specs]
     further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
+    if spec.simulator.motion == QUASI_STATIC:
+        damping = {name: found for name, found in robot_of(spec).parameters.items() if name in DAMPING}
+        further['set [simulator] motion = "dynamic"'] = specs_of(damping)
     further['let the noise last, [model] noise = "auto"'] = (OBJECT_CORRELATION_TIME,)
     further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
     for mechanism in mechanisms_named(REGISTRY, simulator.robot):

@@ -269,8 +269,8 @@ class Robot(RobotTable):
         """Names of the markers."""
         return tuple(marker.name for marker in self.markers)
 
-    def layered_arrays(self) -> dict[str, np.ndarray | int | bool]:
-        """The fields of the finite-element engine's layered body: ``LayeredBody(**robot.layered_arrays())``."""
+    def rod_arrays(self) -> dict[str, np.ndarray]:
+        """The sections of the finite-element engine's rod: ``profile_rod(**robot.rod_arrays())``."""
         return self.body.arrays()
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:

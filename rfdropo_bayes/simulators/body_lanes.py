@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import point_positions
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
-from rfdropo_bayes.fem.layered import PointMap, joined
-from rfdropo_bayes.fem.native.layered_session import LayeredSession
+from rfdropo_bayes.fem.native.rod_session import RodSession
 from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.fem.rod import joined
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import loaded
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine, cube_arrays
@@ -59,10 +59,10 @@ def body_lanes(engine: Engine, count: int) -> BodyLanes:
     """Bodies for so many lanes.
 
     Raises:
-        InputError: an engine whose body is not made of layers.
+        InputError: an engine whose body is no rod.
     """
-    if not engine.layered:
-        raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a layered body")
+    if not engine.is_rod:
+        raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a rod")
     kind = ReferenceLanes if engine.backend.name == "jax" else CompiledLanes
     return kind(engine, count) if engine.scene is None else LanesBeforeCube(kind, engine, engine.scene, count)
 
@@ -109,7 +109,7 @@ class CompiledLanes:
     """Bodies in the compiled engine: see `BodyLanes`."""
 
     def __init__(self, engine: Engine, count: int) -> None:
-        self._session, self._from_equilibrium = LayeredSession(engine.native, count), engine.from_equilibrium
+        self._session, self._from_equilibrium = RodSession(engine.native, count), engine.from_equilibrium
         self._acting = engine.section_loads
         self.save, self.restore = self._session.save, self._session.restore
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import LayeredBody
+from rfdropo_bayes.fem.rod import Rod, profile_rod
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.layered import PointMap, joined
@@ -35,7 +35,6 @@ from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.simulators.trunk import refined_body
 
 SAME_HEIGHT = 1e-5
 """[m] A marker so near the height of guides is their mean, where markers are means of guides."""
@@ -93,7 +92,7 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
         raise InputError(
             f"robot {robot.name!r} starts in equilibrium, a body of tetrahedra at rest",
             where="[simulator] body",
-            remedy='use body = "layered", or a robot with initial_state = "rest"',
+            remedy='use body = "rod", or a robot with initial_state = "rest"',
         )
     _check_cables(robot, table)
     body = tetrahedral_body(mesh.position, mesh.element, mesh.position[:, 2] <= table.clamp_height, table.frames)
@@ -223,14 +222,14 @@ class MeshTrunkSimulator(RobotSimulator):
         return command @ jnp.asarray(self.robot.channel_matrix(values)).T + self.pretension(values)
 
     @cached_property
-    def _layers(self) -> LayeredBody:
-        return refined_body(self.robot.layered_arrays(), 1, 2)
+    def _layers(self) -> Rod:
+        return profile_rod(**self.robot.rod_arrays())
 
     def material(self, values: Values) -> TetrahedralMaterial:
         """See `RobotSimulator`."""
         layers = self._layers
         masses = jnp.asarray(self.robot.point_masses(values))
-        material = self.embodied(values, layers, jnp.ones(len(layers.station) - 1), masses)
+        material = self.embodied(values, layers, jnp.ones(layers.elements), masses)
         assembly = self.assembly
         trunk_mass = material.density * self.robot.body.volume_m3
         return TetrahedralMaterial(

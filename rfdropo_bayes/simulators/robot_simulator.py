@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import LayeredBody, Material
+from rfdropo_bayes.fem import Material, Rod
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot, Travel
-from rfdropo_bayes.simulators.body_engine import Backend, CubeInputs, Engine
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
@@ -32,6 +32,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     Values,
     check_mechanisms,
     code_of,
+    motions_of,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.port_signals import BodySignals
@@ -40,6 +41,9 @@ from rfdropo_bayes.simulators.protocol import Observation, Result
 PASSES = 2
 """Rollouts after which laws that follow the motion are given the motion that they make: with two, a pull and a
 softening are within 5 % of what they do after eight."""
+DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
+"""Parameters that a body at rest does not have."""
+DYNAMIC = 'set motion = "dynamic" under [simulator]'
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
 
@@ -92,6 +96,11 @@ class RobotSimulator(ExtendedSimulator):
             "content_sha256": self.content_sha256,
             **({"object": "cube"} if self.pushes else {}),
         }
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether every observation shows an equilibrium, found from the one before: no time step, no damping."""
+        return self.engine.at_rest
 
     @property
     def discretised(self) -> dict[str, object]:
@@ -183,21 +192,46 @@ class RobotSimulator(ExtendedSimulator):
         """
         values = self.complete(parameters)
         steps = self.steps_seen(values, commands, self.time_step, steps)
-        cube, inputs = self.body_inputs(values)[1], self.inputs(values, commands)
         loads = self.loads(values, commands)
         following = [m for m in self.mechanisms if isinstance(m, PushingMechanism) and m.follows_motion]
         for _ in range(PASSES if following else 0):
-            path = self.engine.motion(*inputs, steps, cube, loads).position[:, -1]
+            path = self._path(self._motion(values, commands, steps, loads), commands)
             loads = self.loads(values, commands, path)
-        motion = self.engine.motion(*inputs, steps, cube, loads)
-        return self.observation(values, commands, motion, self.unsolved)
+        return self.observation(values, commands, self._motion(values, commands, steps, loads), self.unsolved)
 
     def path(self, parameters: Values, commands: Commands) -> Float[Array, "row 3"]:
         """Where the last marker is before the first step and at the end of each [m], in the frame of the base, without
         laws that follow the motion."""
         values = self.complete(parameters)
-        cube, loads = self.body_inputs(values)[1], self.loads(values, commands)
-        return self.engine.motion(*self.inputs(values, commands), None, cube, loads).position[:, -1]
+        return self._path(self._motion(values, commands, None, self.loads(values, commands)), commands)
+
+    def _motion(
+        self, values: Values, commands: Commands, steps: Int[Array, ""] | None, loads: BodySignals | None
+    ) -> Motion:
+        """The motion of the body: a row before the first step and at the end of each; of a body at rest before the
+        first observation and at each."""
+        cube, (material, start, displacement) = self.body_inputs(values)[1], self.inputs(values, commands)
+        if self.at_rest:
+            displacement = sample(jnp.concatenate([start[None], displacement]), commands)
+            if loads is not None:
+                loads = jax.tree.map(lambda part: jnp.concatenate([part[:1], sample(part, commands)]), loads)
+            if steps is not None:
+                steps = jnp.sum(commands.sample_step + (commands.sample_fraction > 0) <= steps)
+        return self.engine.motion(material, start, displacement, steps, cube, loads)
+
+    def _path(self, motion: Motion, commands: Commands) -> Float[Array, "row 3"]:
+        """Where the last marker is before the first step and at the end of each [m]; between observations of a body at
+        rest on the way from one to the next."""
+        tip = motion.position[:, -1]
+        if not self.at_rest:
+            return tip
+        at = jnp.concatenate([jnp.zeros(1), commands.sample_step + commands.sample_fraction])
+        rows = jnp.arange(len(commands.step) + 1.0)
+        return jnp.stack([jnp.interp(rows, at, tip[:, axis]) for axis in range(3)], axis=1)
+
+    def _seen(self, series: Float[Array, "row ..."], commands: Commands) -> Float[Array, "time ..."]:
+        """The rows of a motion that are observed."""
+        return series[1:] if self.at_rest else sample(series, commands)
 
     def loads(
         self, values: Values, commands: Commands, path: Float[Array, "row 3"] | None = None
@@ -211,16 +245,16 @@ class RobotSimulator(ExtendedSimulator):
             path: of the last marker in the frame of the base [m], for laws that follow it; they do nothing without.
 
         Raises:
-            InputError: mechanisms that do, on another body than layers without a cube.
+            InputError: mechanisms that do, on another body than a rod without a cube.
         """
         pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
         found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
         if pushing:
             if not self.engine.carries_loads:
                 raise InputError(
-                    f"{pushing[0].name} acts on layers without a cube only",
+                    f"{pushing[0].name} acts on a rod without a cube only",
                     where="[[model.laws]]",
-                    remedy='set body = "layered" under [simulator], and leave the cube out',
+                    remedy='set body = "rod" under [simulator], and leave the cube out',
                 )
             initial, command = self.actuated(values, commands, self.time_step)
             levels = jnp.concatenate([initial[None], command])
@@ -239,6 +273,8 @@ class RobotSimulator(ExtendedSimulator):
                 integrator than implicit Euler.
         """
         values = self.complete(parameters)
+        if self.at_rest:
+            raise InputError("forces and energies are those of a motion", where="balance", remedy=DYNAMIC)
         if self.loads(values, commands) is not None:
             raise InputError(
                 "forces and energies are not available where laws act on the body",
@@ -251,32 +287,35 @@ class RobotSimulator(ExtendedSimulator):
     def embodied(
         self,
         values: Values,
-        body: LayeredBody,
-        stiffness_scale: Float[Array, " layers"],
+        body: Rod,
+        stiffness_scale: Float[Array, " elements"],
         point_mass: Float[Array, " stations"],
     ) -> Material:
-        """Material of a layered body, body mechanisms included.
+        """Material of a rod, body mechanisms included.
 
         Raises:
-            InputError: a mechanism that acts on layered bodies only, where the engine's is not one.
+            InputError: a mechanism that acts on rods only, where the body is not one; or on motion, where there is none.
         """
         material = Material(
             young_modulus=values["young_modulus"],
             poisson_ratio=values["poisson_ratio"],
             density=jnp.asarray(self.robot.density(values["trunk_mass"])),
-            rayleigh_mass=values["rayleigh_mass"],
-            rayleigh_stiffness=values["rayleigh_stiffness"],
+            rayleigh_mass=values.get("rayleigh_mass", jnp.zeros(())),
+            rayleigh_stiffness=values.get("rayleigh_stiffness", jnp.zeros(())),
             gravity=jnp.asarray(self.robot.gravity),
             stiffness_scale=stiffness_scale,
             point_mass=point_mass,
         )
         for mechanism in self.mechanisms:
+            if self.at_rest and QUASI_STATIC not in motions_of(mechanism):
+                words = f"the mechanism {mechanism.name!r} acts on a body in motion"
+                raise InputError(words, where="[model] mechanisms", remedy=f"remove it, or {DYNAMIC}")
             if isinstance(mechanism, BodyMechanism):
                 material = mechanism.embody(values, material, body)
-                if material.effects.present and not self.engine.layered:
+                if material.effects.present and not self.engine.is_rod:
                     raise InputError(
-                        f"the mechanism {mechanism.name!r} acts on layered bodies only", where="[model] mechanisms",
-                        remedy='remove it, or set body = "layered" under [simulator]',
+                        f"the mechanism {mechanism.name!r} acts on rods only", where="[model] mechanisms",
+                        remedy='remove it, or set body = "rod" under [simulator]',
                     )  # fmt: skip
         return material
 
@@ -292,19 +331,22 @@ class RobotSimulator(ExtendedSimulator):
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
-        true, at = sample(motion.position, commands), observed_at(commands, self.time_step)
+        true, at = self._seen(motion.position, commands), observed_at(commands, self.time_step)
         position = self.measured(values, true, at, self.meanwhile(values, commands))
         pose = None
         if motion.pose is not None:
             pose = sample(motion.pose, commands)
             pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
         angle = self.driven(values, commands, self.time_step)
-        return Observation(position, sample(motion.tension, commands), pose, status_of(motion, unsolved), angle)
+        tension = self._seen(motion.tension, commands)
+        return Observation(position, tension, pose, status_of(motion, unsolved), angle)
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of the robot, those of the mechanisms, then those of the cube."""
+        """Parameters of the robot, those of the mechanisms, then those of the cube; of a body at rest without
+        damping."""
         base = specs_of(self.robot.parameter_table())
+        base = tuple(spec for spec in base if not (self.at_rest and spec.name in DAMPING))
         extended = base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
         return extended + (specs_of(push_table(self.robot).parameters) if self.pushes else ())
 
@@ -350,7 +392,7 @@ class RobotSimulator(ExtendedSimulator):
     @property
     def integrator(self) -> str | None:
         """See `ExtendedSimulator.integrator`."""
-        return self.engine.integrator
+        return QUASI_STATIC if self.at_rest else self.engine.integrator
 
     @property
     def command_timing(self) -> tuple[float, float]:
@@ -370,7 +412,7 @@ class RobotSimulator(ExtendedSimulator):
         """See `ExtendedSimulator.begin_lanes`.
 
         Raises:
-            InputError: a body that is not made of layers.
+            InputError: a body that is no rod.
         """
         return body_lanes(self.engine, count)
 

@@ -1,8 +1,8 @@
-"""A cable-driven trunk: commands, through actuation, body and sensing, to marker positions and tensions."""
+"""A cable-driven rod: commands, through actuation, body and sensing, to marker positions and tensions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
-from rfdropo_bayes.fem.balance import Balance, layered_balance
+from rfdropo_bayes.fem import Material, PointMap, System, attach, cable_layout, prepare, profile_rod, refined
+from rfdropo_bayes.fem.balance import Balance, rod_balance
 from rfdropo_bayes.fem.stage_balance import stepped_balance
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
@@ -23,10 +23,9 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 @dataclass(frozen=True)
 class Discretisation:
-    """How finely the body and time are cut: nodes across a section, sub-layers per layer, and the time step [s]."""
+    """How finely the body and time are cut: time step [s], and elements per layer of the section profile."""
 
     time_step: float
-    nodes_across: int = 2
     refine: int = 1
 
 
@@ -39,36 +38,17 @@ class Assembly(NamedTuple):
 
 
 def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
-    """Cut the robot's body into layers and attach cables and markers to it."""
-    arrays = dict(robot.layered_arrays())
-    body = refined_body(arrays, discretisation.refine, discretisation.nodes_across)
+    """Cut the robot's body into elements and attach cables and markers to it."""
+    layers = profile_rod(**robot.rod_arrays())
+    body = refined(layers, discretisation.refine)
     system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
-    station_of = np.arange(len(np.asarray(arrays["station"]))) * discretisation.refine
+    station_of = np.arange(len(layers.station)) * discretisation.refine
     return Assembly(system, attach(body, robot.marker_points()), station_of)
-
-
-def refined_body(arrays: Mapping[str, np.ndarray | int | bool], refine: int, nodes_across: int) -> LayeredBody:
-    """The body with every layer cut into ``refine`` equal layers of the same section."""
-    station, half_width = np.asarray(arrays["station"]), np.asarray(arrays["half_width"])
-    at = np.arange((len(station) - 1) * refine + 1) / refine
-    rows = np.arange(len(station))
-    sections = {
-        name: np.repeat(np.asarray(value), refine, axis=0)
-        for name, value in arrays.items()
-        if name not in ("station", "half_width", "nodes_across", "sectional")
-    }
-    return profile_body(
-        station=np.interp(at, rows, station),
-        half_width=np.stack([np.interp(at, rows, half_width[:, i]) for i in range(2)], axis=1),
-        nodes_across=nodes_across,
-        sectional=bool(arrays["sectional"]),
-        **sections,
-    )
 
 
 @dataclass(frozen=True)
 class TrunkSimulator(RobotSimulator):
-    """A layered trunk with mechanisms, behind the `Simulator` protocol.
+    """A rod with mechanisms, behind the `Simulator` protocol.
 
     Attributes:
         discretisation: how finely the body and time are cut; for the others see `RobotSimulator`.
@@ -88,8 +68,7 @@ class TrunkSimulator(RobotSimulator):
     @property
     def discretised(self) -> dict[str, object]:
         """See `RobotSimulator`."""
-        layers = len(self.assembly.system.body.station) - 1
-        return {"nodes_across": self.discretisation.nodes_across, "layers": layers}
+        return {"body": "rod", "elements": self.assembly.system.body.elements}
 
     def session(self, lanes: int, period: float) -> Session:
         """So many trunks that are commanded one control period [s] at a time; see `Session`."""
@@ -104,7 +83,7 @@ class TrunkSimulator(RobotSimulator):
         system, engine = self.assembly.system, self.engine
         if engine.integrator == "euler":
             motion, prepared = self.motion_of_nodes(inputs, cube), prepare(system, inputs[0])
-            return layered_balance(system, prepared, motion.position, motion.tension, self.time_step)
+            return rod_balance(system, prepared, motion.position, motion.tension, self.time_step)
         material, start, displacement = inputs
         prepared, state, _ = engine.initial(material, start)
         around = () if cube is None else (engine.scene, cube.cube)
