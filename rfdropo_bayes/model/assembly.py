@@ -65,6 +65,10 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
 }
 
 
+REST_CLOCK = 0.05
+"""Step [s] of drives and cameras of a body at rest, which has no time step itself."""
+
+
 def robot_of(spec: ModelSpec) -> Robot:
     """The robot of a model, where only a robot will do.
 
@@ -102,7 +106,9 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
     table, robot = spec.simulator, with_drives(robot_of(spec), spec.drives, spec.groups)
     if table.drives == "direct":
         robot = robot.without_command_timing()
-    time_step, integrator = table.time_step or robot.time_step_s, table.integrator or robot.integrator
+    rests = table.motion == QUASI_STATIC
+    time_step = REST_CLOCK if rests else table.time_step or robot.time_step_s
+    integrator = table.integrator or robot.integrator
     trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
@@ -113,7 +119,6 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
     else:
         discretisation = Discretisation(time_step, table.refine)
         assembly = assemble(robot, discretisation)
-        rests = table.motion == QUASI_STATIC
         settled = rests or robot.initial_state == "equilibrium"
         engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator, at_rest=rests)
         trunk = TrunkSimulator(robot, engine, assembly, discretisation)

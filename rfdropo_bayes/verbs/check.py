@@ -37,6 +37,7 @@ from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
@@ -153,8 +154,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
 
 
 def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What the nominal model shows: errors of time step and mesh, and motions in another direction."""
-    say_step(f"simulating {runs[0].name} with a finer time step and a finer mesh")
+    """What the nominal model shows: errors of time step, elements and motion, and motions in another direction."""
+    say_step(f"simulating {runs[0].name} with a finer time step, more elements, and the other kind of motion")
     spec = spec_of(experiment, folder)
     found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
@@ -403,8 +404,11 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
     simulator = None if spec is None else _try(found, partial(build_simulator, spec))
     if spec is None or simulator is None or not fitted:
         return
-    step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
-    found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
+    if simulator.integrator == QUASI_STATIC:
+        found.lines.append(("motion", "quasi-static: every row is an equilibrium, without time step and damping"))
+    else:
+        step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
+        found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
     model = _try(found, lambda: build_model(spec, simulator, fitted))
     if model is not None:
         for index, parameter in enumerate(model.space.parameters):
