@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from rfdropo_bayes.fem import BendingLaw, Rod, Material, Viscoelasticity, Wall
+from rfdropo_bayes.fem import BendingLaw, Material, Rod, Viscoelasticity, Wall
 from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values

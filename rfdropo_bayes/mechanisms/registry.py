@@ -32,11 +32,11 @@ from rfdropo_bayes.mechanisms.actuation import (
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
     BaseTilt,
-    FibreLaw,
     BendTwistCoupling,
     CableCompliance,
     CapstanFriction,
     CoulombFriction,
+    FibreLaw,
     Payload,
     PlaneAnisotropy,
     QuadraticDrag,

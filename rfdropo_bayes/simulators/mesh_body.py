@@ -16,10 +16,10 @@ from jaxtyping import Array, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.rod import Rod, profile_rod
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.layered import PointMap, joined
+from rfdropo_bayes.fem.rod import Rod, profile_rod
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
     locate,
@@ -94,13 +94,16 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
             where="[simulator] body",
             remedy='use body = "rod", or a robot with initial_state = "rest"',
         )
+    if robot.command_unit in ("N", "Pa"):
+        words = f"robot {robot.name!r} is driven by forces, a body of tetrahedra by displacements of cables"
+        raise InputError(words, where="[simulator] body", remedy='use body = "rod"')
     _check_cables(robot, table)
     body = tetrahedral_body(mesh.position, mesh.element, mesh.position[:, 2] <= table.clamp_height, table.frames)
     guides = robot.guides()
     cables = route_cables(body, robot.anchors(), guides)
     limits = DriveLimits(np.full(len(guides), np.inf))
     if table.drives == "sofa":
-        limits = DriveLimits(robot.displacement_limits()[:, 1], table.drive_rate or np.inf)
+        limits = DriveLimits(robot.drive_limits()[:, 1], table.drive_rate or np.inf)
     share = np.asarray(lumped_masses(body, 1.0 / body.volume.sum()))
     if table.masses == "equal":
         share = np.full(body.nodes, 1.0 / body.nodes)

@@ -294,7 +294,7 @@ class RobotSimulator(ExtendedSimulator):
         """Material of a rod, body mechanisms included.
 
         Raises:
-            InputError: a mechanism that acts on rods only, where the body is not one; or on motion, where there is none.
+            InputError: a mechanism that acts on rods or on motion only, where the body is none or at rest.
         """
         material = Material(
             young_modulus=values["young_modulus"],
@@ -361,33 +361,41 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.command.unit
 
     def pretension(self, values: Values) -> Float[Array, " cable"]:
-        """Cable displacements at zero command [m]."""
-        return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
+        """What drives each cable and chamber at zero command [m, N or Pa]."""
+        names = self.robot.initial_displacement_names
+        if not names:
+            return jnp.zeros(len(self.robot.actuators))
+        return jnp.stack([values[name] for name in names])
+
+    def exerted(self, values: Values, level: Float[Array, "*row actuator"]) -> Float[Array, "*row cable"]:
+        """What the engine's cables are given, displacements [m] or tensions [N], at levels of the drives."""
+        return level + self.pretension(values)
 
     def wound(
         self, values: Values, commands: Commands, time_step: float
     ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
-        """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
+        """What the engine's cables are given before the first step and at the end of every step, by drives with end
+        stops."""
         initial, command = self.actuated(values, commands, time_step)
         start = self.unwound(values, initial)
         levels = jax.lax.scan(lambda drives, sent: self.wind(values, drives, sent), start, command)[1]
-        return start.level + self.pretension(values), levels
+        return self.exerted(values, start.level), levels
 
     def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
         """The drives before the first step, where this command [m or rad] has reached them."""
-        limits = self.robot.displacement_limits()
+        limits = self.robot.drive_limits()
         level = self.robot.channel_matrix(values) @ initial
         return Wound(jnp.clip(level, limits[:, 0], limits[:, 1]), jnp.asarray(initial, float))
 
     def wind(
         self, values: Values, drives: Wound, sent: Float[Array, " channel"]
     ) -> tuple[Wound, Float[Array, " cable"]]:
-        """The drives at the end of a step, and the cables' displacements [m], given the command that reached them."""
-        limits = jnp.asarray(self.robot.displacement_limits())
+        """The drives at the end of a step, and what the engine's cables are given, by the command that reached them."""
+        limits = jnp.asarray(self.robot.drive_limits())
         move = jnp.asarray(self.robot.channel_matrix(values)) @ (sent - drives.sent)
         # A drive at its limit ignores further pulls, and answers the first release at once.
         level = jnp.clip(drives.level + move, limits[:, 0], limits[:, 1])
-        return Wound(level, sent), level + self.pretension(values)
+        return Wound(level, sent), self.exerted(values, level)
 
     @property
     def integrator(self) -> str | None:
@@ -406,7 +414,7 @@ class RobotSimulator(ExtendedSimulator):
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
         """See `ExtendedSimulator.lane_start`."""
         material, cube = self.body_inputs(values)
-        return LaneStart(material, drives.level + self.pretension(values), cube)
+        return LaneStart(material, self.exerted(values, drives.level), cube)
 
     def begin_lanes(self, count: int) -> BodyLanes:
         """See `ExtendedSimulator.begin_lanes`.

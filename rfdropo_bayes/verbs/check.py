@@ -334,26 +334,31 @@ def _say_unasked(found: Check, trajectory: Trajectory, robot: Robot) -> None:
         )
 
 
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
+"""Factor and unit in which what drives a cable or a chamber is shown."""
+
+
 def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:
-    """Cables that are asked for more than they are allowed, or for more than a body has."""
+    """Cables and chambers that are asked for more than they are allowed, or for more than a body has."""
     low, high = asked.min(axis=0), asked.max(axis=0)
-    least, most = np.array(robot.displacement_limits()).T
+    least, most = np.array(robot.drive_limits()).T
     beyond = np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
     if not len(beyond):
         return
+    factor, unit = SHOWN[robot.actuators[0].unit]
     words = ", ".join(
-        f"{robot.cable_names[k]} {MILLIMETRES * low[k]:.3g} to {MILLIMETRES * high[k]:.3g} mm "
-        f"(limits {MILLIMETRES * least[k]:.3g} to {MILLIMETRES * most[k]:.3g})"
+        f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
+        f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
         for k in beyond
     )
     length = robot.body.station_m[-1] - robot.body.station_m[0]
-    if high.max() > length:
+    if unit == "mm" and high.max() > length:
         found.doubts.append(
             f"{name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: {words}: look at "
             "command_unit, at counts_per_turn, and at spool_radius and gain of the robot file"
         )
         return
-    found.notes.append(f"{name}: cables are held at their displacement_limit_m where commands ask for more: {words}")
+    found.notes.append(f"{name}: drives are held at the limits of the robot file where commands ask for more: {words}")
 
 
 def _travel(travel: Travel, robot: Robot) -> Iterator[str]:

@@ -41,7 +41,9 @@ def slow_motion(robot: Robot, recording: Trajectory) -> str | None:
         return f"rows are {interval:.3g} s apart, and the body comes to rest within a few periods of {period:.2g} s"
     rate = command_rate(recording)
     if rate is not None and rate * damping + (rate * period / (2.0 * np.pi)) ** 2 < LAGGING:
-        return f"commands take {1.0 / rate:.3g} s to change by their size, and the body's slowest period is {period:.2g} s"
+        return (
+            f"commands take {1.0 / rate:.3g} s to change by their size, and the body's slowest period is {period:.2g} s"
+        )
     return None
 
 

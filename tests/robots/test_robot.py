@@ -152,7 +152,7 @@ def test_trunk_sofa_is_the_scene_of_the_paper():
     assert nominal["rayleigh_mass"] == nominal["rayleigh_stiffness"] == 0.1
     assert robot.initial_state == "rest"
     assert robot.gravity.tolist() == [0.0, -9.81, 0.0]
-    assert robot.displacement_limits()[:, 1].tolist() == [0.07] * 4 + [0.04] * 4
+    assert robot.drive_limits()[:, 1].tolist() == [0.07] * 4 + [0.04] * 4
     assert [len(guides) for guides in robot.guides()] == [20] * 4 + [9] * 4
     assert robot.push.parameters["cube_side"].nominal == 0.035
     assert robot.push.parameters["cube_mass"].nominal == 0.05
