@@ -88,10 +88,10 @@ class Trajectory:
             given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
                 marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
                 away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
-                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in force
-                until the next; ``markers`` and ``channels``, their names. These five are required. ``command_time``:
-                from when each command is in force, on the clock of ``time``; ``initial_command``, in force before the
-                first; ``largest_command`` that is to be believed, of drives of many turns. ``tension`` (time, channel)
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in
+                force until the next; ``markers`` and ``channels``, their names. These five are required.
+                ``command_time``: from when each command is in force, on the clock of ``time``; ``initial_command``, in
+                force before the first; ``largest_command`` that is to be believed, of drives of many turns. ``tension`` (time, channel)
                 [N], ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7): centre and unit quaternion x, y,
                 z, w. ``name`` of the recording; ``robot`` that was recorded.
 
