@@ -13,12 +13,14 @@ from rfdropo_bayes.bayes.channels import (
     Markers,
     MotorAngle,
     ObjectPose,
+    Orientation,
     Series,
     Tension,
     WeighedParts,
 )
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
+from rfdropo_bayes.bayes.channels.orientation import FRAME_TURNS, ORIENTATION_NOISE
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
 from rfdropo_bayes.bayes.noise import (
     NOISE_CORRELATION_TIME,
@@ -62,7 +64,10 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
     "tension": (TENSION_NOISE, TENSION_GAIN),
     "motor_angle": (MOTOR_ANGLE_NOISE,),
     "object_pose": (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME),
+    "orientation": (ORIENTATION_NOISE, *FRAME_TURNS),
 }
+GAINS = (TENSION_GAIN, *FRAME_TURNS)
+"""Parameters of channels that are known unless they have a prior."""
 
 
 REST_CLOCK = 0.05
@@ -167,7 +172,7 @@ def measurement_specs(noise: str, channels: DataChannels) -> tuple[ParameterSpec
     further = [spec for key, chosen in asdict(channels).items() if chosen for spec in SWITCHED[key]]
     if noise == "white":
         further = [spec for spec in further if spec != OBJECT_CORRELATION_TIME]
-    return (*own, *(s for s in further if noise != REPEATS or s == TENSION_GAIN))
+    return (*own, *(s for s in further if noise != REPEATS or s in GAINS))
 
 
 def measured_parameters() -> set[str]:
@@ -320,7 +325,7 @@ def model_space(
     check_used(spec.per_recording, spec, simulator, where="[model.per_recording]")
     known, last = {each.name for each in specs}, [each.name for m in later for each in m.parameters]
     added = [each.name for mechanism in simulator.mechanisms if mechanism not in later for each in mechanism.parameters]
-    measured = [s.name for s in specs if s not in simulator.parameters and s != TENSION_GAIN]
+    measured = [s.name for s in specs if s not in simulator.parameters and s not in GAINS]
     every = model_specs(spec, simulator)
     given = {name: entry for name, entry in expand_groups(spec.priors, every).items() if name in known}
     both = sorted(set(fixed) & set(given))
@@ -358,6 +363,8 @@ def gather_channels(
         channels.append(Tension.gather(simulator, trajectories, length, fitted))
     if chosen.motor_angle:
         channels.append(MotorAngle.gather(trajectories, length, fitted))
+    if chosen.orientation:
+        channels.append(Orientation.gather(simulator, trajectories, length, fitted))
     if chosen.object_pose:
         channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=spec.noise != "white"))
     if spec.noise == REPEATS:

@@ -123,6 +123,11 @@ class ModelTable(ExperimentTable):
         default=False,
         description="the recordings' motor angles are data, with a noise motor_angle_noise that is inferred",
     )
+    orientation: bool = Field(
+        default=False,
+        description="the recordings' orientations of sections are data, with a noise orientation_noise that is inferred "
+        "and a turn of the frame, frame_turn_x, _y and _z, that is zero unless it has a prior",
+    )
     object_pose: bool = Field(
         default=False,
         description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and, "

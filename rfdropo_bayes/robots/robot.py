@@ -57,6 +57,13 @@ class Marker(RobotTable):
     point_m: Vector = Field(description="where it lies in the undeformed body: x, y, z")
 
 
+class OrientedSection(RobotTable):
+    """A section of the body whose orientation is measured."""
+
+    name: Name = Field(description="name, as in the recordings")
+    z_m: float = Field(description="axial coordinate in the undeformed body")
+
+
 OBJECT = ("cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "cube_yaw")
 """Parameters of a cube on a plate."""
 
@@ -104,6 +111,7 @@ class Robot(RobotTable):
     chambers: tuple[Chamber, ...] = Field(default=(), description="chambers under pressure")
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
     markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
+    orientations: tuple[OrientedSection, ...] = Field(default=(), description="sections whose orientation is measured")
     push: PushScene | None = Field(default=None, description="object on a plate, if the robot has one")
     motors: tuple[Motor, ...] = Field(
         default=(), description="drives of the channels, in their order; none where the robot is only recorded"
@@ -116,7 +124,8 @@ class Robot(RobotTable):
 
     @model_validator(mode="after")
     def _consistent(self) -> Robot:
-        for kind, names in (("cable", self.cable_names), ("marker", self.marker_names)):
+        named = {"cable": self.cable_names, "marker": self.marker_names, "section": self.section_names}
+        for kind, names in named.items():
             if len(set(names)) != len(names):
                 raise ValueError(f"two of its {kind}s share a name")
         if not self.actuators:
@@ -169,6 +178,7 @@ class Robot(RobotTable):
         points = {f"guide of {cable.name}": cable.guides() for cable in self.cables}
         for chamber in self.chambers:
             points[f"end of {chamber.name}"] = np.stack([chamber.line(station, end)[-1] for end in chamber.z_m])
+        points |= {f"section {each.name}": np.array([[0.0, 0.0, each.z_m]]) for each in self.orientations}
         points |= {f"marker {marker.name}": np.array([marker.point_m]) for marker in self.markers}
         for name, place in points.items():
             width = np.stack([np.interp(place[:, 2], station, half[:, axis]) for axis in (0, 1)], axis=1)
@@ -294,6 +304,11 @@ class Robot(RobotTable):
     def marker_names(self) -> tuple[str, ...]:
         """Names of the markers."""
         return tuple(marker.name for marker in self.markers)
+
+    @property
+    def section_names(self) -> tuple[str, ...]:
+        """Names of the sections whose orientation is measured."""
+        return tuple(each.name for each in self.orientations)
 
     def rod_arrays(self) -> dict[str, np.ndarray]:
         """The sections of the finite-element engine's rod: ``profile_rod(**robot.rod_arrays())``."""

@@ -61,6 +61,32 @@ def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "
     return arrays.select(cases, [int(code) for code in codes], int(Result.OK))
 
 
+def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time section 4"]:
+    """Unit quaternions (x, y, z, w) of sections, given three points of each: on its axis, and along its x and y."""
+    corner = points.reshape(len(points), -1, 3, 3)
+    along, beside = corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0]
+    x = along / jnp.linalg.norm(along, axis=-1, keepdims=True)
+    beside = beside - jnp.sum(beside * x, axis=-1, keepdims=True) * x
+    y = beside / jnp.linalg.norm(beside, axis=-1, keepdims=True)
+    z = jnp.cross(x, y)
+    # Four ways to write the quaternion, each good where its own component is large.
+    a, e, i = x[..., 0], y[..., 1], z[..., 2]
+    p, q, r = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
+    u, v, w = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]
+    ways = jnp.stack(
+        [
+            jnp.stack([1.0 + a - e - i, u, v, p], axis=-1),
+            jnp.stack([u, 1.0 - a + e - i, w, q], axis=-1),
+            jnp.stack([v, w, 1.0 - a - e + i, r], axis=-1),
+            jnp.stack([p, q, r, 1.0 + a + e + i], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = jnp.argmax(jnp.stack([a - e - i, e - a - i, i - a - e, a + e + i], axis=-1), axis=-1)
+    found = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
+    return found / jnp.linalg.norm(found, axis=-1, keepdims=True)
+
+
 class RobotSimulator(ExtendedSimulator):
     """Base of simulators that move a robot's body by cables, alone or with a cube on a plate before it.
 
@@ -96,6 +122,16 @@ class RobotSimulator(ExtendedSimulator):
             "content_sha256": self.content_sha256,
             **({"object": "cube"} if self.pushes else {}),
         }
+
+    @property
+    def shown(self) -> int:
+        """Points of the engine that are markers; those after them tell orientations of sections."""
+        return len(self.robot.markers)
+
+    @property
+    def section_names(self) -> tuple[str, ...]:
+        """Sections of the robot whose orientation is told."""
+        return self.robot.section_names
 
     @property
     def at_rest(self) -> bool:
@@ -222,7 +258,7 @@ class RobotSimulator(ExtendedSimulator):
     def _path(self, motion: Motion, commands: Commands) -> Float[Array, "row 3"]:
         """Where the last marker is before the first step and at the end of each [m]; between observations of a body at
         rest on the way from one to the next."""
-        tip = motion.position[:, -1]
+        tip = motion.position[:, self.shown - 1]
         if not self.at_rest:
             return tip
         at = jnp.concatenate([jnp.zeros(1), commands.sample_step + commands.sample_fraction])
@@ -331,7 +367,8 @@ class RobotSimulator(ExtendedSimulator):
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
-        true, at = self._seen(motion.position, commands), observed_at(commands, self.time_step)
+        points, at, shown = self._seen(motion.position, commands), observed_at(commands, self.time_step), self.shown
+        true = points[:, :shown]
         position = self.measured(values, true, at, self.meanwhile(values, commands))
         pose = None
         if motion.pose is not None:
@@ -339,7 +376,8 @@ class RobotSimulator(ExtendedSimulator):
             pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
         angle = self.driven(values, commands, self.time_step)
         tension = self._seen(motion.tension, commands)
-        return Observation(position, tension, pose, status_of(motion, unsolved), angle)
+        turn = None if points.shape[1] == shown else orientations(points[:, shown:])
+        return Observation(position, tension, pose, status_of(motion, unsolved), angle, orientation=turn)
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
@@ -422,7 +460,11 @@ class RobotSimulator(ExtendedSimulator):
         Raises:
             InputError: a body that is no rod.
         """
-        return body_lanes(self.engine, count)
+        body: Any = self.engine.body
+        markers = type(body.markers)(*(part[: self.shown] for part in body.markers))
+        shows_all = len(body.markers[0]) == self.shown
+        engine = self.engine if shows_all else replace(self.engine, body=body._replace(markers=markers))
+        return body_lanes(engine, count)
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
         """Markers of the undeformed robot [m]."""

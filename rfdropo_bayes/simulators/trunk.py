@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import Material, PointMap, System, attach, cable_layout, prepare, profile_rod, refined
 from rfdropo_bayes.fem.balance import Balance, rod_balance
@@ -43,7 +43,17 @@ def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
     body = refined(layers, discretisation.refine)
     system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
     station_of = np.arange(len(layers.station)) * discretisation.refine
-    return Assembly(system, attach(body, robot.marker_points()), station_of)
+    return Assembly(system, attach(body, np.concatenate([robot.marker_points(), section_points(robot)])), station_of)
+
+
+ARM = 0.01
+"""[m] Points that tell a section's orientation lie so far from the axis."""
+
+
+def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
+    """Three points of each section whose orientation is measured: on the axis, and along its x and y."""
+    corners = ARM * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    return np.concatenate([np.zeros((0, 3)), *([0.0, 0.0, each.z_m] + corners for each in robot.orientations)])
 
 
 @dataclass(frozen=True)

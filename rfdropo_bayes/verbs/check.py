@@ -235,6 +235,7 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
             ("cable tensions", trajectory.tension),
             ("motor angles", trajectory.motor_angle),
             ("poses of an object", trajectory.object_pose),
+            ("orientations", trajectory.orientation),
         )
         if values is not None
     ]
@@ -427,6 +428,7 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         "tension": any(t.tension is not None for t in fitted),
         "motor_angle": any(t.motor_angle is not None for t in fitted),
         "object_pose": any(t.object_pose is not None for t in fitted),
+        "orientation": any(t.orientation is not None for t in fitted),
     }
     for key, there in recorded.items():
         if there and not asdict(spec.channels)[key]:
