@@ -125,8 +125,8 @@ class ModelTable(ExperimentTable):
     )
     orientation: bool = Field(
         default=False,
-        description="the recordings' orientations of sections are data, with a noise orientation_noise that is inferred "
-        "and a turn of the frame, frame_turn_x, _y and _z, that is zero unless it has a prior",
+        description="the recordings' orientations of sections are data, with a noise orientation_noise that is "
+        "inferred and a turn of the frame, frame_turn_x, _y and _z, that is zero unless it has a prior",
     )
     object_pose: bool = Field(
         default=False,

@@ -53,7 +53,8 @@ ARM = 0.01
 def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
     """Three points of each section whose orientation is measured: on the axis, and along its x and y."""
     corners = ARM * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    return np.concatenate([np.zeros((0, 3)), *([0.0, 0.0, each.z_m] + corners for each in robot.orientations)])
+    middles = np.array([[0.0, 0.0, each.z_m] for each in robot.orientations]).reshape(-1, 1, 3)
+    return (middles + corners).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
