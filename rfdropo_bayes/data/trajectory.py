@@ -92,10 +92,10 @@ class Trajectory:
                 "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in
                 force until the next; ``markers`` and ``channels``, their names. These five are required.
                 ``command_time``: from when each command is in force, on the clock of ``time``; ``initial_command``, in
-                force before the first; ``largest_command`` that is to be believed, of drives of many turns. ``tension`` (time, channel)
-                [N], ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7): centre and unit quaternion x, y,
-                z, w. ``orientation`` (time, section, 4), unit quaternions x, y, z, w, and ``sections``, their names.
-                ``name`` of the recording; ``robot`` that was recorded.
+                force before the first; ``largest_command`` that is to be believed, of drives of many turns.
+                ``tension`` (time, channel) [N], ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7):
+                centre and unit quaternion x, y, z, w. ``orientation`` (time, section, 4), unit quaternions x, y, z, w,
+                and ``sections``, their names. ``name`` of the recording; ``robot`` that was recorded.
 
         Raises:
             InputError: an unknown or missing keyword, an unknown unit, what is not a number, shapes that do not fit,

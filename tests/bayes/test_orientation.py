@@ -22,7 +22,7 @@ def test_three_points_of_a_section_tell_its_turn_whatever_it_is():
     """Turns by half a turn about each axis among them, where three of the four formulas fail."""
     turns = Rotation.concatenate([TURNS, Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity()])
     corners = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0]])
-    points = np.einsum("tij,kj->tki", turns.as_matrix(), corners) + [0.1, 0.2, 0.3]
+    points = np.einsum("tij,kj->tki", turns.as_matrix(), corners) + np.array([0.1, 0.2, 0.3])
     found = Rotation.from_quat(np.asarray(orientations(jnp.asarray(points)))[:, 0])
     np.testing.assert_allclose((found * turns.inv()).magnitude(), 0.0, atol=1e-7)
 
