@@ -151,8 +151,8 @@ class CsvColumns(BaseModel):
     )
     orientations: list[list[str]] | None = Field(
         default=None,
-        description="columns of the orientation of each of sections: a unit quaternion x, y, z, w, or a rotation vector "
-        "x, y, z in rotation_unit, from the section in the undeformed body, along the file's axes; empty rows are left "
+        description="columns of the orientation of each of sections: a unit quaternion x, y, z, w, or a rotation "
+        "vector x, y, z in rotation_unit, from the undeformed body, along the file's axes; empty rows are left "
         "out",
     )
     sections: list[str] | None = Field(
