@@ -1,110 +1,100 @@
-"""Symmetric positive definite block-tridiagonal systems: factor once, solve for many right-hand sides.
-
-Block elimination along the axis. The pivot blocks are inverted explicitly, by sweeps over their 3 x 3 diagonal blocks:
-plain array operations over a batch, where a LAPACK call for each small block would cost more than its arithmetic.
-"""
+"""Symmetric positive definite block-tridiagonal systems with blocks of 6 x 6: Cholesky's factor along a chain of
+stations, written out by components, with a batch in the last axis (``lanes``)."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.hexahedron import cofactor
-
-
-class BlockTridiagonal(NamedTuple):
-    """Symmetric matrix with blocks on the diagonal and below it; ``lower[i]`` couples row i + 1 to column i."""
-
-    diagonal: Float[Array, "stations b b"]
-    lower: Float[Array, "stations_1 b b"]
+SIZE = 6
 
 
-def at_stations(lower: Float[Array, "layers *b"], upper: Float[Array, "layers *b"]) -> Float[Array, "stations *b"]:
-    """Sums at all stations of what every layer has at its lower and at its upper one."""
-    none = jnp.zeros_like(lower[:1])
-    return jnp.concatenate([lower, none]) + jnp.concatenate([none, upper])
+class Factor(NamedTuple):
+    """A = C C', with C lower block-bidiagonal."""
+
+    pivot: Float[Array, "stations 6 6"]  # lower triangle of C's diagonal blocks, its diagonal inverted
+    coupling: Float[Array, "stations 6 6"]  # transposed blocks below the diagonal, to the station before; zero at first
 
 
-class BlockFactor(NamedTuple):
-    """Inverse pivots D^-1 and multipliers L of A = (1 + L) D (1 + L)'; ``multiplier[0]`` is zero."""
-
-    inverse: Float[Array, "stations b b"]
-    multiplier: Float[Array, "stations b b"]
-
-
-def multiply(matrix: BlockTridiagonal, vector: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
-    """Matrix times k vectors."""
-    result = matrix.diagonal @ vector
-    result = result.at[1:].add(matrix.lower @ vector[:-1])
-    return result.at[:-1].add(jnp.swapaxes(matrix.lower, -1, -2) @ vector[1:])
+def _triangle(block: Any) -> Array:
+    """Cholesky's factor of a block, the diagonal inverted."""
+    none = jnp.zeros_like(block[0, 0])
+    rows: list[list[Any]] = [[none] * SIZE for _ in range(SIZE)]
+    for k in range(SIZE):
+        rows[k][k] = lax.rsqrt(block[k, k] - sum(rows[k][z] * rows[k][z] for z in range(k)))
+        for r in range(k + 1, SIZE):
+            rows[r][k] = (block[r, k] - sum(rows[r][z] * rows[k][z] for z in range(k))) * rows[k][k]
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def invert(block: Float[Array, "b b"]) -> Float[Array, "b b"]:
-    """Inverse of a symmetric positive definite block of a size divisible by three (Gauss-Jordan by 3 x 3 pivots)."""
-    size = block.shape[-1]
-
-    def sweep(index: Int[Array, ""], block: Float[Array, "b b"]) -> Float[Array, "b b"]:
-        first = 3 * index
-        pivot = lax.dynamic_slice(block, (first, first), (3, 3))
-        adjugate = cofactor(pivot).T
-        inverse = adjugate / jnp.dot(pivot[0], adjugate[:, 0])
-        row = inverse @ lax.dynamic_slice(block, (first, 0), (3, size))
-        row = lax.dynamic_update_slice(row, inverse, (0, first))
-        column = lax.dynamic_slice(block, (0, first), (size, 3))
-        column = lax.dynamic_update_slice(column, jnp.zeros((3, 3)), (first, 0))
-        rest = lax.dynamic_update_slice(block, jnp.zeros((size, 3)), (0, first))
-        return lax.dynamic_update_slice(rest - column @ row, row, (first, 0))
-
-    return lax.fori_loop(0, size // 3, sweep, block)
+def _down(triangle: Any, right: Any) -> Array:
+    """Solve with a triangle; right-hand sides (6, ...)."""
+    rows: list[Any] = []
+    for r in range(SIZE):
+        rows.append((right[r] - sum(triangle[r, z] * rows[z] for z in range(r))) * triangle[r, r])
+    return jnp.stack(rows)
 
 
-def factor(matrix: BlockTridiagonal) -> BlockFactor:
-    """Eliminate from the first station to the last."""
-
-    def eliminate(previous_inverse: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        diagonal, lower = blocks
-        multiplier = lower @ previous_inverse
-        inverse = invert(diagonal - multiplier @ lower.T)
-        return inverse, (inverse, multiplier)
-
-    lower = jnp.concatenate([jnp.zeros_like(matrix.diagonal[:1]), matrix.lower])
-    _, (inverse, multiplier) = lax.scan(eliminate, jnp.zeros_like(lower[0]), (matrix.diagonal, lower))
-    return BlockFactor(inverse, multiplier)
+def _up(triangle: Any, right: Any) -> Array:
+    """Solve with a transposed triangle."""
+    rows: list[Any] = [None] * SIZE
+    for r in reversed(range(SIZE)):
+        rows[r] = (right[r] - sum(triangle[z, r] * rows[z] for z in range(r + 1, SIZE))) * triangle[r, r]
+    return jnp.stack(rows)
 
 
-def substitute(factored: BlockFactor, right: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
-    """Solve with a factor for k right-hand sides."""
-
-    def forward(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, Array]:
-        multiplier, values = blocks
-        values = values - multiplier @ previous
-        return values, values
-
-    def backward(following: Array, blocks: tuple[Array, Array]) -> tuple[Array, Array]:
-        multiplier, values = blocks
-        values = values - following
-        return multiplier.T @ values, values
-
-    start = jnp.zeros_like(right[0])
-    _, reduced = lax.scan(forward, start, (factored.multiplier, right))
-    _, solution = lax.scan(backward, start, (factored.multiplier, factored.inverse @ reduced), reverse=True)
-    return solution
+def _across(coupling: Any, values: Any) -> Any:
+    """Transpose of a coupling times values (6, ...)."""
+    return sum(coupling[z][:, None] * values[z][None] for z in range(SIZE))
 
 
-def solve(matrix: BlockTridiagonal, right: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
-    """Solution X of A X = B for k right-hand sides.
+def eliminate(
+    diagonal: Float[Array, "6 6 stations lanes"],
+    lower: Float[Array, "6 6 elements lanes"],
+    right: Float[Array, "6 columns stations lanes"],
+) -> tuple[Factor, Float[Array, "stations 6 columns lanes"]]:
+    """Factor, and C^-1 times right-hand sides."""
+    coupled = jnp.concatenate([jnp.zeros_like(lower[:, :, :1]), lower], axis=2)
 
-    Derivatives go through the solution and not through the elimination: a tangent or a cotangent costs one substitution
-    with the factor that is there already.
-    """
-    factored = factor(jax.tree.map(lax.stop_gradient, matrix))
-    return lax.custom_linear_solve(
-        lambda vector: multiply(matrix, vector),
-        right,
-        solve=lambda _, values: substitute(factored, values),
-        symmetric=True,
-    )
+    def one(before: tuple[Array, Array], here: tuple[Array, Array, Array]) -> tuple[Any, Any]:
+        triangle, solved = before
+        block, below, values = here
+        coupling = _down(triangle, jnp.swapaxes(below, 0, 1))
+        block = block - sum(coupling[z][:, None] * coupling[z][None] for z in range(SIZE))
+        triangle = _triangle(block)
+        solved = _down(triangle, values - _across(coupling, solved))
+        return (triangle, solved), (triangle, coupling, solved)
+
+    first = jnp.ones_like(diagonal[:, :, 0]) * jnp.eye(SIZE)[:, :, None], jnp.zeros_like(right[:, :, 0])
+    along = tuple(jnp.moveaxis(part, 2, 0) for part in (diagonal, coupled, right))
+    _, (pivot, coupling, solved) = lax.scan(one, first, along)
+    return Factor(pivot, coupling), solved
+
+
+def descend(factor: Factor, right: Float[Array, "stations 6 columns lanes"]) -> Float[Array, "stations 6 columns lanes"]:
+    """C^-1 times right-hand sides."""
+
+    def one(solved: Array, here: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        triangle, coupling, values = here
+        solved = _down(triangle, values - _across(coupling, solved))
+        return solved, solved
+
+    start = jnp.zeros_like(right[0] * factor.pivot[0, 0, 0])
+    return lax.scan(one, start, (factor.pivot, factor.coupling, right))[1]
+
+
+def ascend(factor: Factor, right: Float[Array, "stations 6 columns lanes"]) -> Float[Array, "stations 6 columns lanes"]:
+    """C'^-1 times right-hand sides."""
+
+    def one(after: tuple[Array, Array], here: tuple[Array, Array, Array]) -> tuple[Any, Array]:
+        solved, coupling = after
+        triangle, own, values = here
+        back = sum(coupling[:, k][:, None] * solved[k][None] for k in range(SIZE))
+        solved = _up(triangle, values - back)
+        return (solved, own), solved
+
+    start = jnp.zeros_like(right[0] * factor.pivot[0, 0, 0]), jnp.zeros_like(factor.coupling[0])
+    return lax.scan(one, start, (factor.pivot, factor.coupling, right), reverse=True)[1]

@@ -1,0 +1,122 @@
+"""Geometrically exact rod elements between two stations: strains, their rates, forces and tangent.
+
+Strains are those of Simo and Reissner in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with
+q_v the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
+Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
+forces turn: under guided cables those of the rod and of the cables cancel nearly.
+
+Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
+moment, or velocity and spin, in space.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.components import (
+    Matrix,
+    Quaternion,
+    Vector,
+    cross,
+    diagonal,
+    dot,
+    normalised,
+    product,
+    rotation,
+    skew,
+    times,
+    transposed,
+    transposed_times,
+)
+
+Six = Float[Array, "6 *n"]
+
+
+class Elements(NamedTuple):
+    """Shape of all elements."""
+
+    length: Float[Array, "*n"]  # at rest [m]
+    frame: Matrix  # half-way between both sections
+    way: Vector  # from station to station [m]
+    bend: Vector  # vector part of the quaternion from section to section, in space
+    share: Float[Array, "*n"]  # 1 / (1 + scalar part)
+    strain: Six  # shear (2), stretch; curvature (2), twist [1/m]
+
+
+class Blocks(NamedTuple):
+    """Symmetric block-tridiagonal matrix over stations; ``lower`` couples row i + 1 to column i."""
+
+    diagonal: Float[Array, "6 6 stations *lanes"]
+    lower: Float[Array, "6 6 elements *lanes"]
+
+
+def shape(length: Float[Array, "*n"], position: Vector, orientation: Quaternion) -> Elements:
+    """Shape of the elements between neighbouring stations."""
+    first, second = orientation[:, :-1], orientation[:, 1:]
+    scalar = dot(first, second)
+    sign = jnp.where(scalar < 0.0, -1.0, 1.0)
+    scalar, second = sign * scalar, sign * second
+    # Vector parts of second o conj(first) in space, and of conj(first) o second in the frames.
+    across = cross(first[1:], second[1:])
+    straight = first[0] * second[1:] - second[0] * first[1:]
+    frame = rotation(normalised(first + second))
+    way = position[:, 1:] - position[:, :-1]
+    stretch = transposed_times(frame, way) / length
+    stretch = stretch - jnp.array([0.0, 0.0, 1.0]).reshape(3, *[1] * (stretch.ndim - 1))
+    strain = jnp.concatenate([stretch, 2.0 * (straight - across) / length])
+    return Elements(length, frame, way, straight + across, 1.0 / (1.0 + scalar), strain)
+
+
+def _less_turn(elements: Elements, vector: Vector) -> Vector:
+    """W times a vector: W (da_b - da_a) is h times the change of curvature, in space."""
+    return vector - elements.bend * (elements.share * dot(elements.bend, vector))
+
+
+def strain_rates(elements: Elements, twist: Six) -> Six:
+    """Rates of the strains from the velocities and spins of all stations."""
+    relative = twist[:, 1:] - twist[:, :-1]
+    spin = twist[3:]
+    lean = elements.share * elements.bend
+    middle = 0.5 * (spin[:, 1:] + spin[:, :-1]) - 0.5 * cross(lean, relative[3:])
+    stretching = transposed_times(elements.frame, relative[:3] + cross(elements.way, middle))
+    bending = transposed_times(elements.frame, _less_turn(elements, relative[3:]))
+    return jnp.concatenate([stretching, bending]) / elements.length
+
+
+def station_forces(elements: Elements, resultant: Six) -> Six:
+    """Forces and moments on all stations of the sections' forces and moments, those in the elements' frames."""
+    force = times(elements.frame, resultant[:3])
+    moment = _less_turn(elements, times(elements.frame, resultant[3:]))
+    lever = cross(elements.way, force)
+    half, lean = 0.5 * lever, 0.5 * cross(elements.share * elements.bend, lever)
+    first = jnp.concatenate([force, moment + half - lean])
+    second = jnp.concatenate([-force, half + lean - moment])
+    none = jnp.zeros_like(first[:, :1])
+    return jnp.concatenate([first, none], axis=1) + jnp.concatenate([none, second], axis=1)
+
+
+def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> Blocks:
+    """Stiffness over all stations, from the stiffness of the sections: a diagonal, and a diagonal or a matrix."""
+    frame, way = elements.frame, elements.way
+    stiff = product(frame * (stretch / elements.length)[None], transposed(frame))
+    turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
+    bent = product(turned / elements.length, transposed(frame))
+    for _ in range(2):  # W from the left, then, as the matrix is symmetric, from the right
+        row = transposed_times(bent, elements.bend)
+        bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
+    lean = elements.share * elements.bend
+    turn, fold = 0.5 * skew(way), 0.5 * (lean[:, None] * way[None] - diagonal(jnp.stack([dot(lean, way)] * 3)))
+    lever_a, lever_b = turn + fold, turn - fold
+    stiff_a, stiff_b = product(stiff, lever_a), product(stiff, lever_b)
+
+    def block(one: Matrix, two: Matrix, three: Matrix, four: Matrix) -> Array:
+        return jnp.concatenate([jnp.concatenate([one, two], axis=1), jnp.concatenate([three, four], axis=1)])
+
+    first = block(stiff, -stiff_a, -transposed(stiff_a), product(transposed(lever_a), stiff_a) + bent)
+    second = block(stiff, stiff_b, transposed(stiff_b), product(transposed(lever_b), stiff_b) + bent)
+    lower = block(-stiff, stiff_a, -transposed(stiff_b), product(transposed(lever_b), stiff_a) - bent)
+    none = jnp.zeros_like(first[:, :, :1])
+    return Blocks(jnp.concatenate([first, none], axis=2) + jnp.concatenate([none, second], axis=2), lower)
