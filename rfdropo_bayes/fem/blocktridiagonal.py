@@ -74,7 +74,9 @@ def eliminate(
     return Factor(pivot, coupling), solved
 
 
-def descend(factor: Factor, right: Float[Array, "stations 6 columns lanes"]) -> Float[Array, "stations 6 columns lanes"]:
+def descend(
+    factor: Factor, right: Float[Array, "stations 6 columns lanes"]
+) -> Float[Array, "stations 6 columns lanes"]:
     """C^-1 times right-hand sides."""
 
     def one(solved: Array, here: tuple[Array, Array, Array]) -> tuple[Array, Array]:

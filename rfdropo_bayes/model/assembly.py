@@ -113,7 +113,7 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
         robot = robot.without_command_timing()
     rests = table.motion == QUASI_STATIC
     time_step = REST_CLOCK if rests else table.time_step or robot.time_step_s
-    integrator = table.integrator or robot.integrator
+    integrator = QUASI_STATIC if rests else table.integrator or robot.integrator
     trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
@@ -125,7 +125,7 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
         discretisation = Discretisation(time_step, table.refine)
         assembly = assemble(robot, discretisation)
         settled = rests or robot.initial_state == "equilibrium"
-        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator, at_rest=rests)
+        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator)
         trunk = TrunkSimulator(robot, engine, assembly, discretisation)
     return _with_mechanisms(trunk.pushing() if table.push else trunk, spec)
 

@@ -31,7 +31,7 @@ from rfdropo_bayes.fem import (
 )
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, System
-from rfdropo_bayes.fem.integrators import Integrator
+from rfdropo_bayes.fem.integrators import STAGES, Integrator
 from rfdropo_bayes.fem.native.rod_engine import NativeRod
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushGeometry
@@ -83,10 +83,10 @@ class EngineBody(Protocol):
         """Body and cables."""
 
     @property
-    def markers(self) -> PointMap:
+    def markers(self) -> PointMap | NodePoints:
         """Recorded points."""
 
-    def _replace(self, *, markers: PointMap = ...) -> Any:
+    def _replace(self, *, markers: PointMap | NodePoints = ...) -> Any:
         """The same with other points."""
 
 
@@ -134,8 +134,8 @@ class Engine:
         backend: what computes.
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of a rod.
         scene: what the body pushes a cube on; None for a body that touches nothing.
-        integrator: how a time step is taken, see `fem.integrators`.
-        at_rest: every row of a motion is an equilibrium, found from the one before; of a rod.
+        integrator: how a time step is taken, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
+            row, an equilibrium found from the one before.
     """
 
     body: EngineBody
@@ -144,7 +144,6 @@ class Engine:
     from_equilibrium: bool = False
     scene: PushGeometry | None = None
     integrator: Integrator = "euler"
-    at_rest: bool = False
 
     def __post_init__(self) -> None:
         system = self.body.system
@@ -161,6 +160,11 @@ class Engine:
                 where="[simulator] integrator",
                 remedy='use integrator = "euler", or drives = "robot" in [simulator.tetrahedra]',
             )
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether every row of a motion is an equilibrium."""
+        return self.integrator == QUASI_STATIC
 
     @property
     def is_rod(self) -> bool:
@@ -193,12 +197,11 @@ class Engine:
     def describe(self) -> dict[str, object]:
         """Name, precision, device and, where it is not implicit Euler, integrator, for the record."""
         steps = {} if self.integrator == "euler" else {"integrator": self.integrator}
-        steps = {"motion": QUASI_STATIC} if self.at_rest else steps
         if self.backend.name == "jax":
             return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform, **steps}
         return {"engine": "numba", "precision": self.backend.precision, "device": "cpu", **steps}
 
-    def recording(self, points: PointMap) -> Engine:
+    def recording(self, points: PointMap | NodePoints) -> Engine:
         """The same engine in double precision, recording these points of the body in place of the markers."""
         body, backend = self.body._replace(markers=points), self.backend._replace(precision="float64")
         return replace(self, body=body, backend=backend)
@@ -245,13 +248,13 @@ class Engine:
         system: Any = self.body.system
         prepared, state, residual = prepare(system, material), state_at_rest(system), jnp.zeros(())
         if self.from_equilibrium:
-            under, force = prepared, jnp.zeros((len(state.position), 3))
+            under, force = prepared, jnp.zeros((len(state.position), 6))
             acting = self.section_loads(loads)
             if acting is not None:
                 under, force = loaded(system, prepared, acting, 0)
             state, found = find_equilibrium(system, under, start, force)
             residual = found.residual
-        if self.integrator != "euler":
+        if len(STAGES[self.integrator]) > 1:
             state = state._replace(commanded=jnp.asarray(start))
         return prepared, state, residual
 
@@ -264,7 +267,7 @@ class Engine:
         state = state._replace(cube=None if cube is None else cube.start)
         options = {"horizon": steps, "integrator": self.integrator, "loads": acting, **around}
         rollout = simulate(system, prepared, state, rows, self.time_step, markers, **options)
-        first = point_positions(markers, state.position)
+        first = point_positions(markers, state.position, state.orientation)
         pose = None
         if cube is not None:
             begin = jnp.concatenate([cube.start.position, cube.start.orientation])
@@ -301,7 +304,7 @@ class Engine:
 
         flag = jax.ShapeDtypeStruct((), jnp.bool_)
         pose = None if self.scene is None else numbers(rows, 7)
-        markers = len(self.body.markers.node)
+        markers = len(self.body.markers.weight)
         shapes = Motion(numbers(rows, markers, 3), numbers(rows, cables), flag, numbers(), flag, pose)
         return one_callback(self._rolled, shapes, inputs, limit)
 

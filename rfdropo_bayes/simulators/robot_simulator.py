@@ -438,7 +438,7 @@ class RobotSimulator(ExtendedSimulator):
     @property
     def integrator(self) -> str | None:
         """See `ExtendedSimulator.integrator`."""
-        return QUASI_STATIC if self.at_rest else self.engine.integrator
+        return self.engine.integrator
 
     @property
     def command_timing(self) -> tuple[float, float]:
