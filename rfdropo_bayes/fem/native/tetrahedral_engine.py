@@ -22,13 +22,13 @@ from rfdropo_bayes.fem.native.contact_records import (
     ContactRecords,
     PushOutput,
     cube_rows,
+    mesh_scene,
     pairs_of,
-    scene_tables,
     touch_storage,
 )
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
-from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
-from rfdropo_bayes.fem.native.layered_engine import in_blocks
+from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
 from rfdropo_bayes.fem.pushing import PushGeometry
@@ -74,7 +74,7 @@ class TetrahedralEngine:
         self._cables = _cables(cables, limits, body, self._number, self.dtype)
         self._nodes = np.ascontiguousarray(self._number[points.node], dtype=np.int32)
         self._weights = np.ascontiguousarray(points.weight, dtype=self.dtype)
-        self._scene = None if scene is None else scene_tables(scene, np.ones((1, 1)), self._number, self.dtype.type)
+        self._scene = None if scene is None else mesh_scene(scene, self._number, self.dtype.type)
 
     def rollouts(
         self,
@@ -89,7 +89,7 @@ class TetrahedralEngine:
 
         ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
         (nodes) [kg], ``rayleigh_mass`` [1/s], ``rayleigh_stiffness`` [s], ``gravity`` (3) [m/s2], and optionally
-        ``stiffness_scale`` (elements). ``cube`` as in ``NativeLayered.rollout``.
+        ``stiffness_scale`` (elements). ``cube`` as in ``NativeRod.rollout``.
 
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
@@ -147,7 +147,7 @@ class TetrahedralEngine:
             spheres = self._scene.spheres
         pairs = pairs_of(spheres) if spheres else 0
         return (
-            touch_storage(spheres, self.lanes, kind) if spheres else None,
+            touch_storage(self._scene, self.lanes, kind) if self._scene is not None else None,
             row_storage(3 * free, 2 * spheres, self._pattern.border, self.lanes, kind),
             problem_storage(cables, pairs, self.lanes, kind),
             np.zeros(free, dtype=np.int64),
