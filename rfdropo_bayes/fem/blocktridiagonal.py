@@ -55,23 +55,30 @@ def eliminate(
     diagonal: Float[Array, "6 6 stations lanes"],
     lower: Float[Array, "6 6 elements lanes"],
     right: Float[Array, "6 columns stations lanes"],
-) -> tuple[Factor, Float[Array, "stations 6 columns lanes"]]:
-    """Factor, and C^-1 times right-hand sides."""
+) -> tuple[Factor, Float[Array, "stations 6 columns lanes"], Float[Array, "columns columns lanes"]]:
+    """Factor, Y = C^-1 times right-hand sides, and Y' Y."""
     coupled = jnp.concatenate([jnp.zeros_like(lower[:, :, :1]), lower], axis=2)
 
-    def one(before: tuple[Array, Array], here: tuple[Array, Array, Array]) -> tuple[Any, Any]:
-        triangle, solved = before
+    def one(before: tuple[Array, Array, Array], here: tuple[Array, Array, Array]) -> tuple[Any, Any]:
+        triangle, solved, total = before
         block, below, values = here
         coupling = _down(triangle, jnp.swapaxes(below, 0, 1))
         block = block - sum(coupling[z][:, None] * coupling[z][None] for z in range(SIZE))
         triangle = _triangle(block)
         solved = _down(triangle, values - _across(coupling, solved))
-        return (triangle, solved), (triangle, coupling, solved)
+        total = total + sum(solved[z][:, None] * solved[z][None] for z in range(SIZE))
+        return (triangle, solved, total), (triangle, coupling, solved)
 
-    first = jnp.ones_like(diagonal[:, :, 0]) * jnp.eye(SIZE)[:, :, None], jnp.zeros_like(right[:, :, 0])
-    along = tuple(jnp.moveaxis(part, 2, 0) for part in (diagonal, coupled, right))
-    _, (pivot, coupling, solved) = lax.scan(one, first, along)
-    return Factor(pivot, coupling), solved
+    lanes, columns = right.shape[-1], right.shape[1]
+    first = (
+        jnp.broadcast_to(jnp.eye(SIZE)[:, :, None], (SIZE, SIZE, lanes)),
+        jnp.zeros((SIZE, columns, lanes)),
+        jnp.zeros((columns, columns, lanes)),
+    )
+    along = [jnp.broadcast_to(jnp.moveaxis(part, 2, 0), (part.shape[2], *part.shape[:2], lanes)) for part in
+             (diagonal, coupled, right)]
+    (_, _, total), (pivot, coupling, solved) = lax.scan(one, first, along)
+    return Factor(pivot, coupling), solved, total
 
 
 def descend(

@@ -15,22 +15,17 @@ from jaxtyping import Array, Float
 from rfdropo_bayes.fem.constraints import HALVINGS, ITERATIONS, TOLERANCE
 
 
-def _masked_solve(matrix: Any, right: Any) -> Array:
-    """Solution with a positive definite matrix (n, n, lanes), by Cholesky's factor column by column."""
-    size = len(right)
-    columns, solved = [], []
-    for k in range(size):
-        inverse = lax.rsqrt(matrix[0, 0])
-        column = matrix[1:, 0] * inverse
-        value = right[0] * inverse
-        columns.append((inverse, column))
-        solved.append(value)
-        matrix, right = matrix[1:, 1:] - column[:, None] * column[None], right[1:] - column * value
-    result: list[Any] = []
-    for (inverse, column), value in zip(reversed(columns), reversed(solved), strict=True):
-        below = sum((c * r for c, r in zip(column, result, strict=True)), 0.0 * value)
-        result.insert(0, (value - below) * inverse)
-    return jnp.stack(result)
+def _solve(matrix: Float[Array, "n n lanes"], right: Float[Array, "n lanes"]) -> Float[Array, "n lanes"]:
+    """Solution with a positive definite matrix, by elimination above and below each pivot."""
+    whole = jnp.concatenate([matrix, right[:, None]], axis=1)
+
+    def sweep(index: Array, whole: Array) -> Array:
+        row, column = whole[index], whole[:, index]
+        row = row / row[index]
+        swept = whole - column[:, None] * row[None]
+        return lax.dynamic_update_index_in_dim(swept, row, index, 0)
+
+    return lax.fori_loop(0, len(right), sweep, whole)[:, -1]
 
 
 def settle_cables(
@@ -63,7 +58,7 @@ def settle_cables(
         active = usable & (velocity < 0.0)
         both = active[:, None] & active[None]
         matrix = jnp.where(both, compliance, 0.0) + eye * jnp.where(active, soft, 1.0)[None]
-        change = _masked_solve(matrix, jnp.where(active, -free, 0.0)) - impulse
+        change = _solve(matrix, jnp.where(active, -free, 0.0)) - impulse
         moving = product(change)
 
         def slope(share: Any) -> Array:

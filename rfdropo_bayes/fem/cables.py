@@ -117,8 +117,9 @@ def threads(layout: CableLayout) -> Threads:
 def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matrix) -> Courses:
     """Where the cables run, from the places and frames of the stations."""
     station = layout.station[:, :, : _sides(layout)]
-    lever = times(frame[:, :, station], thread.arm)
-    place = jnp.sum(thread.weight * position[:, station] + lever, axis=3)
+    lever = times(_taken(frame, station, 2), thread.arm)
+    bound = thread.weight * _taken(position, station, 1) + lever
+    place = sum((bound[:, :, :, side] for side in range(1, bound.shape[3])), bound[:, :, :, 0])
     anchor = jnp.broadcast_to(thread.anchor[:, :, None], (*place.shape[:2], 1, *place.shape[3:]))
     points = jnp.concatenate([anchor, place], axis=2)
     used = layout.used.reshape(*layout.used.shape, *[1] * (place.ndim - 3))
@@ -126,6 +127,11 @@ def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matri
     segment = jnp.where(used, points[:, :, 1:] - points[:, :, :-1], unit)
     length = jnp.sqrt(dot(segment, segment))
     return Courses(jnp.where(used, length, 0.0), jnp.where(used, segment / length, 0.0), lever)
+
+
+def _taken(values: Array, index: np.ndarray, axis: int) -> Array:
+    """Parts of an array at indices that are there."""
+    return values.at[(slice(None),) * axis + (index,)].get(mode="promise_in_bounds")
 
 
 def _entries(layout: CableLayout, stations: int) -> Int[np.ndarray, "most cables stations"]:
@@ -155,12 +161,19 @@ def station_rows(
     entries = entries.reshape(6, -1, *entries.shape[4:])
     entries = jnp.concatenate([entries, jnp.zeros_like(entries[:, :1])], axis=1)
     index = _entries(layout, stations)
-    return sum((entries[:, part] for part in index[1:]), entries[:, index[0]])
+    return sum((_taken(entries, part, 1) for part in index[1:]), _taken(entries, index[0], 1))
 
 
 def lengths(course: Courses) -> Float[Array, "cables *lanes"]:
     """Lengths of the cables [m]."""
-    return jnp.sum(course.length, axis=1)
+    parts = course.length
+    return sum((parts[:, k] for k in range(1, parts.shape[1])), parts[:, 0])
+
+
+def rest_lengths(layout: CableLayout, body: Rod) -> Float[np.ndarray, " cables"]:
+    """Lengths of the cables on the undeformed body [m]."""
+    ways = (np.diff(route, axis=0) for route in routes(layout, body))
+    return np.array([np.linalg.norm(way, axis=1).sum() for way in ways])
 
 
 def patterns(

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import rod_elements
 from rfdropo_bayes.fem.cable_friction import PRESLIDING, Slip, slip_problem, slip_rows, slipped, start_slip
-from rfdropo_bayes.fem.cables import CableLayout, courses, lengths, threads
+from rfdropo_bayes.fem.cables import CableLayout, courses, lengths, rest_lengths, threads
 from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
@@ -144,7 +144,7 @@ def prepare(system: System, material: Material) -> Prepared:
         gravity=material.gravity,
         rayleigh_mass=material.rayleigh_mass,
         rayleigh_stiffness=material.rayleigh_stiffness,
-        rest_length=cable_lengths(system, state_at_rest(system)),
+        rest_length=jnp.asarray(rest_lengths(system.cables, body)),
         effects=effects,
     )
 

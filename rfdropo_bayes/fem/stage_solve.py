@@ -176,7 +176,8 @@ def all_rows(way: Way, body: StageBody, bonds: Bonds, frame: Matrix) -> tuple[Ar
 
 def along(rows: Float[Array, "6 rows stations *lanes"], twist: Six) -> Float[Array, "rows *lanes"]:
     """J times velocities."""
-    return jnp.sum(dot(rows, twist[:, None]), axis=1)
+    products = dot(rows, twist[:, None])
+    return sum((products[:, k] for k in range(1, products.shape[1])), products[:, 0])
 
 
 def free_velocities(
@@ -184,12 +185,12 @@ def free_velocities(
 ) -> Float[Array, "rows *lanes"]:
     """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
     cables = len(reached)
-    moving = along(rows, body.twist)
     slack = (bonds.reach - reached) / body.span
+    if bonds.rows is None and way.predicted:
+        return slack
+    moving = along(rows, body.twist)
     free = slack if way.predicted else moving[:cables] + slack
-    if bonds.rows is None:
-        return free
-    return jnp.concatenate([free, moving[cables:] + bonds.base])
+    return free if bonds.rows is None else jnp.concatenate([free, moving[cables:] + bonds.base])
 
 
 def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Factor, Array, Array, Array]:
@@ -198,13 +199,12 @@ def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Factor, Array, A
     whole = matrix(body, line)
     rows, reached = all_rows(way, body, bonds, line.frame)
     parts = line.right[:, None], rows
-    lanes = max(part.shape[-1] for part in parts)
+    lanes = max(part.shape[-1] for part in (*parts, whole.diagonal))
     columns = jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:-1], lanes)) for part in parts], axis=1)
     held = way.held
-    factor, solved = eliminate(whole.diagonal[:, :, held:], whole.lower[:, :, held:], columns[:, :, held:])
-    products = jnp.sum(solved[:, :, :, None] * solved[:, :, None, 1:], axis=(0, 1))
-    free = free_velocities(way, body, bonds, rows, reached) + products[0]
-    return factor, solved, products[1:], free
+    factor, solved, products = eliminate(whole.diagonal[:, :, held:], whole.lower[:, :, held:], columns[:, :, held:])
+    free = free_velocities(way, body, bonds, rows, reached) + products[0, 1:]
+    return factor, solved, products[1:, 1:], free
 
 
 def _project(factor: Factor, columns: Array, right: Six) -> tuple[Array, Array]:
