@@ -314,7 +314,8 @@ class Engine:
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
             options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": self.section_loads(inputs.loads)}
-            return self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
+            found = self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
+            return found._replace(solves=None)
         commands = inputs.displacement[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 

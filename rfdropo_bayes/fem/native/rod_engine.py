@@ -292,7 +292,7 @@ class NativeRod:
             rows[name] = np.broadcast_to(value, (count, *shape))
         modulus = rows["young_modulus"]
         shear = modulus / (2.0 * (1.0 + rows["poisson_ratio"]))
-        stages = STAGES.get(self.integrator, STAGES["euler"])
+        stages = STAGES[self.integrator] or STAGES["euler"]
         arrays = {
             "moduli": np.stack([modulus, shear], axis=1),
             "density": rows["density"][:, None],
