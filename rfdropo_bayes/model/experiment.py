@@ -174,7 +174,7 @@ class SimulatorTable(ExperimentTable):
         description='"sdirk2", of second order, takes two solves a step and comes about ten times nearer to the '
         'converged motion than "euler", which takes one, as SOFA does; the robot\'s by default',
     )
-    refine: int = Field(default=1, ge=1, le=16, description="elements of the rod in each layer of the profile")
+    refine: int = Field(default=1, ge=1, le=16, description="cut every element of the robot's rod into so many")
     threads: int | None = Field(default=None, ge=1, description="of the compiled engine; one per processor by default")
 
     @model_validator(mode="after")

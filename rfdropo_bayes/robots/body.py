@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -49,6 +49,11 @@ class Body(RobotTable):
         "plane",
     )
     torsion_constant_m4: tuple[Positive, ...] = Field(description="GJ / G of each layer")
+    elements: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        default=(),
+        description="elements of a rod in each layer; one by default. A layer that cables press together between two "
+        "guides bends more in its middle, which one element does not show",
+    )
     mass_area_m2: tuple[Positive, ...] = Field(description="volume per length of each layer")
     mass_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
         description="rotary inertia per density and length of each layer, ordered like bending_moment_area_m4",
@@ -85,6 +90,8 @@ class Body(RobotTable):
         ):
             if len(getattr(self, key)) != layers:
                 raise ValueError(f"{key} has {len(getattr(self, key))} entries for {layers} layers")
+        if self.elements and len(self.elements) != layers:
+            raise ValueError(f"elements has {len(self.elements)} entries for {layers} layers")
         if self.poisson_stiffening:
             if len(self.poisson_stiffening) != layers:
                 raise ValueError(f"poisson_stiffening has {len(self.poisson_stiffening)} entries for {layers} layers")
@@ -112,6 +119,10 @@ class Body(RobotTable):
             "mass_area": np.array(self.mass_area_m2),
             "mass_moment_area": np.array(self.mass_moment_area_m4),
         }
+
+    def cuts(self) -> tuple[int, ...]:
+        """Elements of a rod in each layer."""
+        return self.elements or (1,) * (len(self.station_m) - 1)
 
     def stiffness_scale(self, poisson_ratio: Any) -> Any:
         """Factor (S - 1,) on each layer's stiffness at this Poisson ratio (a JAX tracer is welcome)."""

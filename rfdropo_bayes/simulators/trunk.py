@@ -23,7 +23,7 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 @dataclass(frozen=True)
 class Discretisation:
-    """How finely the body and time are cut: time step [s], and elements per layer of the section profile."""
+    """How finely the body and time are cut: time step [s], and by how many times the elements of the robot's body."""
 
     time_step: float
     refine: int = 1
@@ -39,10 +39,10 @@ class Assembly(NamedTuple):
 
 def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
     """Cut the robot's body into elements and attach cables and markers to it."""
-    layers = profile_rod(**robot.rod_arrays())
-    body = refined(layers, discretisation.refine)
+    cuts = discretisation.refine * np.array(robot.body.cuts())
+    body = refined(profile_rod(**robot.rod_arrays()), cuts)
     system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
-    station_of = np.arange(len(layers.station)) * discretisation.refine
+    station_of = np.append(0, np.cumsum(cuts))
     return Assembly(system, attach(body, np.concatenate([robot.marker_points(), section_points(robot)])), station_of)
 
 
@@ -106,5 +106,6 @@ class TrunkSimulator(RobotSimulator):
         """See `RobotSimulator`."""
         body = self.assembly.system.body
         masses = jnp.zeros(len(body.station)).at[self.assembly.station_of].set(self.robot.point_masses(values))
-        scale = jnp.repeat(jnp.asarray(self.robot.stiffness_scale(values["poisson_ratio"])), self.discretisation.refine)
+        cuts = np.diff(self.assembly.station_of)
+        scale = jnp.asarray(self.robot.stiffness_scale(values["poisson_ratio"]))[np.repeat(np.arange(len(cuts)), cuts)]
         return self.embodied(values, body, scale, masses)
