@@ -22,7 +22,6 @@ from rfdropo_bayes.fem.native.simd import (
     kernel,
     load,
     magnitude,
-    square_root,
     store,
     where_greater,
 )
@@ -30,6 +29,7 @@ from rfdropo_bayes.fem.native.slip_rows import end_sliding, slide_on, start_slid
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
+LARGEST_RELAXATION = 2.0
 LARGEST_TURN = 0.5
 """[rad] No section turns further in an iteration."""
 
@@ -60,18 +60,23 @@ def _largest(tables, first, field, token):
 
 @kernel
 def _share_of(tables, work, token):
-    """Share of the increment that is taken: limited in length, less when it points against the one before; and whether
-    what is left is small."""
+    """Share of the increment that is taken, and the increment's size.
+
+    The share is that of Aitken's method for vectors (Irons and Tuck 1969, Int. J. Numer. Methods Eng. 1:275), limited
+    in length.
+    """
     one, zero = fill(1.0, work.frame, token), fill(0.0, work.frame, token)
     along = _square(tables, work.solution, work.before, token)
     now = _square(tables, work.solution, work.solution, token)
     before = _square(tables, work.before, work.before, token)
     for row in range(SIZE * tables.stations):
         store(work.before, row, load(work.solution, row, token))
-    change = where_greater(-0.3 * square_root(now * before), along, 0.6 * one, 1.2 * one)
-    share = load(work.relaxation, 0, token) * change
-    share = where_greater(share, one, one, share)
-    share = where_greater(SMALLEST_RELAXATION * one, share, SMALLEST_RELAXATION * one, share)
+    apart, least = now - 2.0 * along + before, fill(1e-30, work.frame, token)
+    change = (before - along) / where_greater(apart, least, apart, least)
+    share = where_greater(before, zero, load(work.relaxation, 0, token) * change, one)
+    largest, smallest = LARGEST_RELAXATION * one, SMALLEST_RELAXATION * one
+    share = where_greater(share, largest, largest, share)
+    share = where_greater(share, smallest, share, smallest)
     store(work.relaxation, 0, share)
     way, turn = _largest(tables, 0, work.solution, token), _largest(tables, 3, work.solution, token)
     longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), LARGEST_TURN * one
