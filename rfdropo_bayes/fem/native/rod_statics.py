@@ -25,7 +25,7 @@ from rfdropo_bayes.fem.native.simd import (
     store,
     where_greater,
 )
-from rfdropo_bayes.fem.native.slip_rows import end_sliding, slide_on, start_sliding, sum_losses
+from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_row, sum_losses
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
@@ -101,6 +101,8 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, sch
     zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
     condense_increment(tables, samples, factors, work, EULER, token)
+    if runs is not None and slips > 0:
+        slide(tables, runs, friction, slips, work, token)
     hold(
         tables, runs, None, samples, factors, work, friction, None, rows, p, slips, 0, 1.0, schedule, token
     )  # fmt: skip
@@ -109,7 +111,7 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, sch
     share, left = _share_of(tables, work, token)
     if runs is not None and slips > 0:
         sum_losses(tables, runs, samples, friction, p, token)
-        slide_on(tables, factors, friction, p, work, slips, share, moving, token)
+        keep_row(tables, factors, friction, p, work, slips, share, moving, token)
     move_stations(tables, moving, share, work, token)
     store(work.solves, 0, load(work.solves, 0, token) + moving)
     bound = fill(schedule.at_rest * tables.total, work.frame, token)
@@ -122,14 +124,15 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
     store(work.moving, 0, one)
-    if runs is not None:
-        start_sliding(friction, slips, token)
+    if runs is not None and slips > 0:
+        gather_cables(tables, work, one, False, token)
+        start_row(tables, runs, samples, friction, work, token)
     for _ in range(most):
         _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, schedule, token)
         if not any_greater(load(work.moving, 0, token), zero):
             break
     if runs is not None:
-        end_sliding(friction, slips, token)
+        end_row(friction, slips, token)
 
 
 @kernel
