@@ -40,7 +40,14 @@ from rfdropo_bayes.fem.native.rod_step import (
 )
 from rfdropo_bayes.fem.native.rod_tables import SIZE
 from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, fma, kernel, load, store, where_greater
-from rfdropo_bayes.fem.native.slip_rows import gather_slip, kinds_present, remember_slip, start_sliding, sum_losses
+from rfdropo_bayes.fem.native.slip_rows import (
+    gather_slip,
+    kinds_present,
+    remember_slip,
+    start_sliding,
+    sum_losses,
+    weigh_guides,
+)
 from rfdropo_bayes.fem.native.sphere_maps import row_entry
 from rfdropo_bayes.fem.native.vectors import added
 
@@ -224,6 +231,7 @@ def constrained_stage(tables, runs, scene, samples, factors, work, friction, tou
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
         start_sliding(friction, slips, token)
+        weigh_guides(runs, samples, friction, work.direction, token)
     again = True
     while again:
         again = False

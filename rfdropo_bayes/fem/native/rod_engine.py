@@ -53,7 +53,7 @@ from rfdropo_bayes.fem.section_loads import SectionLoads
 from rfdropo_bayes.runtime import available_processors
 
 Precision = Literal["float64", "float32"]
-AT_REST = {"float64": 1e-7, "float32": 3e-6}
+AT_REST = {"float64": 1e-6, "float32": 1e-5}
 """Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest."""
 # When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
 # resolves them.

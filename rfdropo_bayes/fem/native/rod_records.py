@@ -70,6 +70,7 @@ class RodWork(NamedTuple):
     element: Float[np.ndarray, "rows lanes"]  # scratch of an element
     lever: Float[np.ndarray, "guide_entries3 lanes"]  # arms of the guides in space [m]
     direction: Float[np.ndarray, "guides3 lanes"]  # from the point before to a guide
+    way: Float[np.ndarray, "guides lanes"]  # and how far [m]
     slack: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
@@ -110,7 +111,9 @@ class Friction(NamedTuple):
     segment: Float[np.ndarray, "guides lanes"]  # tension in front of every guide [N]
     weight: Float[np.ndarray, "kinds_guides lanes"]  # friction of every guide per coefficient [N]
     whole: Float[np.ndarray, "rows lanes"]  # its sum over a run
-    trial: Float[np.ndarray, "rows lanes"]  # share mobilised within a row at rest, as if nothing could slide
+    trial: Float[np.ndarray, "rows lanes"]  # share that a solve starts from, as if nothing could slide
+    ended: Float[np.ndarray, "rows lanes"]  # share mobilised after a row at rest
+    begun: Float[np.ndarray, "guides lanes"]  # ways of the cables when the row began [m]
     lost: Float[np.ndarray, "guides lanes"]  # impulse that a cable has lost before and at a guide
 
 
@@ -132,6 +135,6 @@ def friction_storage(runs: Runs, lanes: int, dtype: type) -> Friction:
     rows = KINDS * runs.count
     sizes = {
         "mobilised": rows, "segment": runs.guides, "weight": KINDS * runs.guides,
-        "whole": rows, "trial": rows, "lost": runs.guides,
+        "whole": rows, "trial": rows, "ended": rows, "begun": runs.guides, "lost": runs.guides,
     }  # fmt: skip
     return Friction(**{name: aligned_zeros((max(size, 1), lanes), dtype) for name, size in sizes.items()})

@@ -97,7 +97,7 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
     work = rows(
         turn=4 * stations, frame=FRAME * stations, velocity=values, pivot=BLOCK * stations, coupling=BLOCK * stations,
         border=PANEL * panels * stations, condensed=9 * panels**2, solution=values, field=values, weight=3 * panels,
-        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, slack=cables, tension=cables,
+        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, way=guides, slack=cables, tension=cables,
         commanded=cables, unsolved=1, accepted=1, lost=1, failed=1, points=3 * tables.points, before=values,
         sudden=values, relaxation=1, moving=1, solves=1, imbalance=1, softness=1, firmness=1, loss=1,
         pushed=3 * stations, given=3 * stations, branch=values,

@@ -22,14 +22,14 @@ from rfdropo_bayes.fem.native.simd import (
     kernel,
     load,
     magnitude,
-    square_root,
     store,
     where_greater,
 )
-from rfdropo_bayes.fem.native.slip_rows import end_sliding, slide_on, start_sliding, sum_losses
+from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_row, sum_losses
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
+LARGEST_RELAXATION = 2.0
 LARGEST_TURN = 0.5
 """[rad] No section turns further in an iteration."""
 
@@ -60,18 +60,23 @@ def _largest(tables, first, field, token):
 
 @kernel
 def _share_of(tables, work, token):
-    """Share of the increment that is taken: limited in length, less when it points against the one before; and whether
-    what is left is small."""
+    """Share of the increment that is taken, and the increment's size.
+
+    The share is that of Aitken's method for vectors (Irons and Tuck 1969, Int. J. Numer. Methods Eng. 1:275), limited
+    in length.
+    """
     one, zero = fill(1.0, work.frame, token), fill(0.0, work.frame, token)
     along = _square(tables, work.solution, work.before, token)
     now = _square(tables, work.solution, work.solution, token)
     before = _square(tables, work.before, work.before, token)
     for row in range(SIZE * tables.stations):
         store(work.before, row, load(work.solution, row, token))
-    change = where_greater(-0.3 * square_root(now * before), along, 0.6 * one, 1.2 * one)
-    share = load(work.relaxation, 0, token) * change
-    share = where_greater(share, one, one, share)
-    share = where_greater(SMALLEST_RELAXATION * one, share, SMALLEST_RELAXATION * one, share)
+    apart, least = now - 2.0 * along + before, fill(1e-30, work.frame, token)
+    change = (before - along) / where_greater(apart, least, apart, least)
+    share = where_greater(before, zero, load(work.relaxation, 0, token) * change, one)
+    largest, smallest = LARGEST_RELAXATION * one, SMALLEST_RELAXATION * one
+    share = where_greater(share, largest, largest, share)
+    share = where_greater(share, smallest, share, smallest)
     store(work.relaxation, 0, share)
     way, turn = _largest(tables, 0, work.solution, token), _largest(tables, 3, work.solution, token)
     longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), LARGEST_TURN * one
@@ -96,6 +101,8 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, sch
     zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
     condense_increment(tables, samples, factors, work, EULER, token)
+    if runs is not None and slips > 0:
+        slide(tables, runs, friction, slips, work, token)
     hold(
         tables, runs, None, samples, factors, work, friction, None, rows, p, slips, 0, 1.0, schedule, token
     )  # fmt: skip
@@ -104,7 +111,7 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, sch
     share, left = _share_of(tables, work, token)
     if runs is not None and slips > 0:
         sum_losses(tables, runs, samples, friction, p, token)
-        slide_on(tables, factors, friction, p, work, slips, share, moving, token)
+        keep_row(tables, factors, friction, p, work, slips, share, moving, token)
     move_stations(tables, moving, share, work, token)
     store(work.solves, 0, load(work.solves, 0, token) + moving)
     bound = fill(schedule.at_rest * tables.total, work.frame, token)
@@ -117,14 +124,15 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
     store(work.moving, 0, one)
-    if runs is not None:
-        start_sliding(friction, slips, token)
+    if runs is not None and slips > 0:
+        gather_cables(tables, work, one, False, token)
+        start_row(tables, runs, samples, friction, work, token)
     for _ in range(most):
         _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, schedule, token)
         if not any_greater(load(work.moving, 0, token), zero):
             break
     if runs is not None:
-        end_sliding(friction, slips, token)
+        end_row(friction, slips, token)
 
 
 @kernel

@@ -41,25 +41,32 @@ def _wrap_angle(direction, g, token):
 
 
 @kernel
-def _weigh_guides(runs, friction, direction, kinds, kind, token):
-    """Friction of every guide per coefficient."""
-    for r in range(runs.count):
-        for g in range(runs.first[r], runs.last[r]):
-            middle = 0.5 * (load(friction.segment, g, token) + load(friction.segment, g + 1, token)) + SLACK
-            for k in range(kinds):
+def weigh_guides(runs, samples, friction, direction, token):
+    """Friction of every guide per coefficient, and of every run."""
+    kinds, kind = kinds_present(samples)
+    for k in range(kinds):
+        for r in range(runs.count):
+            whole = fill(0.0, friction.weight, token)
+            for g in range(runs.first[r], runs.last[r]):
+                middle = 0.5 * (load(friction.segment, g, token) + load(friction.segment, g + 1, token)) + SLACK
                 value = middle / (middle + FADING) if kind + k == 0 else middle * _wrap_angle(direction, g, token)
                 store(friction.weight, k * runs.guides + g, value)
+                whole = whole + value
+            store(friction.whole, k * runs.count + r, whole)
+
+
+@kernel
+def _inverse(friction, row, token):
+    """One over the friction of a run, or one if there is none."""
+    zero, one, whole = fill(0.0, friction.whole, token), fill(1.0, friction.whole, token), load(friction.whole, row, token)
+    return one / where_greater(whole, zero, whole, one)
 
 
 @kernel
 def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
     """Border row of a run; returns how fast the guides move along it."""
-    zero, one = fill(0.0, border, token), fill(1.0, border, token)
-    row, whole = kind * runs.count + r, zero
-    for g in range(runs.first[r], runs.last[r]):
-        whole = whole + load(friction.weight, kind * runs.guides + g, token)
-    store(friction.whole, row, whole)
-    inverse = one / where_greater(whole, zero, whole, one)
+    zero, row = fill(0.0, border, token), kind * runs.count + r
+    inverse = _inverse(friction, row, token)
     before, moving, tied = zero, zero, tables.cable_first[runs.cable[r] + 1] - 1
     for g in range(runs.first[r], tied + 1):
         beyond = before
@@ -77,7 +84,6 @@ def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
 def gather_slip(tables, runs, samples, factors, friction, border, panels, p, work, time_step, token):
     """Border rows of all runs, and their part of a step's problem: friction goes on from ``trial``."""
     kinds, kind = kinds_present(samples)
-    _weigh_guides(runs, friction, work.direction, kinds, kind, token)
     for k in range(kinds):
         coefficient = time_step * load(samples.effects, COULOMB if kind + k == 0 else CAPSTAN, token)
         coefficient = coefficient * load(factors.wide, 0, token)
@@ -154,24 +160,48 @@ def remember_segments(tables, factors, friction, work, rate, accepted, token):
 
 @kernel
 def start_sliding(friction, rows, token):
-    """Begin a row at rest with the friction that is mobilised."""
+    """Begin a stage with the friction that is mobilised."""
     for i in range(rows):
         store(friction.trial, i, load(friction.mobilised, i, token))
 
 
 @kernel
-def slide_on(tables, factors, friction, p, work, rows, share, accepted, token):
-    """Let cables slide by a share of the slip of a static iteration, in the lanes that are accepted."""
-    zero = fill(0.0, work.tension, token)
-    for i in range(rows):
-        slip, trial = share * load(p.velocity, tables.cables + i, token), load(friction.trial, i, token)
-        slid = fnma(slip, 1.0 / PRESLIDING, trial)
-        store(friction.trial, i, where_greater(accepted, zero, slid, trial))
-    remember_segments(tables, factors, friction, work, 1.0, accepted, token)
+def start_row(tables, runs, samples, friction, work, token):
+    """Begin a row at rest: its friction and the ways of its cables, which were gathered."""
+    weigh_guides(runs, samples, friction, work.direction, token)
+    for g in range(runs.guides):
+        store(friction.begun, g, load(work.way, g, token))
 
 
 @kernel
-def end_sliding(friction, rows, token):
-    """Keep the friction that a row at rest has mobilised."""
+def slide(tables, runs, friction, rows, work, token):
+    """Share of the friction that is mobilised where the body is, as if nothing could slide, into ``trial``."""
     for i in range(rows):
-        store(friction.mobilised, i, _bounded(load(friction.trial, i, token)))
+        r, k = i % runs.count, i // runs.count
+        slip, before = fill(0.0, work.way, token), fill(0.0, work.way, token)
+        inverse = _inverse(friction, i, token)
+        for g in range(runs.first[r], tables.cable_first[runs.cable[r] + 1]):
+            longer = load(work.way, g, token) - load(friction.begun, g, token)
+            slip = fma(before, longer, slip)
+            if g < runs.last[r]:
+                before = fma(load(friction.weight, k * runs.guides + g, token), inverse, before)
+        store(friction.trial, i, fnma(slip, 1.0 / PRESLIDING, load(friction.mobilised, i, token)))
+
+
+@kernel
+def keep_row(tables, factors, friction, p, work, rows, share, moving, token):
+    """Keep the friction that an iteration mobilises by a share of its slip, and the tensions along the cables, in the
+    lanes that move."""
+    zero = fill(0.0, work.tension, token)
+    for i in range(rows):
+        slip = share * load(p.velocity, tables.cables + i, token)
+        there = _bounded(fnma(slip, 1.0 / PRESLIDING, load(friction.trial, i, token)))
+        store(friction.ended, i, where_greater(moving, zero, there, load(friction.ended, i, token)))
+    remember_segments(tables, factors, friction, work, 1.0, moving, token)
+
+
+@kernel
+def end_row(friction, rows, token):
+    """The friction that is mobilised after a row at rest."""
+    for i in range(rows):
+        store(friction.mobilised, i, load(friction.ended, i, token))
