@@ -75,13 +75,17 @@ def eliminate(
         jnp.zeros((SIZE, columns, lanes)),
         jnp.zeros((columns, columns, lanes)),
     )
-    along = [jnp.broadcast_to(jnp.moveaxis(part, 2, 0), (part.shape[2], *part.shape[:2], lanes)) for part in
-             (diagonal, coupled, right)]
+    along = [
+        jnp.broadcast_to(jnp.moveaxis(part, 2, 0), (part.shape[2], *part.shape[:2], lanes))
+        for part in (diagonal, coupled, right)
+    ]
     (_, _, total), (pivot, coupling, solved) = lax.scan(one, first, along)
     return Factor(pivot, coupling), solved, total
 
 
-def descend(factor: Factor, right: Float[Array, "stations 6 columns lanes"]) -> Float[Array, "stations 6 columns lanes"]:
+def descend(
+    factor: Factor, right: Float[Array, "stations 6 columns lanes"]
+) -> Float[Array, "stations 6 columns lanes"]:
     """C^-1 times right-hand sides."""
 
     def one(solved: Array, here: tuple[Array, Array, Array]) -> tuple[Array, Array]:

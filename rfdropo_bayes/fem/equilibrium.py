@@ -126,18 +126,16 @@ def _find(system: System, iterations: int, task: Task) -> Found:
         scale = jnp.minimum(relaxation, 1.0 / jnp.maximum(jnp.maximum(*far), 1e-300))
         moved = displaced(current.place, scale * increment)
         count = current.iterations + 1.0
-        return _Iterate(moved, found.impulse, increment, relaxation, largest > SETTLED, found.converged, count, softness)
+        return _Iterate(
+            moved, found.impulse, increment, relaxation, largest > SETTLED, found.converged, count, softness
+        )
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
     none, whole = jnp.zeros((len(task.start.position), 6)), jnp.ones(())
-    first = _Iterate(
-        task.start, impulse, none, whole, jnp.array(True), whole, jnp.zeros(()), jnp.zeros(cables)
-    )
+    first = _Iterate(task.start, impulse, none, whole, jnp.array(True), whole, jnp.zeros(()), jnp.zeros(cables))
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
-    return Found(
-        last.place.position, last.place.orientation, last.impulse, last.solved, last.iterations, last.softness
-    )
+    return Found(last.place.position, last.place.orientation, last.impulse, last.solved, last.iterations, last.softness)
 
 
 def _unbalanced(
@@ -182,9 +180,7 @@ def _balanced(system: System, iterations: int, task: Task) -> Found:
         change = jnp.linalg.solve(slope, -missing)
         moved = jnp.concatenate([jnp.zeros((held, 6)), change[:free].reshape(-1, 6)])
         turning = jax.jvp(lambda a: turned(found.orientation.T, a).T, (jnp.zeros((3, stations)),), (moved[:, 3:].T,))[1]
-        return found, Found(
-            moved[:, :3], turning, change[free:], *jax.tree.map(jnp.zeros_like, (found[3:]))
-        )
+        return found, Found(moved[:, :3], turning, change[free:], *jax.tree.map(jnp.zeros_like, (found[3:])))
 
     solution.defjvp(rule, symbolic_zeros=True)
     return solution(task)

@@ -39,15 +39,11 @@ def laned(function: Callable[..., Any]) -> Callable[..., Any]:
     @custom_vmap
     def with_lanes(*arguments: Any) -> Any:
         width = _width(arguments)
-        return jax.tree.map(
-            lambda part: jnp.broadcast_to(part, (*part.shape[:-1], width)), function(*arguments)
-        )
+        return jax.tree.map(lambda part: jnp.broadcast_to(part, (*part.shape[:-1], width)), function(*arguments))
 
     @with_lanes.def_vmap
     def more_lanes(size: int, batched: Any, *arguments: Any) -> Any:
-        width = max(
-            part.shape[-1] for part in jax.tree.leaves(arguments)
-        )
+        width = max(part.shape[-1] for part in jax.tree.leaves(arguments))
         merged = jax.tree.map(lambda part, new: _merged(part, new, size, width), arguments, tuple(batched))
         result = with_lanes(*merged)
         split = jax.tree.map(lambda part: jnp.moveaxis(part.reshape(*part.shape[:-1], width, size), -1, 0), result)

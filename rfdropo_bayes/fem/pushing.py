@@ -66,7 +66,11 @@ class Touch(NamedTuple):
 
 
 def push_scene(
-    spheres: Spheres | MeshSpheres, *, plate_normal: Float[np.ndarray, "3"], plate_height: float, contact_distance: float
+    spheres: Spheres | MeshSpheres,
+    *,
+    plate_normal: Float[np.ndarray, "3"],
+    plate_height: float,
+    contact_distance: float,
 ) -> PushGeometry:
     """Scene of a body with these spheres before a plate of any normal."""
     normal = np.asarray(plate_normal, float)

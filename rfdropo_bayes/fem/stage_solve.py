@@ -161,9 +161,7 @@ def matrix(body: StageBody, line: Linearised) -> Blocks:
     turning = product(line.frame * (grown * body.inertia)[None], transposed(line.frame))
     straight, turning = jnp.broadcast_arrays(straight, turning)
     none = jnp.zeros_like(turning)
-    inertia = jnp.concatenate(
-        [jnp.concatenate([straight, none], axis=1), jnp.concatenate([none, turning], axis=1)]
-    )
+    inertia = jnp.concatenate([jnp.concatenate([straight, none], axis=1), jnp.concatenate([none, turning], axis=1)])
     return Blocks(blocks.diagonal + inertia, blocks.lower)
 
 
@@ -182,7 +180,9 @@ def along(rows: Float[Array, "6 rows stations *lanes"], twist: Six) -> Float[Arr
     return sum((products[:, k] for k in range(1, products.shape[1])), products[:, 0])
 
 
-def free_velocities(way: Way, body: StageBody, bonds: Bonds, rows: Array, reached: Array) -> Float[Array, "rows *lanes"]:
+def free_velocities(
+    way: Way, body: StageBody, bonds: Bonds, rows: Array, reached: Array
+) -> Float[Array, "rows *lanes"]:
     """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
     cables = len(reached)
     slack = (bonds.reach - reached) / body.span
