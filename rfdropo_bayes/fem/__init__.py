@@ -8,7 +8,7 @@ from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()
 
-# BAL from rfdropo_bayes.fem.balance import energies  # noqa: E402
+from rfdropo_bayes.fem.balance import energies  # noqa: E402
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     Material,

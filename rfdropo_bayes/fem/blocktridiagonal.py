@@ -75,8 +75,10 @@ def eliminate(
         jnp.zeros((SIZE, columns, lanes)),
         jnp.zeros((columns, columns, lanes)),
     )
-    along = [jnp.broadcast_to(jnp.moveaxis(part, 2, 0), (part.shape[2], *part.shape[:2], lanes)) for part in
-             (diagonal, coupled, right)]
+    along = [
+        jnp.broadcast_to(jnp.moveaxis(part, 2, 0), (part.shape[2], *part.shape[:2], lanes))
+        for part in (diagonal, coupled, right)
+    ]
     (_, _, total), (pivot, coupling, solved) = lax.scan(one, first, along)
     return Factor(pivot, coupling), solved, total
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
@@ -107,6 +108,30 @@ def _sides(layout: CableLayout) -> int:
     return 2 if second else 1
 
 
+def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"]:
+    """Stations of the guides. Cables that share those of their guides, which most do, are told by a first axis of one:
+    then fewer parts are gathered."""
+    station = layout.station[:, :, : _sides(layout)]
+    if not len(station):
+        return station
+    longest = np.argmax(layout.used.sum(axis=1))
+    same = (station == station[longest]).all(axis=-1) | ~layout.used
+    return station[longest : longest + 1] if same.all() else station
+
+
+def _gathered(values: Float[Array, "k n *lanes"], index: np.ndarray) -> Float[Array, "k *places *lanes"]:
+    """Parts of the second axis.
+
+    On lanes a loop copies long rows. Without, a product with ones and zeros is quick in both modes of differentiation.
+    """
+    shape = (len(values), *index.shape, *values.shape[2:])
+    if values.ndim == 2:
+        return (values @ (np.arange(values.shape[1])[:, None] == index.ravel()).astype(float)).reshape(shape)
+    rows = jnp.moveaxis(values, 1, 0)
+    chosen = lax.map(lambda place: lax.dynamic_index_in_dim(rows, place, 0, keepdims=False), index.ravel())
+    return jnp.moveaxis(chosen, 0, 1).reshape(shape)
+
+
 def threads(layout: CableLayout) -> Threads:
     """The numbers of a layout, as arguments of ``courses`` and ``station_rows``."""
     sides = _sides(layout)
@@ -116,9 +141,11 @@ def threads(layout: CableLayout) -> Threads:
 
 def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matrix) -> Courses:
     """Where the cables run, from the places and frames of the stations."""
-    station = layout.station[:, :, : _sides(layout)]
-    lever = times(_taken(frame, station, 2), thread.arm)
-    bound = thread.weight * _taken(position, station, 1) + lever
+    index, lanes = _stations(layout), position.shape[2:]
+    parts = _gathered(jnp.concatenate([position, frame.reshape(9, *frame.shape[2:])]), index)
+    here, turn = parts[:3], parts[3:].reshape(3, 3, *index.shape, *lanes)
+    lever = times(turn, thread.arm)
+    bound = thread.weight * here + lever
     place = sum((bound[:, :, :, side] for side in range(1, bound.shape[3])), bound[:, :, :, 0])
     anchor = jnp.broadcast_to(thread.anchor[:, :, None], (*place.shape[:2], 1, *place.shape[3:]))
     points = jnp.concatenate([anchor, place], axis=2)
@@ -129,23 +156,11 @@ def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matri
     return Courses(jnp.where(used, length, 0.0), jnp.where(used, segment / length, 0.0), lever)
 
 
-def _taken(values: Array, index: np.ndarray, axis: int) -> Array:
-    """Parts of an array at indices that are there."""
-    return values.at[(slice(None),) * axis + (index,)].get(mode="promise_in_bounds")
-
-
-def _entries(layout: CableLayout, stations: int) -> Int[np.ndarray, "most cables stations"]:
-    """For every cable and station the guides' sides that are there, in the order of all; one past the last for none."""
-    sides = _sides(layout)
-    bound = (layout.weight != 0.0) | (layout.arm != 0.0).any(axis=-1)
-    here = (bound & layout.used[..., None])[:, :, :sides]
-    number = np.arange(here.size).reshape(here.shape)
-    found: list[list[list[int]]] = [[[] for _ in range(stations)] for _ in layout.anchor]
-    for cable, guide, side in np.argwhere(here):
-        found[cable][layout.station[cable, guide, side]].append(int(number[cable, guide, side]))
-    most = max((len(one) for row in found for one in row), default=0) or 1
-    padded = [[one + [here.size] * (most - len(one)) for one in row] for row in found]
-    return np.moveaxis(np.array(padded, dtype=int).reshape(len(layout.anchor), stations, most), -1, 0)
+def _entries(station: Int[np.ndarray, " bound"], used: Bool[np.ndarray, " bound"], stations: int) -> np.ndarray:
+    """For every station the places in a list of guides' sides that are there, in rows; one past the last for none."""
+    found = [np.flatnonzero(used & (station == number)) for number in range(stations)]
+    most = max((len(places) for places in found), default=0) or 1
+    return np.stack([np.pad(places, (0, most - len(places)), constant_values=len(station)) for places in found], axis=1)
 
 
 def station_rows(
@@ -157,11 +172,33 @@ def station_rows(
 ) -> Float[Array, "6 cables stations *lanes"]:
     """Forces and moments on the stations of one pull at every guide, for every cable."""
     pulled = jnp.broadcast_to(pull[:, :, :, None], lever.shape)
-    entries = jnp.concatenate([thread.weight * pulled, cross(lever, pulled)])
-    entries = entries.reshape(6, -1, *entries.shape[4:])
-    entries = jnp.concatenate([entries, jnp.zeros_like(entries[:, :1])], axis=1)
-    index = _entries(layout, stations)
-    return sum((_taken(entries, part, 1) for part in index[1:]), _taken(entries, index[0], 1))
+    parts = jnp.concatenate([thread.weight * pulled, cross(lever, pulled)])
+    cables, lanes = lever.shape[1], lever.shape[4:]
+    index, bound = (
+        _stations(layout),
+        ((layout.weight != 0.0) | (layout.arm != 0.0).any(axis=-1))[:, :, : lever.shape[3]],
+    )
+    if len(index) == cables:  # every cable has its own
+        rows = [
+            _at_stations(parts[:, cable], index[cable], bound[cable] & layout.used[cable, :, None], stations)
+            for cable in range(cables)
+        ]
+        return jnp.stack(rows, axis=1) if rows else jnp.zeros((6, 0, stations, *lanes))
+    rows = parts.reshape(6 * cables, *parts.shape[2:])
+    return _at_stations(rows, index[0], bound.any(axis=0), stations).reshape(6, cables, stations, *lanes)
+
+
+def _at_stations(
+    parts: Float[Array, "k guides sides *lanes"],
+    station: Int[np.ndarray, "guides sides"],
+    bound: Bool[np.ndarray, "guides sides"],
+    stations: int,
+) -> Float[Array, "k stations *lanes"]:
+    """Sums over what is bound to each station."""
+    flat = parts.reshape(len(parts), -1, *parts.shape[3:])
+    flat = jnp.concatenate([flat, jnp.zeros_like(flat[:, :1])], axis=1)
+    index = _entries(station.ravel(), bound.ravel(), stations)
+    return sum((_gathered(flat, places) for places in index[1:]), _gathered(flat, index[0]))
 
 
 def lengths(course: Courses) -> Float[Array, "cables *lanes"]:

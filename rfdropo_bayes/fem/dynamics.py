@@ -28,8 +28,8 @@ from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
-from rfdropo_bayes.fem.pushing import PushGeometry, unchanged, untouched
 from rfdropo_bayes.fem.push_rows import Push, meet, pushed_rows, released
+from rfdropo_bayes.fem.pushing import PushGeometry, unchanged, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rod import Rod, inertia_per_density
 from rfdropo_bayes.fem.sections import Sections, sections

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.components import Matrix, Vector, diagonal, dot, times
+from rfdropo_bayes.fem.components import diagonal, dot, times
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Scalar
 from rfdropo_bayes.fem.rod import SHEAR, Rod
 

@@ -6,6 +6,9 @@ length h, u = R q, g = u / (1 + q0) and W = 1 - u g', the strains h Gamma = R' d
 
     h R dGamma = dr_b - dr_a + S_a da_a + S_b da_b,    S = [d]x (1 +- [g]x) / 2,    h R dK = W (da_b - da_a)
 
+An arc is longer than its chord: its stretch is Gamma_3 + h^2 (K_1^2 + K_2^2) / 24, which changes by B (da_b - da_a) / h
+besides, B = h^2 W R (K_1, K_2, 0) / 12.
+
 A time step and an iteration for equilibrium differ in a few factors only, held in ``factors``. ``tables``, ``samples``,
 ``factors`` and ``work`` are records of addresses; see `rod_records`. Stiffnesses are those over h, strains those times
 h.
@@ -23,7 +26,7 @@ from rfdropo_bayes.fem.native.rod_effects import (
     find_slopes,
     place_law_stress,
 )
-from rfdropo_bayes.fem.native.rod_records import CHORD, DIRECTOR, GRADIENT, RATE, SLOPE, STRAIN, STRESS, TILTED
+from rfdropo_bayes.fem.native.rod_records import BOW, CHORD, DIRECTOR, GRADIENT, RATE, SLOPE, STRAIN, STRESS, TILTED
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store, where_greater
 from rfdropo_bayes.fem.native.vectors import (
@@ -71,8 +74,11 @@ def measure_element(tables, element, work, token):
     put(rows, CHORD, chord)
     put(rows, GRADIENT, gradient)
     x, y, z = components(rows, DIRECTOR, chord, token)
-    put(rows, STRAIN, (x, y, z - fill(tables.length[element], z, token)))
-    put(rows, STRAIN + 3, plus(between, between))
+    length, (k, l, m) = fill(tables.length[element], z, token), plus(between, between)
+    bow = length * (1.0 / 12.0)
+    store(rows, BOW, bow * k, bow * l)
+    put(rows, STRAIN, (x, y, fma(0.5 * bow, fma(k, k, l * l), z - length)))
+    put(rows, STRAIN + 3, (k, l, m))
 
 
 @kernel
@@ -86,8 +92,10 @@ def _measure_rates(element, work, token):
     half = fill(0.5, work.velocity, token)
     drift = minus(load3(work.velocity, b, token), load3(work.velocity, a, token))
     drift = added(cross(chord, middle), half, drift)
-    put(rows, RATE, components(rows, DIRECTOR, drift, token))
-    put(rows, RATE + 3, components(rows, TILTED, turning, token))
+    x, y, z = components(rows, DIRECTOR, drift, token)
+    k, l, m = components(rows, TILTED, turning, token)
+    put(rows, RATE, (x, y, fma(load(rows, BOW, token), k, fma(load(rows, BOW + 1, token), l, z))))
+    put(rows, RATE + 3, (k, l, m))
 
 
 @kernel
@@ -130,6 +138,9 @@ def add_element_force(tables, samples, factors, element, work, token):
         place_law_stress(tables, samples, element, force, rate, work, token)
     if samples.present[BRANCH]:
         add_branch(samples, factors, element, work, token)
+    pull = load(rows, STRESS + 2, token)
+    for i in range(2):
+        store(rows, STRESS + 3 + i, fma(pull, load(rows, BOW + i, token), load(rows, STRESS + 3 + i, token)))
     _add_forces(element, rows, work.field, token)
 
 
@@ -205,11 +216,11 @@ def _bending_tile(rows, elasticity, token):
 
 
 @kernel
-def _lever_tiles(upper, whole, soft, stiff, axis, even, odd, work, token):
+def _lever_tiles(upper, whole, soft, stiff, axis, even, odd, bow, work, token):
     """Tiles of moments by displacements: S' c of both stations, column by column.
 
-    S' c = ``soft`` S' + ``stiff`` s t' with s = S' t, t the ``axis``; S and s are the sum and the difference of parts
-    that are even and odd in g.
+    S' c = ``soft`` S' + ``stiff`` s t' -+ ``bow`` t' with s = S' t, t the ``axis``; S and s are the sum and the
+    difference of parts that are even and odd in g.
     """
     rows, lower, half = work.element, upper - BLOCK, 0.5 * soft
     g = load3(rows, GRADIENT, token)
@@ -220,6 +231,7 @@ def _lever_tiles(upper, whole, soft, stiff, axis, even, odd, work, token):
     for c in range(3):
         along = stiff * axis[c]
         p, q = added(even, along, hats[c]), added(odd, along, added(chord, g[c], units[c]))
+        q = added(bow, -axis[c], q)
         a, b = plus(p, q), minus(p, q)
         add_to(work.pivot, upper + PANEL + 3 * c, b, token)
         if whole:
@@ -237,7 +249,7 @@ def _put_full(target, t, a, skew):
 
 
 @kernel
-def _moment_tiles(upper, whole, soft, stiff, even, odd, work, bending, token):
+def _moment_tiles(upper, whole, soft, stiff, even, odd, bow, work, bending, token):
     """Tiles of moments by rotations: S' c S of both stations and of the pair, and ``bending``; see `_lever_tiles`."""
     rows, quarter, diagonal = work.element, 0.25 * soft, upper + PANEL + 9
     chord, g, one = load3(rows, CHORD, token), load3(rows, GRADIENT, token), fill(1.0, work.element, token)
@@ -247,7 +259,7 @@ def _moment_tiles(upper, whole, soft, stiff, even, odd, work, bending, token):
     first, second = _symmetric(even, stiff), _symmetric(odd, stiff)
     mixed = _mixed(even, scaled(odd, stiff))
     swing = _mixed(chord, scaled(cross(chord, g), quarter))
-    mixed = _difference(mixed, swing)
+    mixed = _difference(_difference(mixed, swing), _mixed(even, bow))
     ball = quarter * (square + bent)
     same = _sum(_sum(first, second), bending)
     same = _sum(_difference(same, both), _times(own, steep - one))
@@ -260,6 +272,7 @@ def _moment_tiles(upper, whole, soft, stiff, even, odd, work, bending, token):
         pair = _difference(_sum(pair, both), _times(own, steep + one))
         pair = _sum(pair, (ball, zero, zero, ball, zero, ball))
         skew = added(cross(odd, even), stiff, scaled(added(chord, lean, scaled(g, square)), quarter))
+        skew = plus(skew, cross(even, bow))
         _put_full(work.coupling, diagonal, pair, scaled(skew, -one))
 
 
@@ -279,8 +292,14 @@ def add_element_tangent(factors, element, work, whole, token):
         _put_negative(work.coupling, upper, tile)
     even = scaled(cross(axis, chord), half)
     odd = scaled(added(chord, dot(g, axis), scaled(axis, -dot(chord, g))), half)
-    _lever_tiles(upper, whole, soft, stiff, axis, even, odd, work, token)
-    _moment_tiles(upper, whole, soft, stiff, even, odd, work, _bending_tile(rows, elasticity, token), token)
+    firm = elasticity * load(rows, SLOPE + 1, token)
+    bow = scaled(load3(rows, TILTED, token), load(rows, BOW, token))
+    bow = added(load3(rows, TILTED + 3, token), load(rows, BOW + 1, token), bow)
+    pull = scaled(bow, firm)
+    bending = _sum(_bending_tile(rows, elasticity, token), _symmetric(bow, firm))
+    bending = _difference(bending, _mixed(odd, pull))
+    _lever_tiles(upper, whole, soft, stiff, axis, even, odd, pull, work, token)
+    _moment_tiles(upper, whole, soft, stiff, even, odd, pull, work, bending, token)
 
 
 @kernel
