@@ -169,8 +169,8 @@ def _remedy(answer: Answer, name: str) -> str:
     candidate = answer.problem.candidate(name)
     if candidate is not None:
         return candidate.mechanism.remedy
-    layered = "layers" in answer.problem.lanes.simulator.description
-    return REFINE if layered else SHORTEN
+    rod = answer.problem.lanes.simulator.description.get("body") == "rod"
+    return REFINE if rod else SHORTEN
 
 
 def _watch(answer: Answer) -> str:

@@ -18,17 +18,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.cable_drive import DriveLimits
-from rfdropo_bayes.fem.layered import PointMap, joined
+from rfdropo_bayes.fem.mesh_points import NodePoints, joined
 from rfdropo_bayes.fem.rod import Rod, profile_rod
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
+    TetrahedralMaterial,
+    TetrahedralSystem,
     locate,
     lumped_masses,
     mean_points,
     route_cables,
     tetrahedral_body,
 )
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem, tetrahedral_system
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import TetrahedralMesh
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
@@ -76,7 +77,7 @@ class MeshAssembly(NamedTuple):
     """A robot with a mesh for its body as the finite-element engines see it."""
 
     system: TetrahedralSystem
-    markers: PointMap
+    markers: NodePoints
     node_share: Float[np.ndarray, " nodes"]  # of the trunk's mass
     layer: Int[np.ndarray, " elements"]  # layer of the robot's section profile that an element lies in
     station_share: Float[np.ndarray, "nodes stations"]  # of a mass at a station of the robot, on each node
@@ -110,7 +111,7 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
     station = np.asarray(robot.body.station_m)
     layer = np.searchsorted(station, body.rest[body.element, 2].mean(axis=1), side="right") - 1
     return MeshAssembly(
-        tetrahedral_system(body, cables, limits),
+        TetrahedralSystem(body, cables, limits),
         _markers(robot, body, dict(zip(robot.cable_names, guides, strict=True)), table.marker_cables),
         share,
         np.clip(layer, 0, len(station) - 2),
@@ -130,12 +131,12 @@ def _check_cables(robot: Robot, table: TetrahedraTable) -> None:
 
 def _markers(
     robot: Robot, body: TetrahedralBody, guides: dict[str, np.ndarray], marker_cables: tuple[str, ...]
-) -> PointMap:
+) -> NodePoints:
     maps = {name: locate(body, guides[name]) for name in marker_cables}
     rows = []
     for name, point in zip(robot.marker_names, robot.marker_points(), strict=True):
         near = {cable: np.abs(guides[cable][:, 2] - point[2]) < SAME_HEIGHT for cable in marker_cables}
-        found = [PointMap(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
+        found = [NodePoints(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
         if len(found) not in (0, len(marker_cables)):
             raise InputError(
                 f"marker {name!r} is at the height of a guide of some cables but not of all",
@@ -214,7 +215,9 @@ class MeshTrunkSimulator(RobotSimulator):
                 where="balance",
                 remedy='use integrator = "euler" under [simulator], with shorter steps',
             )
-        motion = self.motion_of_nodes(inputs, cube)
+        nodes = self.assembly.system.body.nodes
+        every = NodePoints(np.arange(nodes)[:, None], np.ones((nodes, 1)))
+        motion = self.engine.recording(every).motion(*inputs, cube=cube)
         return tetrahedral_balance(self.assembly.system, inputs[0], motion.position, motion.tension, self.time_step)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material, Rod
 from rfdropo_bayes.fem.balance import Balance
-from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot, Travel
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend, CubeInputs, Engine
@@ -46,11 +45,6 @@ DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
 DYNAMIC = 'set motion = "dynamic" under [simulator]'
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
-
-
-def every_node(count: int) -> PointMap:
-    """All nodes of a body as recorded points."""
-    return PointMap(np.arange(count)[:, None], np.ones((count, 1)))
 
 
 def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "*batch"]:
@@ -154,11 +148,6 @@ class RobotSimulator(ExtendedSimulator):
     def balance_of(self, inputs: tuple[Any, Array, Array], cube: CubeInputs | None) -> Balance:
         """Forces and energies after every step, of the rollout of these `inputs`."""
         raise NotImplementedError
-
-    def motion_of_nodes(self, inputs: tuple[Any, Array, Array], cube: CubeInputs | None) -> Motion:
-        """The rollout of these `inputs` in double precision, with all nodes of the body recorded."""
-        engine = self.engine.recording(every_node(self.assembly.system.body.nodes))
-        return engine.motion(*inputs, cube=cube)
 
     @property
     def pushes(self) -> bool:

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem import Material, PointMap, System, attach, cable_layout, prepare, profile_rod, refined
-from rfdropo_bayes.fem.balance import Balance, rod_balance
+from rfdropo_bayes.fem import Material, PointMap, System, attach, cable_layout, profile_rod, refined
+from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.stage_balance import stepped_balance
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
@@ -92,9 +92,6 @@ class TrunkSimulator(RobotSimulator):
     def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
         """See `RobotSimulator`; the energies are those of the body."""
         system, engine = self.assembly.system, self.engine
-        if engine.integrator == "euler":
-            motion, prepared = self.motion_of_nodes(inputs, cube), prepare(system, inputs[0])
-            return rod_balance(system, prepared, motion.position, motion.tension, self.time_step)
         material, start, displacement = inputs
         prepared, state, _ = engine.initial(material, start)
         around = () if cube is None else (engine.scene, cube.cube)

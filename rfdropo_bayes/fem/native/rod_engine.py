@@ -57,9 +57,7 @@ AT_REST = {"float64": 1e-6, "float32": 1e-5}
 """Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest."""
 # When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
 # resolves them.
-_NUMERICS = {
-    name: (SETTLED[name], SOFTNESS[name], MISSED[name], AT_REST[name]) for name in ("float64", "float32")
-}
+_NUMERICS = {name: (SETTLED[name], SOFTNESS[name], MISSED[name], AT_REST[name]) for name in ("float64", "float32")}
 
 
 class Run(NamedTuple):
@@ -79,9 +77,7 @@ class Run(NamedTuple):
         pose = None if self.poses is None else self.poses.pose
         diverged = output.diverged.view(bool) | ~self.commanded
         solved = output.converged.view(bool)
-        return Motion(
-            output.position, output.tension, diverged, output.imbalance, solved, pose, solves=output.solves
-        )
+        return Motion(output.position, output.tension, diverged, output.imbalance, solved, pose, solves=output.solves)
 
     @property
     def commanded(self) -> Bool[np.ndarray, " batch"]:
@@ -154,7 +150,7 @@ class NativeRod:
         self.tables = rod_tables(system, points, self.dtype.type)
         self._runs = runs_of(system.cables)
         if scene is not None and integrator == "quasi-static":
-            raise InputError("a body that touches a cube and is always at rest", remedy='use another integrator')
+            raise InputError("a body that touches a cube and is always at rest", remedy="use another integrator")
         self._scene = None if scene is None else rod_scene(scene, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()

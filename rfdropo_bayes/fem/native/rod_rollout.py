@@ -58,7 +58,9 @@ class RodOutput(NamedTuple):
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
-    converged: UInt8[np.ndarray, " batch"]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
+    converged: UInt8[
+        np.ndarray, " batch"
+    ]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
     imbalance: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium
     solves: Float[np.ndarray, " batch"]  # of the equilibria of all rows
     records: int
