@@ -239,9 +239,10 @@ class NativeRod:
         begin = np.zeros(cables) if given is None else np.asarray(given, dtype=float)
         if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
             raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
-        moves = displacement.reshape(-1, displacement.shape[-2] * cables)
+        moves = displacement[None] if displacement.ndim == 2 else displacement
+        moves = moves.reshape(len(moves), moves.shape[1] * cables)
         pushed, place = load_rows(loads)
-        batch = self._batch(material, {"start": begin.reshape(-1, cables), "displacement": moves, "loads": pushed})
+        batch = self._batch(material, {"start": np.atleast_2d(begin), "displacement": moves, "loads": pushed})
         if loads is not None:
             present = batch.present.copy()
             present[LOADED] = 1

@@ -11,10 +11,9 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cable_drive import DriveLimits
-from rfdropo_bayes.fem.cables import CableLayout, routes
-from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
+from rfdropo_bayes.fem.dynamics import LOST
 from rfdropo_bayes.fem.integrators import Integrator, timed_stages
-from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.mesh_points import NodeCables, NodePoints, routes
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, ConstraintProblem, problem_storage
@@ -33,7 +32,7 @@ from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lane
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
+from rfdropo_bayes.fem.tetrahedra import POISSON_LIMIT, TetrahedralBody
 from rfdropo_bayes.runtime import available_processors
 
 
@@ -50,9 +49,9 @@ class TetrahedralEngine:
     def __init__(
         self,
         body: TetrahedralBody,
-        cables: CableLayout,
+        cables: NodeCables,
         limits: DriveLimits,
-        points: PointMap,
+        points: NodePoints,
         *,
         dtype: type = np.float64,
         threads: int | None = None,
@@ -249,7 +248,7 @@ def _mesh(
 
 
 def _cables(
-    layout: CableLayout, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
+    layout: NodeCables, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
 ) -> kernels.Cables:
     first, node, weight = [0], [], []
     legs = [np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes(layout, body.rest)]
