@@ -18,6 +18,7 @@ from rfdropo_bayes.fem.native.rod_records import (
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.vectors import add_to, added, dot, minus, put, scaled
+from rfdropo_bayes.fem.sections import LEAST_TANGENT
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
@@ -32,8 +33,6 @@ FLAGS = LOADED + 1
 EFFECTS = FIBRE + 1
 LAW = 6
 """Rows of ``samples.law`` for each element, added to its stiffness in bending and twist: 00, 01, 02, 11, 12, 22."""
-LEAST_TANGENT = 0.1
-"""Least tangent stiffness under the law of fibres, relative to the linear section's."""
 
 
 @kernel

@@ -70,7 +70,7 @@ class RodWork(NamedTuple):
     element: Float[np.ndarray, "rows lanes"]  # scratch of an element
     lever: Float[np.ndarray, "guide_entries3 lanes"]  # arms of the guides in space [m]
     direction: Float[np.ndarray, "guides3 lanes"]  # from the point before to a guide
-    way: Float[np.ndarray, "guides lanes"]  # and how far [m]
+    course: Float[np.ndarray, "guides lanes"]  # and how far [m]
     slack: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
@@ -81,7 +81,11 @@ class RodWork(NamedTuple):
     points: Float[np.ndarray, "point_values lanes"]
     before: Float[np.ndarray, "values lanes"]  # the increment of the stage or static iteration before
     sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
-    relaxation: Float[np.ndarray, "1 lanes"]
+    way: Float[np.ndarray, "values lanes"]  # that a static iteration goes
+    change: Float[np.ndarray, "values lanes"]  # of the increment in the iteration before
+    went: Float[np.ndarray, "values lanes"]  # way that made this change
+    older: Float[np.ndarray, "values lanes"]  # the same of an iteration earlier
+    earlier: Float[np.ndarray, "values lanes"]
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]

@@ -76,7 +76,8 @@ class RodSchedule(NamedTuple):
     settled: float  # relative change of the velocities that ends the iterations of a step
     softness: float  # of the cables, relative to W
     missed: float  # [m/s] velocity at which surfaces may meet that were not taken to
-    at_rest: float  # largest increment over the body's length, and turn [rad], of a body at rest
+    at_start: float  # largest increment over the body's length, and turn [rad], of the initial equilibrium
+    at_rest: float  # and of a row at rest
     count: int = 1  # stages of a step
     stages: tuple[Stage, Stage] = (EULER, EULER)  # in seconds; the first ``count`` of them
     still: int = 0  # 1 for a quasi-static motion: a step is a row at rest
@@ -99,9 +100,9 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
     work = rows(
         turn=4 * stations, frame=FRAME * stations, velocity=values, pivot=BLOCK * stations, coupling=BLOCK * stations,
         border=PANEL * panels * stations, condensed=9 * panels**2, solution=values, field=values, weight=3 * panels,
-        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, way=guides, slack=cables, tension=cables,
+        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
         commanded=cables, unsolved=1, accepted=1, lost=1, failed=1, points=3 * tables.points, before=values,
-        sudden=values, relaxation=1, moving=1, solves=1, imbalance=1, softness=1, firmness=1, loss=1,
+        sudden=values, way=values, change=values, went=values, older=values, earlier=values, moving=1, solves=1, imbalance=1, softness=1, firmness=1, loss=1,
         pushed=3 * stations, given=3 * stations, branch=values,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
@@ -247,8 +248,8 @@ def settle(tables, runs, batch, samples, factors, work, friction, rows, p, sched
     take_loads(batch, samples, work, 0, first, token)
     fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
     if schedule.static_iterations > 0:
-        most = schedule.static_iterations
-        come_to_rest(tables, runs, samples, factors, work, friction, rows, p, 0, most, schedule, token)
+        most, bound = schedule.static_iterations, schedule.at_start
+        come_to_rest(tables, runs, samples, factors, work, friction, rows, p, 0, most, bound, schedule, token)
         measure_imbalance(tables, samples, factors, work, token)
         keep_found(tables, work, True, token)
     _relax_branches(tables, samples, factors, work, token)
@@ -264,7 +265,8 @@ def take_row(tables, runs, batch, samples, factors, work, friction, rows, p, sch
         slips = kinds_present(samples)[0] * runs.count
     take_loads(batch, samples, work, step + 1, first, token)
     _take_commands(tables, batch, work, step, 1.0, first, token)
-    come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, ROW_ITERATIONS, schedule, token)
+    most, bound = ROW_ITERATIONS, schedule.at_rest
+    come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token)
     keep_found(tables, work, False, token)
 
 

@@ -1,12 +1,13 @@
 """Static equilibrium of a rod in SIMD lanes: where a rollout starts, and every row of a quasi-static motion.
 
-Newton's method without geometric stiffness, neither of the rod nor of its cables, whose parts nearly cancel. A lane
-that has come to rest is not moved again: how long others take changes nothing of it.
+Newton's method without geometric stiffness, neither of the rod nor of its cables, whose parts nearly cancel; what they
+leave is made up for by mixing iterations. A lane that has come to rest is not moved again: how long others take changes
+nothing of it.
 """
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.equilibrium import LONGEST_STEP, SMALLEST_RELAXATION
+from rfdropo_bayes.fem.equilibrium import LONGEST_STEP
 from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import PANEL
 from rfdropo_bayes.fem.native.fields import clear
@@ -29,19 +30,22 @@ from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_r
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
-LARGEST_RELAXATION = 2.0
 LARGEST_TURN = 0.5
 """[rad] No section turns further in an iteration."""
+DISTINCT = 1e-6
+"""Squared sine of the least angle between two changes of the increment that count as two."""
+TINY = 1e-30
+"""Squared changes of the increment below this are none [m2]."""
 
 
 @kernel
-def _square(tables, field, other, token):
+def _product(tables, a, b, token):
     """Product of two changes of all stations; turns count by the length of the body."""
-    total, square = fill(0.0, field, token), tables.total * tables.total
-    for station in range(tables.stations):
+    total, square = fill(0.0, a, token), tables.total * tables.total
+    for station in range(tables.held, tables.stations):
         for i in range(SIZE):
             row = SIZE * station + i
-            product = load(field, row, token) * load(other, row, token)
+            product = load(a, row, token) * load(b, row, token)
             total = total + (product if i < 3 else product * square)
     return total
 
@@ -59,31 +63,64 @@ def _largest(tables, first, field, token):
 
 
 @kernel
-def _share_of(tables, work, token):
-    """Share of the increment that is taken, and the increment's size.
-
-    The share is that of Aitken's method for vectors (Irons and Tuck 1969, Int. J. Numer. Methods Eng. 1:275), limited
-    in length.
-    """
-    one, zero = fill(1.0, work.frame, token), fill(0.0, work.frame, token)
-    along = _square(tables, work.solution, work.before, token)
-    now = _square(tables, work.solution, work.solution, token)
-    before = _square(tables, work.before, work.before, token)
-    for row in range(SIZE * tables.stations):
+def _remember(tables, work, token):
+    """Turn ``before``, the increment of the iteration before, into its change, and keep the two last changes, and the
+    ways that made them."""
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        store(work.older, row, load(work.change, row, token))
+        store(work.earlier, row, load(work.went, row, token))
+        store(work.change, row, load(work.solution, row, token) - load(work.before, row, token))
+        store(work.went, row, load(work.way, row, token))
         store(work.before, row, load(work.solution, row, token))
-    apart, least = now - 2.0 * along + before, fill(1e-30, work.frame, token)
-    change = (before - along) / where_greater(apart, least, apart, least)
-    share = where_greater(before, zero, load(work.relaxation, 0, token) * change, one)
-    largest, smallest = LARGEST_RELAXATION * one, SMALLEST_RELAXATION * one
-    share = where_greater(share, largest, largest, share)
-    share = where_greater(share, smallest, share, smallest)
-    store(work.relaxation, 0, share)
-    way, turn = _largest(tables, 0, work.solution, token), _largest(tables, 3, work.solution, token)
-    longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), LARGEST_TURN * one
-    share = where_greater(share * way, longest, longest / way, share)
-    share = where_greater(share * turn, widest, widest / turn, share)
-    turn = turn * tables.total
-    return share, where_greater(way, turn, way, turn)
+
+
+@kernel
+def _mixing(tables, work, number, token):
+    """Shares of the last two changes of the increment that cancel it best."""
+    zero, one, tiny = fill(0.0, work.frame, token), fill(1.0, work.frame, token), fill(TINY, work.frame, token)
+    first, along = _product(tables, work.change, work.change, token), _product(tables, work.change, work.solution, token)
+    alone = along / where_greater(first, tiny, first, one)
+    alone = where_greater(first, tiny, alone, zero)
+    if number < 2:
+        return alone, zero
+    second, beside = _product(tables, work.older, work.older, token), _product(tables, work.older, work.solution, token)
+    mixed = _product(tables, work.change, work.older, token)
+    area = fnma(mixed, mixed, first * second)
+    apart = where_greater(area, DISTINCT * first * second, one, zero)
+    apart = where_greater(area, tiny, apart, zero)
+    inverse = one / where_greater(apart, zero, area, one)
+    a, b = fnma(beside, mixed, along * second) * inverse, fnma(along, mixed, beside * first) * inverse
+    return where_greater(apart, zero, a, alone), where_greater(apart, zero, b, zero)
+
+
+@kernel
+def _choose_way(tables, work, number, token):
+    """Turn ``solution`` into the way that an iteration goes; returns the largest increment.
+
+    Anderson's mixing (1965, J. ACM 12:547) with the last two iterations, limited in length.
+    """
+    one, turning = fill(1.0, work.frame, token), fill(tables.total, work.frame, token)
+    size, turn = _largest(tables, 0, work.solution, token), turning * _largest(tables, 3, work.solution, token)
+    size = where_greater(size, turn, size, turn)
+    if number > 0:
+        _remember(tables, work, token)
+        a, b = _mixing(tables, work, number, token)
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        way = load(work.solution, row, token)
+        if number > 0:
+            way = fnma(a, load(work.went, row, token) + load(work.change, row, token), way)
+            way = fnma(b, load(work.earlier, row, token) + load(work.older, row, token), way)
+        else:
+            store(work.before, row, way)
+        store(work.way, row, way)
+    far, wide = _largest(tables, 0, work.way, token), _largest(tables, 3, work.way, token)
+    longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), fill(LARGEST_TURN, work.frame, token)
+    share = where_greater(far, longest, longest / far, one)
+    share = where_greater(share * wide, widest, widest / wide, share)
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        store(work.way, row, share * load(work.way, row, token))
+        store(work.solution, row, load(work.way, row, token))
+    return size
 
 
 @kernel
@@ -96,7 +133,7 @@ def _take_tensions(tables, work, moving, token):
 
 
 @kernel
-def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, schedule, token):
+def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, number, bound, schedule, token):
     """One iteration of the lanes that move; those whose increment was small stop."""
     zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
@@ -108,27 +145,28 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, sch
     )  # fmt: skip
     store(work.unsolved, 0, where_greater(moving, zero, load(work.unsolved, 0, token), unsolved))
     _take_tensions(tables, work, moving, token)
-    share, left = _share_of(tables, work, token)
+    left = _choose_way(tables, work, number, token)
     if runs is not None and slips > 0:
         sum_losses(tables, runs, samples, friction, p, token)
-        keep_row(tables, factors, friction, p, work, slips, share, moving, token)
-    move_stations(tables, moving, share, work, token)
+        keep_row(tables, factors, friction, p, work, slips, moving, token)
+    move_stations(tables, moving, work, token)
     store(work.solves, 0, load(work.solves, 0, token) + moving)
-    bound = fill(schedule.at_rest * tables.total, work.frame, token)
-    store(work.moving, 0, where_greater(left, bound, moving, zero))
+    small = fill(bound * tables.total, work.frame, token)
+    store(work.moving, 0, where_greater(left, small, moving, zero))
 
 
 @kernel
-def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, schedule, token):
-    """Find the equilibrium from where the body is, in at most so many iterations."""
+def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
+    """Find the equilibrium from where the body is, in at most so many iterations, to a largest increment relative to
+    the body's length."""
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
     store(work.moving, 0, one)
     if runs is not None and slips > 0:
         gather_cables(tables, work, one, False, token)
         start_row(tables, runs, samples, friction, work, token)
-    for _ in range(most):
-        _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, schedule, token)
+    for number in range(most):
+        _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, number, bound, schedule, token)
         if not any_greater(load(work.moving, 0, token), zero):
             break
     if runs is not None:
@@ -151,8 +189,6 @@ def _start_settling(tables, samples, factors, work, token):
     store(factors.narrow, 0, one)
     store(factors.going, 0, zero)
     store(factors.give, 0, load(samples.effects, GIVE, token))
-    clear(work.before, 0, SIZE * tables.stations, token)
-    store(work.relaxation, 0, one)
 
 
 @kernel

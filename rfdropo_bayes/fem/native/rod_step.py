@@ -136,7 +136,7 @@ def _gather_cable(tables, c, work, token):
         shorter = shorter - segment
         way = scaled(way, one / segment)
         put(work.direction, 3 * g, way)
-        store(work.way, g, segment)
+        store(work.course, g, segment)
         if g > first:
             pull = minus(before, way)
             growth = growth + pull_guide(tables, g - 1, work.border, row, tables.panels, pull, work, token)
@@ -283,18 +283,14 @@ def chosen(accepted, a, b):
 
 
 @kernel
-def move_stations(tables, accepted, share, work, token):
-    """Move and turn all stations by a share of ``solution`` in the lanes that are accepted; others keep every bit."""
+def move_stations(tables, accepted, work, token):
+    """Move and turn all stations by ``solution`` in the lanes that are accepted; others keep every bit."""
     zero = fill(0.0, work.frame, token)
     for station in range(tables.held, tables.stations):
         frame, row, t = FRAME * station, SIZE * station, 4 * station
-        here, scalar, vector = (
-            load3(work.frame, frame, token),
-            load(work.turn, t, token),
-            load3(work.turn, t + 1, token),
-        )
-        put(work.frame, frame, chosen(accepted, added(load3(work.solution, row, token), share, here), here))
-        turn_station(work, station, scaled(load3(work.solution, row + 3, token), share), token)
+        here, scalar, vector = load3(work.frame, frame, token), load(work.turn, t, token), load3(work.turn, t + 1, token)
+        put(work.frame, frame, chosen(accepted, plus(load3(work.solution, row, token), here), here))
+        turn_station(work, station, load3(work.solution, row + 3, token), token)
         store(work.turn, t, where_greater(accepted, zero, load(work.turn, t, token), scalar))
         put(work.turn, t + 1, chosen(accepted, load3(work.turn, t + 1, token), vector))
         place_directors(work, station, token)

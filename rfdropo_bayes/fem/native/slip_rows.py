@@ -174,7 +174,7 @@ def start_row(tables, runs, samples, friction, work, token):
     """Begin a row at rest: its friction and the ways of its cables, which were gathered."""
     weigh_guides(runs, samples, friction, work.direction, token)
     for g in range(runs.guides):
-        store(friction.begun, g, load(work.way, g, token))
+        store(friction.begun, g, load(work.course, g, token))
 
 
 @kernel
@@ -182,10 +182,10 @@ def slide(tables, runs, friction, rows, work, token):
     """Share of the friction that is mobilised where the body is, as if nothing could slide, into ``trial``."""
     for i in range(rows):
         r, k = i % runs.count, i // runs.count
-        slip, before = fill(0.0, work.way, token), fill(0.0, work.way, token)
+        slip, before = fill(0.0, work.course, token), fill(0.0, work.course, token)
         inverse = _inverse(friction, i, token)
         for g in range(runs.first[r], tables.cable_first[runs.cable[r] + 1]):
-            longer = load(work.way, g, token) - load(friction.begun, g, token)
+            longer = load(work.course, g, token) - load(friction.begun, g, token)
             slip = fma(before, longer, slip)
             if g < runs.last[r]:
                 before = fma(load(friction.weight, k * runs.guides + g, token), inverse, before)
@@ -193,12 +193,12 @@ def slide(tables, runs, friction, rows, work, token):
 
 
 @kernel
-def keep_row(tables, factors, friction, p, work, rows, share, moving, token):
-    """Keep the friction that an iteration mobilises by a share of its slip, and the tensions along the cables, in the
+def keep_row(tables, factors, friction, p, work, rows, moving, token):
+    """Keep the friction that an iteration mobilises, and the tensions along the cables, in the
     lanes that move."""
     zero = fill(0.0, work.tension, token)
     for i in range(rows):
-        slip = share * load(p.velocity, tables.cables + i, token)
+        slip = load(p.velocity, tables.cables + i, token)
         there = _bounded(fnma(slip, 1.0 / PRESLIDING, load(friction.trial, i, token)))
         store(friction.ended, i, where_greater(moving, zero, there, load(friction.ended, i, token)))
     remember_segments(tables, factors, friction, work, 1.0, moving, token)
