@@ -107,7 +107,7 @@ def slip_problem(
 
 def slip_rows(
     layout: CableLayout, slip: Slip, position: Float[Array, "stations 3"], orientation: Float[Array, "stations 4"]
-) -> tuple[Float[Array, "6 runs stations"], Float[Array, " runs"]]:
+) -> tuple[Float[Array, "stations 6 runs"], Float[Array, " runs"]]:
     """Minus the derivatives of the runs' slip by the motion of the stations, and lengths [m] that grow as they do."""
     thread = threads(layout)
     course = courses(layout, thread, position.T, rotation(orientation.T))
@@ -116,9 +116,9 @@ def slip_rows(
     weight = jnp.swapaxes(slip.weight, 1, 2).reshape(-1, cables, guides)
     weighted = weight * course.direction[:, None]
     pull = weighted - jnp.concatenate([weighted[..., 1:], jnp.zeros_like(weighted[..., :1])], axis=-1)
-    rows = patterns(layout, thread, course.lever, pull, len(position)).reshape(6, kinds, runs, cables, -1)
+    rows = patterns(layout, thread, course.lever, pull, len(position)).reshape(len(position), 6, kinds, runs, cables)
     length = jnp.sum(slip.weight * course.length[:, None], axis=-1)
-    return jnp.swapaxes(rows, 2, 3).reshape(6, kinds * cables * runs, -1), length.ravel()
+    return jnp.swapaxes(rows, 3, 4).reshape(len(position), 6, -1), length.ravel()
 
 
 def slipped(

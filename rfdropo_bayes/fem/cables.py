@@ -119,17 +119,14 @@ def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"
     return station[longest : longest + 1] if same.all() else station
 
 
-def _gathered(values: Float[Array, "k n *lanes"], index: np.ndarray) -> Float[Array, "k *places *lanes"]:
-    """Parts of the second axis.
+def _gathered(values: Float[Array, "k n *lanes"], index: Int[np.ndarray, " m"]) -> Float[Array, "m k *lanes"]:
+    """Parts of the second axis, which becomes the first.
 
     On lanes a loop copies long rows. Without, a product with ones and zeros is quick in both modes of differentiation.
     """
-    shape = (len(values), *index.shape, *values.shape[2:])
     if values.ndim == 2:
-        return (values @ (np.arange(values.shape[1])[:, None] == index.ravel()).astype(float)).reshape(shape)
-    rows = jnp.moveaxis(values, 1, 0)
-    chosen = lax.map(lambda place: lax.dynamic_index_in_dim(rows, place, 0, keepdims=False), index.ravel())
-    return jnp.moveaxis(chosen, 0, 1).reshape(shape)
+        return (index[:, None] == np.arange(values.shape[1])).astype(float) @ values.T
+    return lax.map(lambda place: lax.dynamic_index_in_dim(values, place, 1, keepdims=False), index)
 
 
 def threads(layout: CableLayout) -> Threads:
@@ -142,7 +139,8 @@ def threads(layout: CableLayout) -> Threads:
 def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matrix) -> Courses:
     """Where the cables run, from the places and frames of the stations."""
     index, lanes = _stations(layout), position.shape[2:]
-    parts = _gathered(jnp.concatenate([position, frame.reshape(9, *frame.shape[2:])]), index)
+    parts = _gathered(jnp.concatenate([position, frame.reshape(9, *frame.shape[2:])]), index.ravel())
+    parts = jnp.moveaxis(parts, 0, 1).reshape(12, *index.shape, *lanes)
     here, turn = parts[:3], parts[3:].reshape(3, 3, *index.shape, *lanes)
     lever = times(turn, thread.arm)
     bound = thread.weight * here + lever
@@ -169,7 +167,7 @@ def station_rows(
     lever: Float[Array, "3 cables guides sides *lanes"],
     pull: Float[Array, "3 cables guides *lanes"],
     stations: int,
-) -> Float[Array, "6 cables stations *lanes"]:
+) -> Float[Array, "stations 6 cables *lanes"]:
     """Forces and moments on the stations of one pull at every guide, for every cable."""
     pulled = jnp.broadcast_to(pull[:, :, :, None], lever.shape)
     parts = jnp.concatenate([thread.weight * pulled, cross(lever, pulled)])
@@ -183,9 +181,9 @@ def station_rows(
             _at_stations(parts[:, cable], index[cable], bound[cable] & layout.used[cable, :, None], stations)
             for cable in range(cables)
         ]
-        return jnp.stack(rows, axis=1) if rows else jnp.zeros((6, 0, stations, *lanes))
+        return jnp.stack(rows, axis=2) if rows else jnp.zeros((stations, 6, 0, *lanes))
     rows = parts.reshape(6 * cables, *parts.shape[2:])
-    return _at_stations(rows, index[0], bound.any(axis=0), stations).reshape(6, cables, stations, *lanes)
+    return _at_stations(rows, index[0], bound.any(axis=0), stations).reshape(stations, 6, cables, *lanes)
 
 
 def _at_stations(
@@ -193,7 +191,7 @@ def _at_stations(
     station: Int[np.ndarray, "guides sides"],
     bound: Bool[np.ndarray, "guides sides"],
     stations: int,
-) -> Float[Array, "k stations *lanes"]:
+) -> Float[Array, "stations k *lanes"]:
     """Sums over what is bound to each station."""
     flat = parts.reshape(len(parts), -1, *parts.shape[3:])
     flat = jnp.concatenate([flat, jnp.zeros_like(flat[:, :1])], axis=1)
@@ -219,6 +217,6 @@ def patterns(
     lever: Float[Array, "3 cables guides sides"],
     pulls: Float[Array, "3 many cables guides"],
     stations: int,
-) -> Float[Array, "6 many cables stations"]:
+) -> Float[Array, "stations 6 many cables"]:
     """``station_rows`` of many pulls."""
-    return jax.vmap(partial(station_rows, layout, thread, lever, stations=stations), 1, 1)(pulls)
+    return jax.vmap(partial(station_rows, layout, thread, lever, stations=stations), 1, 2)(pulls)

@@ -429,7 +429,7 @@ def end_shares(slip: Slip, bonds: Bonds, twist: Float[Array, "stations 6"]) -> F
     """Share of the friction that is mobilised at the end of a stage."""
     assert bonds.rows is not None
     runs = len(slip.strength)
-    sliding = jnp.einsum("irs,si->r", bonds.rows[:, :runs], twist)
+    sliding = jnp.einsum("sir,si->r", bonds.rows[..., :runs], twist)
     return jnp.clip(slip.mobilised - bonds.follows / PRESLIDING * sliding, -1.0, 1.0)
 
 
@@ -466,7 +466,7 @@ def _bonds(
         base.append(touching.base)
         weight = jax.scipy.linalg.block_diag(weight, touching.compliance)
         contacts = touching.contacts
-    whole = jnp.concatenate(rows, axis=1), jnp.concatenate(base)
+    whole = jnp.concatenate(rows, axis=2), jnp.concatenate(base)
     return bonds._replace(rows=whole[0], base=whole[1], compliance=weight, slips=slips, contacts=contacts)
 
 

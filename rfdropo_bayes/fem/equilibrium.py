@@ -147,7 +147,7 @@ def _unbalanced(
     bonds = _bonds(system, task, place, found.impulse[:cables])
     line, way = linearised(body), Way(system.clamped_stations, True, system.cables)
     rows, reached = all_rows(way, body, bonds, line.frame)
-    forces = line.right + jnp.sum(rows * impulse[:, None], axis=1)
+    forces = line.right + jnp.einsum("sir,r->is", rows, impulse)
     tension = impulse[:cables]
     slack = bonds.reach - reached + (bonds.give + found.softness) * tension
     lacking = jnp.where(found.impulse[:cables] > 0.0, slack, tension)

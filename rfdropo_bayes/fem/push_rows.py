@@ -28,7 +28,7 @@ class Push(NamedTuple):
 class PushedRows(NamedTuple):
     """The contacts in the constraint problem of a stage, three rows each."""
 
-    rows: Float[Array, "6 rows stations"]
+    rows: Float[Array, "stations 6 rows"]
     base: Float[Array, " rows"]  # of the relative velocities, what the cube does without contacts [m/s]
     compliance: Float[Array, "rows rows"]  # of the cube [1/kg]
     contacts: Contacts
@@ -81,7 +81,7 @@ def _widened(
     touch: Touch, cube: CubeState, twist: Float[Array, "stations 6"], stage: Stage, time_step: Scalar
 ) -> Float[Array, ""]:
     """How much longer a stage is for its impacts: as long as the first of them is past, see ``fem.integrators``."""
-    opening = touch.on_cube[:, 0] @ twist_of(cube) + jnp.einsum("irs,si->r", touch.rows[:, ::3], twist)
+    opening = touch.on_cube[:, 0] @ twist_of(cube) + jnp.einsum("sir,si->r", touch.rows[..., ::3], twist)
     closes = (touch.gap < 0.0) & (opening < 0.0)
     past = jnp.where(closes, touch.gap / jnp.where(closes, opening, 1.0), 0.0)
     length = stage.length * time_step
@@ -96,7 +96,7 @@ def _impact(change: Float[Array, " contacts"]) -> Float[Array, " contacts"]:
 
 def _closing(push: Push, twist: Float[Array, "stations 6"], of_cube: Float[Array, "6"]) -> Float[Array, " contacts"]:
     """Opening speeds of the contacts."""
-    return jnp.einsum("irs,si->r", push.touch.rows[:, ::3], twist) + push.touch.on_cube[:, 0] @ of_cube
+    return jnp.einsum("sir,si->r", push.touch.rows[..., ::3], twist) + push.touch.on_cube[:, 0] @ of_cube
 
 
 def pushed_rows(push: Push, stage: Stage, time_step: Scalar, twist: Float[Array, "stations 6"]) -> PushedRows:
@@ -130,5 +130,5 @@ def released(
     touching = jnp.zeros_like(push.before).at[push.touch.pair].set(touching)
     change = _closing(push, twist, after) - _closing(push, before, twist_of(push.state))
     sudden = (_impact(change)[:, None] * impulse).ravel()
-    on_body = jnp.einsum("r,irs->si", sudden, push.touch.rows)
+    on_body = jnp.einsum("r,sir->si", sudden, push.touch.rows)
     return Released(cube, touching, on_body, mass * (on_cube.T @ sudden))

@@ -62,7 +62,7 @@ class Touch(NamedTuple):
     frame: Float[Array, "contacts 3 3"]  # rows: normal, two tangents
     on_cube: Float[Array, "contacts 3 6"]  # relative velocity by the cube's velocity and spin
     pair: Int[Array, " contacts"]  # that a contact is: corners on the plate, spheres on the cube, spheres on the plate
-    rows: Float[Array, "6 rows stations"]  # relative velocity by the stations' velocities and spins; three a contact
+    rows: Float[Array, "stations 6 rows"]  # relative velocity by the stations' velocities and spins; three a contact
 
 
 def push_scene(
@@ -169,7 +169,7 @@ def _trunk_rows(
     chosen: Int[Array, " contacts"],
     frame: Float[Array, "contacts 3 3"],
     orientation: Float[Array, "stations 4"],
-) -> Float[Array, "6 rows stations"]:
+) -> Float[Array, "stations 6 rows"]:
     """Derivatives of the relative velocities of the chosen spheres by the velocities and spins of the stations."""
     station, weight, arm = (jnp.asarray(part)[chosen] for part in spheres.centre)
     turn = jnp.moveaxis(rotation(orientation.T), -1, 0)[station]
@@ -179,8 +179,8 @@ def _trunk_rows(
     force = weight[:, None, :, None] * frame[:, :, None, :]
     moment = jnp.cross(lever, jnp.broadcast_to(frame[:, :, None, :], lever.shape))
     bound = station[..., None] == jnp.arange(len(orientation))
-    rows = jnp.einsum("crsi,csn->icrn", jnp.concatenate([force, moment], axis=-1), bound.astype(float))
-    return rows.reshape(6, -1, len(orientation))
+    rows = jnp.einsum("crsi,csn->nicr", jnp.concatenate([force, moment], axis=-1), bound.astype(float))
+    return rows.reshape(len(orientation), 6, -1)
 
 
 def find_contacts(
@@ -214,7 +214,7 @@ def find_contacts(
         frame,
         jnp.asarray(sign)[:, None, None] * jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2),
         jnp.concatenate([jnp.arange(len(corner)), len(corner) + pushing, len(corner) + len(radius) + lying]),
-        jnp.concatenate([jnp.zeros((6, 3 * len(corner), len(position))), rows], axis=1),
+        jnp.concatenate([jnp.zeros((len(position), 6, 3 * len(corner))), rows], axis=2),
     )
 
 

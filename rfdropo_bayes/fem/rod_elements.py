@@ -47,11 +47,19 @@ class Elements(NamedTuple):
     strain: Six  # shear (2), stretch; curvature (2), twist [1/m]
 
 
-class Blocks(NamedTuple):
-    """Symmetric block-tridiagonal matrix over stations; ``lower`` couples row i + 1 to column i."""
+class Stiffness(NamedTuple):
+    """Tangent stiffness of all elements, in blocks of 3 x 3.
 
-    diagonal: Float[Array, "6 6 stations *lanes"]
-    lower: Float[Array, "6 6 elements *lanes"]
+    With translations and rotations of both stations it is [[c, -a], [-a', aa]] at the first, [[c, b], [b', bb]] at the
+    second and [[-c, a], [-b', ba]] between them, rows of the second.
+    """
+
+    c: Matrix
+    a: Matrix
+    b: Matrix
+    aa: Matrix
+    bb: Matrix
+    ba: Matrix
 
 
 def shape(length: Float[Array, "*n"], position: Vector, orientation: Quaternion) -> Elements:
@@ -109,10 +117,10 @@ def station_forces(elements: Elements, resultant: Six) -> Six:
     return jnp.concatenate([first, none], axis=1) + jnp.concatenate([none, second], axis=1)
 
 
-def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> Blocks:
-    """Stiffness over all stations, from the stiffness of the sections: a diagonal, and a diagonal or a matrix."""
+def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> Stiffness:
+    """Stiffness of the elements, from the stiffness of the sections: a diagonal, and a diagonal or a matrix."""
     frame, way = elements.frame, elements.way
-    stiff = product(frame * (stretch / elements.length)[None], transposed(frame))
+    c = product(frame * (stretch / elements.length)[None], transposed(frame))
     turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
     bent = product(turned / elements.length, transposed(frame))
     for _ in range(2):  # W from the left, then, as the matrix is symmetric, from the right
@@ -123,13 +131,6 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> Bl
     bow = _less_turn(elements, times(frame, _bow(elements)))
     arc = frame[:, 2][:, None] * bow[None]
     lever_a, lever_b = turn + fold - arc, turn - fold + arc
-    stiff_a, stiff_b = product(stiff, lever_a), product(stiff, lever_b)
-
-    def block(one: Matrix, two: Matrix, three: Matrix, four: Matrix) -> Array:
-        return jnp.concatenate([jnp.concatenate([one, two], axis=1), jnp.concatenate([three, four], axis=1)])
-
-    first = block(stiff, -stiff_a, -transposed(stiff_a), product(transposed(lever_a), stiff_a) + bent)
-    second = block(stiff, stiff_b, transposed(stiff_b), product(transposed(lever_b), stiff_b) + bent)
-    lower = block(-stiff, stiff_a, -transposed(stiff_b), product(transposed(lever_b), stiff_a) - bent)
-    none = jnp.zeros_like(first[:, :, :1])
-    return Blocks(jnp.concatenate([first, none], axis=2) + jnp.concatenate([none, second], axis=2), lower)
+    a, b = product(c, lever_a), product(c, lever_b)
+    back_a, back_b = transposed(lever_a), transposed(lever_b)
+    return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)

@@ -59,7 +59,7 @@ def cable_wrench(system: System, state: State, tension: Float[Array, " cables"])
     thread = threads(system.cables)
     course = courses(system.cables, thread, state.position.T, rotation(state.orientation.T))
     rows = station_rows(system.cables, thread, course.lever, course.pull, len(state.position))
-    return -jnp.einsum("ics,c->si", rows, tension)
+    return -jnp.einsum("sic,c->si", rows, tension)
 
 
 def _done(system: System, prepared: Prepared, before: State, after: State, begun: StageBegun, length: Scalar) -> _Done:

@@ -20,9 +20,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import rod_elements
-from rfdropo_bayes.fem.blocktridiagonal import Factor, ascend, descend, eliminate
 from rfdropo_bayes.fem.cable_problem import settle_cables
 from rfdropo_bayes.fem.cables import CableLayout, Threads, courses, lengths, station_rows
+from rfdropo_bayes.fem.chain import Chain, Eliminated, Factor, ascend, descend, eliminate
 from rfdropo_bayes.fem.components import (
     Matrix,
     Quaternion,
@@ -39,7 +39,7 @@ from rfdropo_bayes.fem.constraints import Contacts, Problem, Slips, answers, pos
 from rfdropo_bayes.fem.derivatives import pushed_forward
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.lanes import laned
-from rfdropo_bayes.fem.rod_elements import Blocks, Elements, Six
+from rfdropo_bayes.fem.rod_elements import Elements, Six
 from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
 
 
@@ -72,7 +72,7 @@ class Bonds(NamedTuple):
     previous: Float[Array, " cables"]  # impulses that the iterations start from [N s]
     give: Scalar  # of every cable's length per tension [m/N]
     follows: Scalar  # length of the stage for what has a memory [s]
-    rows: Float[Array, "6 others stations"] | None = None  # of friction and contacts
+    rows: Float[Array, "stations 6 others"] | None = None  # of friction and contacts
     base: Float[Array, " others"] | None = None  # velocities in these rows besides the body's
     compliance: Float[Array, "others others"] | None = None  # in these rows besides the body's
     slips: Slips | None = None
@@ -149,74 +149,59 @@ def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
     return result + jnp.concatenate([around, jnp.zeros_like(around)])
 
 
-def matrix(body: StageBody, line: Linearised) -> Blocks:
+def matrix(body: StageBody, line: Linearised) -> Chain:
     """A."""
     scale = body.span * body.lookahead
-    scaled = line.slope._replace(stretch=scale * line.slope.stretch, bending=scale * line.slope.bending)
-    blocks = rod_elements.tangent(line.elements, scaled.stretch, scaled.bending)
+    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, scale * line.slope.bending)
     grown = 1.0 + body.span * body.loss
     straight = jnp.eye(3).reshape(3, 3, *[1] * body.mass.ndim) * (grown * body.mass)
     if body.added is not None:
         straight = straight + body.added
     turning = product(line.frame * (grown * body.inertia)[None], transposed(line.frame))
-    straight, turning = jnp.broadcast_arrays(straight, turning)
-    none = jnp.zeros_like(turning)
-    inertia = jnp.concatenate([jnp.concatenate([straight, none], axis=1), jnp.concatenate([none, turning], axis=1)])
-    return Blocks(blocks.diagonal + inertia, blocks.lower)
+    return Chain(element, straight, turning)
 
 
 def all_rows(way: Way, body: StageBody, bonds: Bonds, frame: Matrix) -> tuple[Array, Array]:
-    """J of all constraints (6, rows, stations), and the lengths of the cables [m]."""
+    """J of all constraints (stations, 6, rows), and the lengths of the cables [m]."""
     course = courses(way.layout, bonds.thread, body.position, frame)
     rows = -station_rows(way.layout, bonds.thread, course.lever, course.pull, body.mass.shape[0])
     if bonds.rows is not None:
-        rows = jnp.concatenate([rows, bonds.rows], axis=1)
+        rows = jnp.concatenate([rows, bonds.rows], axis=2)
     return rows, lengths(course)
 
 
-def along(rows: Float[Array, "6 rows stations *lanes"], twist: Six) -> Float[Array, "rows *lanes"]:
+def along(rows: Float[Array, "stations 6 rows"], twist: Six) -> Float[Array, " rows"]:
     """J times velocities."""
-    products = dot(rows, twist[:, None])
-    return sum((products[:, k] for k in range(1, products.shape[1])), products[:, 0])
+    return jnp.einsum("sir,is->r", rows, twist)
 
 
 def free_velocities(
-    way: Way, body: StageBody, bonds: Bonds, rows: Array, reached: Array
+    way: Way, body: StageBody, bonds: Bonds, moving: Float[Array, "rows *lanes"], reached: Float[Array, "cables *lanes"]
 ) -> Float[Array, "rows *lanes"]:
     """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
     cables = len(reached)
     slack = (bonds.reach - reached) / body.span
-    if bonds.rows is None and way.predicted:
-        return slack
-    moving = along(rows, body.twist)
     free = slack if way.predicted else moving[:cables] + slack
-    return free if bonds.rows is None else jnp.concatenate([free, moving[cables:] + bonds.base])
+    return free if bonds.base is None else jnp.concatenate([free, moving[cables:] + bonds.base])
 
 
-def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Factor, Array, Array, Array]:
-    """Factor, C^-1 times right-hand side and J', compliance of the constraints, and their free velocities; on lanes."""
+def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Eliminated, Float[Array, "rows lanes"]]:
+    """Elimination, and the velocities of the constraints without them; on lanes."""
     line = linearised(body)
-    whole = matrix(body, line)
     rows, reached = all_rows(way, body, bonds, line.frame)
-    parts = line.right[:, None], rows
-    lanes = max(part.shape[-1] for part in (*parts, whole.diagonal))
-    columns = jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:-1], lanes)) for part in parts], axis=1)
-    held = way.held
-    factor, solved, products = eliminate(whole.diagonal[:, :, held:], whole.lower[:, :, held:], columns[:, :, held:])
-    free = free_velocities(way, body, bonds, rows, reached) + products[0, 1:]
-    return factor, solved, products[1:, 1:], free
+    found = eliminate(matrix(body, line), line.right, rows, body.twist, way.held)
+    return found, free_velocities(way, body, bonds, found.moving, reached) + found.reached
 
 
 def _project(factor: Factor, columns: Array, right: Six) -> tuple[Array, Array]:
     """C^-1 times a right-hand side, and J A^-1 times it; on lanes."""
-    solved = descend(factor, jnp.moveaxis(right, 1, 0)[:, :, None])
-    return solved, jnp.sum(solved * columns, axis=(0, 1))
+    return descend(factor, columns, jnp.moveaxis(right, 1, 0))
 
 
 def _finish(factor: Factor, solved: Array, columns: Array, impulse: Array) -> Six:
     """The solution from C^-1 times its right-hand side without impulses; on lanes."""
-    whole = solved + jnp.sum(columns * impulse, axis=2, keepdims=True)
-    return jnp.moveaxis(ascend(factor, whole)[:, :, 0], 0, 1)
+    pulled = sum((columns[:, :, row] * impulse[row] for row in range(columns.shape[2])), solved)
+    return jnp.moveaxis(ascend(factor, pulled), 0, 1)
 
 
 def _padded(free: Six, held: int) -> Six:
@@ -232,15 +217,15 @@ def _problem(bonds: Bonds, span: Scalar, compliance: Array) -> Problem:
 
 
 def _solve(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Kept]:
-    factor, solved, compliance, free = laned(partial(_condense, way))(body, bonds)
-    problem = _problem(bonds, body.span, compliance)
+    eliminated, free = laned(partial(_condense, way))(body, bonds)
+    problem = _problem(bonds, body.span, eliminated.compliance)
     if bonds.rows is None:
         impulse, converged = laned(settle_cables)(problem.compliance, free, problem.softness, bonds.previous)
     else:
         others = [jnp.zeros(len(problem.slips.impulse)), problem.contacts.before.ravel()]
         impulse, converged = settle(problem, free, jnp.concatenate([bonds.previous, *others]))
-    columns = solved[:, :, 1:]
-    change = laned(_finish)(factor, solved[:, :, :1], columns, impulse)
+    factor, columns = eliminated.factor, eliminated.columns
+    change = laned(_finish)(factor, eliminated.solved, columns, impulse)
     slope = slope_matrix(answers(problem, free + problem.compliance @ impulse))
     system = jnp.eye(len(impulse)) + slope @ problem.compliance
     found = Solution(_padded(change, way.held), impulse, jnp.asarray(converged, float))
@@ -251,10 +236,10 @@ def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bond
     """What the equations of a stage lack at a solution, as functions of the inputs."""
     line = linearised(body)
     rows, reached = all_rows(way, body, bonds, line.frame)
-    pulled = jnp.sum(rows * found.impulse[:, None], axis=1)
+    pulled = jnp.einsum("sir,r->is", rows, found.impulse)
     forces = matrix_times(body, line, found.change) - line.right - pulled
     cables = len(bonds.previous)
-    velocity = free_velocities(way, body, bonds, rows, reached) + along(rows, found.change)
+    velocity = free_velocities(way, body, bonds, along(rows, body.twist), reached) + along(rows, found.change)
     velocity = velocity.at[:cables].add(bonds.give / body.span**2 * found.impulse[:cables])
     problem = kept.problem._replace(time_step=bonds.follows)
     if bonds.rows is not None:
