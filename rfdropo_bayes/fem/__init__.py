@@ -1,4 +1,4 @@
-"""Layered finite elements for slender soft bodies: the differentiable reference engine.
+"""Geometrically exact rods for slender soft bodies: the differentiable engine.
 
 Build a ``System`` (body and cables, static), ``prepare`` it with a ``Material`` once a rollout, start from
 ``state_at_rest`` or ``static_equilibrium``, and ``simulate``. Everything after the system is a pure function of arrays.
@@ -23,16 +23,15 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
 )
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
-from rfdropo_bayes.fem.layered import (  # noqa: E402
-    LayeredBody,
+from rfdropo_bayes.fem.points import point_positions, spread_forces  # noqa: E402
+from rfdropo_bayes.fem.rod import (  # noqa: E402
     PointMap,
+    Rod,
     attach,
-    point_positions,
-    profile_body,
-    rest_positions,
+    profile_rod,
+    refined,
     solid_torsion_constant,
-    spread_forces,
-    uniform_body,
+    uniform_rod,
 )
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
 
@@ -40,10 +39,10 @@ __all__ = [
     "BendingLaw",
     "BodyEffects",
     "CableLayout",
-    "LayeredBody",
     "Material",
     "PointMap",
     "Prepared",
+    "Rod",
     "State",
     "System",
     "Viscoelasticity",
@@ -54,14 +53,14 @@ __all__ = [
     "material",
     "point_positions",
     "prepare",
-    "profile_body",
-    "rest_positions",
+    "profile_rod",
+    "refined",
     "simulate",
     "solid_torsion_constant",
     "spread_forces",
     "state_at_rest",
     "static_equilibrium",
     "step",
-    "uniform_body",
+    "uniform_rod",
     "without_cables",
 ]

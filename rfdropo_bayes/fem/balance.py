@@ -1,38 +1,32 @@
 """What a rollout did to its surroundings: the force of the clamp, contact forces, energies, work and losses.
 
-All of it follows from the states of a rollout, whatever engine computed them: the equation of motion of a step
-(``fem.dynamics``, ``fem.tetrahedral_dynamics``) holds exactly on the free nodes once contacts are added to it, and what
-it leaves on the held nodes is the clamp. Nothing is solved again.
+The equation of motion of a step holds exactly on what is free once contacts are added to it, and what it leaves on the
+held part is the clamp. For a mesh all of it follows from the states of a rollout, and nothing is solved again; a rod is
+simulated again (``stage_balance``).
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import corotational
-from rfdropo_bayes.fem.bending_law import potential
-from rfdropo_bayes.fem.blocktridiagonal import multiply
-from rfdropo_bayes.fem.cables import CableLayout, lengths_and_jacobian
-from rfdropo_bayes.fem.dynamics import (
-    Prepared,
-    State,
-    System,
-    frames_and_displacements,
-    linearised,
-    mass_times,
-    remembering,
-    resistance,
-    within,
-)
+from rfdropo_bayes.fem import sections
+from rfdropo_bayes.fem.dynamics import Prepared, State, System, momentum, strains, twist_of
 from rfdropo_bayes.fem.effects import BodyEffects, Scalar
-from rfdropo_bayes.fem.tetrahedra import elastic_energy, element_rotations, lame_constants, nodal_force
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
+from rfdropo_bayes.fem.mesh_points import cable_force
+from rfdropo_bayes.fem.tetrahedra import (
+    TetrahedralMaterial,
+    TetrahedralSystem,
+    elastic_energy,
+    element_rotations,
+    lame_constants,
+    nodal_force,
+)
 
 
 class Energies(NamedTuple):
@@ -44,15 +38,12 @@ class Energies(NamedTuple):
 
 
 def energies(system: System, prepared: Prepared, state: State) -> Energies:
-    """Kinetic energy v'Mv/2, elastic energy d'Kd/2 in the layers' frames with that of a bending law, and gravity's
-    -x'Mg. What a Prony branch, a wall and stretched cables hold is left out, and softening too."""
-    _, local = frames_and_displacements(system, prepared, state.position)
-    elastic = 0.5 * jnp.einsum("li,lij,lj->", local, prepared.stiffness, local)
-    if prepared.effects.bending is not None and prepared.sections is not None:
-        elastic = elastic + potential(prepared.effects.bending, prepared.sections, local)
+    """Kinetic energy with that of the sections' spin, elastic energy of the sections, and gravity's. What a Prony branch,
+    a wall and stretched cables hold is left out, and softening too."""
+    twist, length = twist_of(state), jnp.asarray(np.diff(system.body.station))
     return Energies(
-        kinetic=0.5 * jnp.sum(state.velocity * mass_times(system, prepared, state.velocity)),
-        elastic=elastic,
+        kinetic=0.5 * jnp.sum(twist * momentum(prepared, state, twist)),
+        elastic=jnp.sum(length * sections.energy(prepared.section, strains(system, state).T)),
         gravitational=-jnp.sum(prepared.weight * state.position),
     )
 
@@ -108,17 +99,6 @@ def check_effects(effects: BodyEffects) -> None:
             )
 
 
-def cable_force(
-    layout: CableLayout,
-    guides: Float[Array, "cables guides nodes"],
-    position: Float[Array, "nodes 3"],
-    tension: Float[Array, " cables"],
-) -> Float[Array, "nodes 3"]:
-    """Forces of the cables on the nodes [N]."""
-    jacobian = lengths_and_jacobian(layout, guides, position)[1]
-    return -jnp.einsum("cni,c->ni", jacobian, tension)
-
-
 def _gathered(
     held: Bool[Array, " nodes"],
     position: Float[Array, "rows nodes 3"],
@@ -148,56 +128,9 @@ def _gathered(
     )
 
 
-def _velocities(
-    position: Float[Array, "rows nodes 3"], start: Float[Array, "nodes 3"] | float, time_step: Scalar
-) -> Float[Array, "rows nodes 3"]:
-    """Implicit Euler moves x by h v: velocities follow from positions, but for the first."""
-    first = jnp.broadcast_to(jnp.asarray(start, float), position.shape[1:])
-    return jnp.concatenate([first[None], jnp.diff(position, axis=0) / time_step])
-
-
-def layered_balance(
-    system: System,
-    prepared: Prepared,
-    position: Float[Array, "rows nodes 3"],
-    tension: Float[Array, "rows cables"],
-    time_step: Scalar,
-    velocity: Float[Array, "nodes 3"] | float = 0.0,
-) -> Balance:
-    """Forces and energies of a rollout of a layered body, recorded after every step.
-
-    Args:
-        position: of all nodes [m]; row 0 is the initial state, in which the body has ``velocity`` [m/s].
-        tension: of the cables [N], of the step that leads to each row.
-
-    Raises:
-        InputError: cables with friction.
-    """
-    check_effects(prepared.effects)
-    velocities = _velocities(position, velocity, time_step)
-    stations = len(system.body.station)
-
-    def one(state: State, reached: tuple[Array, Array, Array]) -> tuple[State, _Step]:
-        after, moving, pulling = reached
-        memory = within(system, prepared, state, time_step)
-        linear = linearised(system, prepared, state._replace(memory=memory), time_step)
-        change = (moving - state.velocity).reshape(stations, -1, 1)
-        cable = cable_force(system.cables, prepared.guides, state.position, pulling)
-        residual = (multiply(linear.matrix, change).reshape(-1, 3) - linear.right) / time_step - cable
-        frame, local = frames_and_displacements(system, prepared, state.position)
-        tangent = corotational.tangent(resistance(prepared, local)[1], frame)
-        strained = multiply(tangent, moving.reshape(stations, -1, 1)).reshape(-1, 3)
-        dragged = prepared.rayleigh_mass * mass_times(system, prepared, moving)
-        damping = jnp.sum(moving * (dragged + prepared.rayleigh_stiffness * strained))
-        return State(after, moving, pulling, memory), _Step(residual, jnp.sum(cable * moving), damping)
-
-    first = remembering(system, prepared, State(position[0], velocities[0], tension[0]))
-    begin = one(first, (position[0], velocities[0], tension[0]))[1]
-    later = lax.scan(one, first, (position[1:], velocities[1:], tension[1:]))[1]
-    steps = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), begin, later)
-    stored = jax.vmap(lambda x, v, t: energies(system, prepared, State(x, v, t)))(position, velocities, tension)
-    held = jnp.arange(position.shape[1]) < system.clamped_stations * system.body.section_nodes
-    return _gathered(held, position, velocities, steps, stored, time_step)
+def _velocities(position: Float[Array, "rows nodes 3"], time_step: Scalar) -> Float[Array, "rows nodes 3"]:
+    """Implicit Euler moves x by h v: velocities follow from positions, after a start at rest."""
+    return jnp.concatenate([jnp.zeros_like(position[:1]), jnp.diff(position, axis=0) / time_step])
 
 
 def tetrahedral_balance(
@@ -209,16 +142,15 @@ def tetrahedral_balance(
 ) -> Balance:
     """Forces and energies of a rollout of a tetrahedral body from rest; arguments as `layered_balance`."""
     body, mass = system.body, material.node_mass[:, None]
-    velocities = _velocities(position, 0.0, time_step)
+    velocities = _velocities(position, time_step)
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
-    guides = jnp.asarray(system.guides)
 
     def one(_: None, at: tuple[Array, ...]) -> tuple[None, tuple[_Step, Energies]]:
         before, slower, after, moving, pulling = at
         turn = element_rotations(body, before)
         viscous = nodal_force(body, turn, moving, 0.0, lame)
-        cable = cable_force(system.cables, guides, before, pulling)
+        cable = cable_force(system.cables, before, pulling)
         inertia = mass * ((moving - slower) / time_step - material.gravity + material.rayleigh_mass * moving)
         lookahead = time_step + material.rayleigh_stiffness
         elastic = nodal_force(body, turn, before, jnp.asarray(body.rest), lame) + lookahead * viscous

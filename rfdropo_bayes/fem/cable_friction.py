@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rfdropo_bayes.fem.cables import CableLayout, segments
+from rfdropo_bayes.fem.cables import CableLayout, courses, patterns, threads
+from rfdropo_bayes.fem.components import dot, rotation
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 
 RUNS = 4
@@ -35,9 +36,9 @@ STRAIGHT = 1e-6
 
 
 class Slip(NamedTuple):
-    """Friction of one step before its size is known; runs of every kind and cable, flattened."""
+    """Friction of one step before its size is known; runs of every kind and cable."""
 
-    pattern: Float[Array, "runs nodes 3"]  # minus the slip's derivative by the node positions
+    weight: Float[Array, "kinds cables cable_runs guides"]  # of the segment in front of each guide in the run's slip
     strength: Float[Array, " runs"]  # friction force [N] if all of it is mobilised
     drop: Float[Array, "kinds cables guides"]  # the same at each guide
     mobilised: Float[Array, " runs"]  # z at the start of the step
@@ -45,18 +46,18 @@ class Slip(NamedTuple):
 
 def run_members(layout: CableLayout) -> Bool[np.ndarray, "cables cable_runs guides"]:
     """Which guides belong to which run of their cable; the last guide of a cable, where it is tied, to none."""
-    cables, guides = layout.guide_used.shape
+    cables, guides = layout.used.shape
     members = np.zeros((cables, RUNS, guides), dtype=bool)
-    for cable, used in enumerate(layout.guide_used):
+    for cable, used in enumerate(layout.used):
         for run, part in enumerate(np.array_split(np.arange(int(used.sum()) - 1), RUNS)):
             members[cable, run, part] = True
     return members
 
 
-def wrap_angles(direction: Float[Array, "cables guides 3"]) -> Float[Array, "cables guides"]:
+def wrap_angles(direction: Float[Array, "3 cables guides"]) -> Float[Array, "cables guides"]:
     """Angle [rad] by which a cable turns at each guide; meaningless at its last. 3e-5 short at 60 degrees."""
-    following = jnp.concatenate([direction[:, 1:], direction[:, -1:]], axis=1)
-    square = jnp.sum((following - direction) ** 2, axis=-1) + STRAIGHT**2
+    change = jnp.concatenate([direction[:, :, 1:], direction[:, :, -1:]], axis=2) - direction
+    square = dot(change, change) + STRAIGHT**2
     series = 1.0 + square * (1 / 24 + square * (3 / 640 + square * (5 / 7168 + square * 35 / 294912)))
     return jnp.sqrt(square) * series
 
@@ -66,7 +67,7 @@ def start_slip(layout: CableLayout, effects: BodyEffects, tension: Float[Array, 
     kinds = len(_coefficients(effects))
     if not kinds:
         return Memory()
-    cables, guides = layout.guide_used.shape
+    cables, guides = layout.used.shape
     return Memory(slip=jnp.zeros((kinds, cables, RUNS)), segment=jnp.repeat(tension[:, None], guides, axis=1))
 
 
@@ -79,34 +80,45 @@ def slip_problem(
     effects: BodyEffects,
     mobilised: Float[Array, "kinds cables cable_runs"],
     segment: Float[Array, "cables guides"],
-    guides: Float[Array, "cables guides nodes"],
-    position: Float[Array, "nodes 3"],
+    position: Float[Array, "stations 3"],
+    orientation: Float[Array, "stations 4"],
 ) -> Slip:
     """Friction of a step from the shape at its start, the friction mobilised then, and the tension in front of every
     guide [N]."""
     members = run_members(layout)
-    direction = segments(layout, guides, position)[1]
     middle = 0.5 * (segment + jnp.concatenate([segment[:, 1:], segment[:, -1:]], axis=1)) + SLACK
     weights = []
     if effects.coulomb_friction is not None:
         weights.append(middle / (middle + FADING))
     if effects.capstan_friction is not None:
-        weights.append(middle * wrap_angles(direction))
+        course = courses(layout, threads(layout), position.T, rotation(orientation.T))
+        weights.append(middle * wrap_angles(course.direction))
     weight = jnp.stack(weights)[:, :, None, :] * members
     whole = jnp.sum(weight, axis=-1)
     share = weight / jnp.where(whole > 0.0, whole, 1.0)[..., None]
-    beyond = jnp.cumsum(share, axis=-1)
-    following = jnp.concatenate([direction[:, 1:], jnp.zeros_like(direction[:, :1])], axis=1)
-    pull = (beyond - share)[..., None] * direction[:, None] - beyond[..., None] * following[:, None]
-    pull = pull * layout.guide_used[:, None, :, None]
-    pattern = jnp.einsum("cgn,kcrgi->kcrni", guides, pull)
     coefficient = jnp.stack([jnp.asarray(value, dtype=float) for value in _coefficients(effects)])
     return Slip(
-        pattern=pattern.reshape(-1, *pattern.shape[-2:]),
+        weight=(jnp.cumsum(share, axis=-1) - share) * layout.used[:, None],
         strength=(coefficient[:, None, None] * whole).ravel(),
         drop=coefficient[:, None, None] * jnp.sum(weight, axis=2),
         mobilised=mobilised.ravel(),
     )
+
+
+def slip_rows(
+    layout: CableLayout, slip: Slip, position: Float[Array, "stations 3"], orientation: Float[Array, "stations 4"]
+) -> tuple[Float[Array, "stations 6 runs"], Float[Array, " runs"]]:
+    """Minus the derivatives of the runs' slip by the motion of the stations, and lengths [m] that grow as they do."""
+    thread = threads(layout)
+    course = courses(layout, thread, position.T, rotation(orientation.T))
+    kinds, cables, runs, guides = slip.weight.shape
+    # (kinds and runs, cables, guides): every run is a line of guides of its cable.
+    weight = jnp.swapaxes(slip.weight, 1, 2).reshape(-1, cables, guides)
+    weighted = weight * course.direction[:, None]
+    pull = weighted - jnp.concatenate([weighted[..., 1:], jnp.zeros_like(weighted[..., :1])], axis=-1)
+    rows = patterns(layout, thread, course.lever, pull, len(position)).reshape(len(position), 6, kinds, runs, cables)
+    length = jnp.sum(slip.weight * course.length[:, None], axis=-1)
+    return jnp.swapaxes(rows, 3, 4).reshape(len(position), 6, -1), length.ravel()
 
 
 def slipped(

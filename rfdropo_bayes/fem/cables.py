@@ -1,4 +1,4 @@
-"""Displacement-driven cables that can pull but not push.
+"""Displacement-driven cables that can pull but not push, through guides on the sections of a rod.
 
 A cable runs straight from a fixed anchor through guide points of the body to the last of them, where it is tied. Its
 length may not exceed the commanded one; tension and slack are complementary (Signorini's condition, which
@@ -7,41 +7,50 @@ length may not exceed the commanded one; tension and slack are complementary (Si
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.layered import LayeredBody, PointMap, attach
+from rfdropo_bayes.fem.components import Matrix, Vector, cross, dot, times
+from rfdropo_bayes.fem.rod import Rod, attach
 
 
 class CableLayout(NamedTuple):
-    """Cables of a body; rows of unused guides repeat the last used one. NumPy arrays, fixed for a simulation."""
+    """Cables of a rod; rows of unused guides repeat the last used one. NumPy arrays, fixed for a simulation."""
 
     anchor: Float[np.ndarray, "cables 3"]  # fixed in space [m]
-    guide_node: Int[np.ndarray, "cables guides 8"]
-    guide_weight: Float[np.ndarray, "cables guides 8"]
-    guide_used: Bool[np.ndarray, "cables guides"]
+    station: Int[np.ndarray, "cables guides 2"]  # of a guide, as in ``rod.PointMap``
+    weight: Float[np.ndarray, "cables guides 2"]
+    arm: Float[np.ndarray, "cables guides 2 3"]  # [m]
+    used: Bool[np.ndarray, "cables guides"]
 
 
 def cable_layout(
-    body: LayeredBody, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
+    body: Rod, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
 ) -> CableLayout:
-    """Cables of a layered body; see `routed`."""
-    return routed(partial(attach, body), anchors, guides)
+    """Cables from fixed anchors through guide points of the undeformed body [m]; each may have its own number of
+    guides.
+
+    Raises:
+        InputError: a cable without guides, or with two successive points at the same place.
+    """
+    anchors, points, used = routed(anchors, guides)
+    bound = attach(body, points.reshape(-1, 3))
+    station, weight, arm = (part.reshape(*used.shape, *part.shape[1:]) for part in bound)
+    return CableLayout(anchors, station, weight, arm, used)
 
 
 def routed(
-    bind: Callable[[Float[np.ndarray, "guides 3"]], PointMap],
-    anchors: Float[np.ndarray, "cables 3"],
-    guides: Sequence[Float[np.ndarray, "guides 3"]],
-) -> CableLayout:
-    """Cables from fixed anchors through guide points of the undeformed body [m]; each may have its own number of
-    guides. ``bind`` ties points to the body's nodes.
+    anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
+) -> tuple[Float[np.ndarray, "cables 3"], Float[np.ndarray, "cables guides 3"], Bool[np.ndarray, "cables guides"]]:
+    """Anchors and guides of cables [m] as arrays, the last guide of a cable repeated, and which guides are used.
 
     Raises:
         InputError: a cable without guides, or with two successive points at the same place.
@@ -50,8 +59,7 @@ def routed(
     if len(anchors) != len(guides):
         raise InputError(f"{len(anchors)} anchors but {len(guides)} lists of guides", where="cables")
     most = max((len(points) for points in guides), default=1)
-    nodes, weights = np.zeros((len(guides), most, 8), dtype=int), np.zeros((len(guides), most, 8))
-    used = np.zeros((len(guides), most), dtype=bool)
+    padded, used = np.zeros((len(guides), most, 3)), np.zeros((len(guides), most), dtype=bool)
     for cable, points in enumerate(guides):
         points = np.asarray(points, dtype=float).reshape(-1, 3)
         if len(points) == 0:
@@ -59,46 +67,156 @@ def routed(
         steps = np.linalg.norm(np.diff(np.concatenate([anchors[cable : cable + 1], points]), axis=0), axis=1)
         if not np.all(steps > 1e-9):
             raise InputError("two successive points coincide", where=f"cable {cable}", remedy="remove one of them")
-        nodes[cable], weights[cable] = bind(
-            np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)])
-        )
+        padded[cable] = np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)])
         used[cable, : len(points)] = True
-    return CableLayout(anchors, nodes, weights, used)
+    return anchors, padded, used
 
 
-def routes(layout: CableLayout, rest: Float[np.ndarray, "nodes 3"]) -> list[Float[np.ndarray, "points 3"]]:
-    """Anchor and guides of every cable, with the nodes here [m]."""
-    parts = zip(*layout, strict=True)
-    return [
-        np.vstack([anchor, np.einsum("gk,gki->gi", weight, rest[node])[used]]) for anchor, node, weight, used in parts
-    ]
+def routes(layout: CableLayout, body: Rod) -> list[Float[np.ndarray, "points 3"]]:
+    """Anchor and guides of every cable on the undeformed body [m]."""
+    height = np.einsum("cgs,cgs->cg", layout.weight, body.station[layout.station])
+    place = layout.arm.sum(axis=2) + height[..., None] * [0.0, 0.0, 1.0]
+    return [np.vstack([anchor, points[used]]) for anchor, points, used in zip(layout.anchor, place, layout.used)]
 
 
-def guide_matrix(layout: CableLayout, nodes: int) -> Float[np.ndarray, "cables guides nodes"]:
-    """Weights that turn node positions into guide positions: dense, because small products beat gathers in a batch."""
-    cables, guides, _ = layout.guide_node.shape
-    matrix = np.zeros((cables, guides, nodes))
-    rows, columns = np.indices((cables, guides))
-    np.add.at(matrix, (rows[..., None], columns[..., None], layout.guide_node), layout.guide_weight)
-    return matrix
+class Threads(NamedTuple):
+    """The numbers of a layout, components first."""
+
+    anchor: Float[Array, "3 cables *lanes"]
+    weight: Float[Array, "cables guides sides *lanes"]
+    arm: Float[Array, "3 cables guides sides *lanes"]
 
 
-def segments(
-    layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
-) -> tuple[Float[Array, "cables guides 1"], Float[Array, "cables guides 3"]]:
-    """Distance [m] from the point before to each guide, and the unit vector; zero where unused."""
-    guided = jnp.einsum("cgn,ni->cgi", guides, position)
-    points = jnp.concatenate([jnp.asarray(layout.anchor)[:, None, :], guided], axis=1)
-    used = layout.guide_used[..., None]
-    segment = jnp.where(used, points[:, 1:] - points[:, :-1], np.array([1.0, 0.0, 0.0]))
-    length = jnp.sqrt(jnp.sum(segment**2, axis=-1, keepdims=True))
-    return jnp.where(used, length, 0.0), jnp.where(used, segment / length, 0.0)
+class Courses(NamedTuple):
+    """Where cables run."""
+
+    length: Float[Array, "cables guides *lanes"]  # from the point before to each guide [m]; zero where unused
+    direction: Float[Array, "3 cables guides *lanes"]  # unit vectors, zero where unused
+    lever: Float[Array, "3 cables guides sides *lanes"]  # of the guides, in space [m]
+
+    @property
+    def pull(self) -> Float[Array, "3 cables guides *lanes"]:
+        """Derivatives of the cables' lengths by the guides' places."""
+        return self.direction - jnp.concatenate(
+            [self.direction[:, :, 1:], jnp.zeros_like(self.direction[:, :, :1])], axis=2
+        )
 
 
-def lengths_and_jacobian(
-    layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
-) -> tuple[Float[Array, " cables"], Float[Array, "cables nodes 3"]]:
-    """Cable lengths [m] and their derivatives with respect to the node positions."""
-    length, direction = segments(layout, guides, position)
-    pull = direction - jnp.concatenate([direction[:, 1:], jnp.zeros_like(direction[:, :1])], axis=1)
-    return jnp.sum(length, axis=(1, 2)), jnp.einsum("cgn,cgi->cni", guides, pull)
+def _sides(layout: CableLayout) -> int:
+    """Stations that a guide is bound to at most."""
+    second = layout.weight[..., 1:].any() or layout.arm[..., 1:, :].any()
+    return 2 if second else 1
+
+
+def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"]:
+    """Stations of the guides. Cables that share those of their guides, which most do, are told by a first axis of one:
+    then fewer parts are gathered."""
+    station = layout.station[:, :, : _sides(layout)]
+    if not len(station):
+        return station
+    longest = np.argmax(layout.used.sum(axis=1))
+    same = (station == station[longest]).all(axis=-1) | ~layout.used
+    return station[longest : longest + 1] if same.all() else station
+
+
+def _gathered(values: Float[Array, "k n *lanes"], index: Int[np.ndarray, " m"]) -> Float[Array, "m k *lanes"]:
+    """Parts of the second axis, which becomes the first.
+
+    On lanes a loop copies long rows. Without, a product with ones and zeros is quick in both modes of differentiation.
+    """
+    if values.ndim == 2:
+        return (index[:, None] == np.arange(values.shape[1])).astype(float) @ values.T
+    return lax.map(lambda place: lax.dynamic_index_in_dim(values, place, 1, keepdims=False), index)
+
+
+def threads(layout: CableLayout) -> Threads:
+    """The numbers of a layout, as arguments of ``courses`` and ``station_rows``."""
+    sides = _sides(layout)
+    arm = np.moveaxis(layout.arm[:, :, :sides], -1, 0)
+    return Threads(jnp.asarray(layout.anchor.T), jnp.asarray(layout.weight[:, :, :sides]), jnp.asarray(arm))
+
+
+def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matrix) -> Courses:
+    """Where the cables run, from the places and frames of the stations."""
+    index, lanes = _stations(layout), position.shape[2:]
+    parts = _gathered(jnp.concatenate([position, frame.reshape(9, *frame.shape[2:])]), index.ravel())
+    parts = jnp.moveaxis(parts, 0, 1).reshape(12, *index.shape, *lanes)
+    here, turn = parts[:3], parts[3:].reshape(3, 3, *index.shape, *lanes)
+    lever = times(turn, thread.arm)
+    bound = thread.weight * here + lever
+    place = sum((bound[:, :, :, side] for side in range(1, bound.shape[3])), bound[:, :, :, 0])
+    anchor = jnp.broadcast_to(thread.anchor[:, :, None], (*place.shape[:2], 1, *place.shape[3:]))
+    points = jnp.concatenate([anchor, place], axis=2)
+    used = layout.used.reshape(*layout.used.shape, *[1] * (place.ndim - 3))
+    unit = np.array([1.0, 0.0, 0.0]).reshape(3, *[1] * (place.ndim - 1))
+    segment = jnp.where(used, points[:, :, 1:] - points[:, :, :-1], unit)
+    length = jnp.sqrt(dot(segment, segment))
+    return Courses(jnp.where(used, length, 0.0), jnp.where(used, segment / length, 0.0), lever)
+
+
+def _entries(station: Int[np.ndarray, " bound"], used: Bool[np.ndarray, " bound"], stations: int) -> np.ndarray:
+    """For every station the places in a list of guides' sides that are there, in rows; one past the last for none."""
+    found = [np.flatnonzero(used & (station == number)) for number in range(stations)]
+    most = max((len(places) for places in found), default=0) or 1
+    return np.stack([np.pad(places, (0, most - len(places)), constant_values=len(station)) for places in found], axis=1)
+
+
+def station_rows(
+    layout: CableLayout,
+    thread: Threads,
+    lever: Float[Array, "3 cables guides sides *lanes"],
+    pull: Float[Array, "3 cables guides *lanes"],
+    stations: int,
+) -> Float[Array, "stations 6 cables *lanes"]:
+    """Forces and moments on the stations of one pull at every guide, for every cable."""
+    pulled = jnp.broadcast_to(pull[:, :, :, None], lever.shape)
+    parts = jnp.concatenate([thread.weight * pulled, cross(lever, pulled)])
+    cables, lanes = lever.shape[1], lever.shape[4:]
+    index, bound = (
+        _stations(layout),
+        ((layout.weight != 0.0) | (layout.arm != 0.0).any(axis=-1))[:, :, : lever.shape[3]],
+    )
+    if len(index) == cables:  # every cable has its own
+        rows = [
+            _at_stations(parts[:, cable], index[cable], bound[cable] & layout.used[cable, :, None], stations)
+            for cable in range(cables)
+        ]
+        return jnp.stack(rows, axis=2) if rows else jnp.zeros((stations, 6, 0, *lanes))
+    rows = parts.reshape(6 * cables, *parts.shape[2:])
+    return _at_stations(rows, index[0], bound.any(axis=0), stations).reshape(stations, 6, cables, *lanes)
+
+
+def _at_stations(
+    parts: Float[Array, "k guides sides *lanes"],
+    station: Int[np.ndarray, "guides sides"],
+    bound: Bool[np.ndarray, "guides sides"],
+    stations: int,
+) -> Float[Array, "stations k *lanes"]:
+    """Sums over what is bound to each station."""
+    flat = parts.reshape(len(parts), -1, *parts.shape[3:])
+    flat = jnp.concatenate([flat, jnp.zeros_like(flat[:, :1])], axis=1)
+    index = _entries(station.ravel(), bound.ravel(), stations)
+    return sum((_gathered(flat, places) for places in index[1:]), _gathered(flat, index[0]))
+
+
+def lengths(course: Courses) -> Float[Array, "cables *lanes"]:
+    """Lengths of the cables [m]."""
+    parts = course.length
+    return sum((parts[:, k] for k in range(1, parts.shape[1])), parts[:, 0])
+
+
+def rest_lengths(layout: CableLayout, body: Rod) -> Float[np.ndarray, " cables"]:
+    """Lengths of the cables on the undeformed body [m]."""
+    ways = (np.diff(route, axis=0) for route in routes(layout, body))
+    return np.array([np.linalg.norm(way, axis=1).sum() for way in ways])
+
+
+def patterns(
+    layout: CableLayout,
+    thread: Threads,
+    lever: Float[Array, "3 cables guides sides"],
+    pulls: Float[Array, "3 many cables guides"],
+    stations: int,
+) -> Float[Array, "stations 6 many cables"]:
+    """``station_rows`` of many pulls."""
+    return jax.vmap(partial(station_rows, layout, thread, lever, stations=stations), 1, 2)(pulls)

@@ -19,6 +19,7 @@ import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -75,7 +76,20 @@ class Impulses(NamedTuple):
         return jnp.concatenate([self.cable, self.slip, self.contact.ravel()])
 
 
-class _Law(NamedTuple):
+class Problem(NamedTuple):
+    """Everything but the free velocities."""
+
+    compliance: Float[Array, "n n"]  # W
+    softness: Float[Array, " cables"]  # R; infinite for a cable that nothing can shorten
+    slips: Slips
+    contacts: Contacts
+    normal: Float[Array, " contacts"]  # R
+    tangent: Float[Array, " contacts"]
+    rigid: Bool[Array, " contacts"]  # of parts that cannot move: they exert nothing
+    time_step: Scalar
+
+
+class Law(NamedTuple):
     """P at a velocity, and minus its derivative G."""
 
     impulse: Float[Array, " n"]
@@ -83,21 +97,11 @@ class _Law(NamedTuple):
     block: Float[Array, "contacts 3 3"]
 
 
-class _Problem(NamedTuple):
-    compliance: Float[Array, "n n"]
-    free: Float[Array, " n"]
-    softness: Float[Array, " cables"]  # R; infinite for a cable that nothing can shorten
-    slips: Slips
-    contacts: Contacts
-    normal: Float[Array, " contacts"]  # R
-    tangent: Float[Array, " contacts"]
-    time_step: Scalar
-
-
-def _contact_law(problem: _Problem, velocity: Float[Array, "contacts 3"]) -> tuple[Array, Array]:
+def _contact_law(problem: Problem, velocity: Float[Array, "contacts 3"]) -> tuple[Array, Array]:
     """Impulses of contacts at a relative velocity, and minus their derivatives."""
     friction, normal, tangent = problem.contacts.friction, problem.normal, problem.tangent
-    y = (-problem.contacts.opening - velocity[:, 0]) / normal
+    opening = jnp.where(problem.rigid, APART, problem.contacts.opening)
+    y = (-opening - velocity[:, 0]) / normal
     x = problem.contacts.before[:, 1:] - velocity[:, 1:] / tangent[:, None]
     square = jnp.sum(x**2, axis=1)
     moving = square > 0.0
@@ -122,7 +126,7 @@ def _contact_law(problem: _Problem, velocity: Float[Array, "contacts 3"]) -> tup
     return impulse, block
 
 
-def _law(problem: _Problem, velocity: Float[Array, " n"]) -> _Law:
+def answers(problem: Problem, velocity: Float[Array, " n"]) -> Law:
     """What every row answers to its velocity."""
     cables, runs = len(problem.softness), len(problem.slips.impulse)
     firmness = jnp.where(velocity[:cables] < 0.0, 1.0 / problem.softness, 0.0)
@@ -132,10 +136,10 @@ def _law(problem: _Problem, velocity: Float[Array, " n"]) -> _Law:
     rubbing = jnp.where(jnp.abs(trial) < 1.0, follows * problem.slips.impulse, 0.0)
     impulse, block = _contact_law(problem, velocity[cables + runs :].reshape(-1, 3))
     lines = jnp.concatenate([-firmness * velocity[:cables], problem.slips.impulse * share])
-    return _Law(jnp.concatenate([lines, impulse.ravel()]), jnp.concatenate([firmness, rubbing]), block)
+    return Law(jnp.concatenate([lines, impulse.ravel()]), jnp.concatenate([firmness, rubbing]), block)
 
 
-def _newton_step(problem: _Problem, law: _Law, impulse: Float[Array, " n"]) -> Float[Array, " n"]:
+def _newton_step(problem: Problem, law: Law, impulse: Float[Array, " n"]) -> Float[Array, " n"]:
     """d of (I + G W) d = P - g."""
     lines = len(law.line)
     top = law.line[:, None] * problem.compliance[:lines]
@@ -144,18 +148,29 @@ def _newton_step(problem: _Problem, law: _Law, impulse: Float[Array, " n"]) -> F
     return jnp.linalg.solve(matrix, law.impulse - impulse)
 
 
-def _iterate(problem: _Problem, start: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+def slope_matrix(law: Law) -> Float[Array, "n n"]:
+    """G of all rows."""
+    lines, contacts = len(law.line), len(law.block)
+    whole = jnp.zeros((lines + 3 * contacts, lines + 3 * contacts))
+    whole = whole.at[jnp.arange(lines), jnp.arange(lines)].set(law.line)
+    place = lines + 3 * np.arange(contacts)[:, None] + np.arange(3)
+    return whole.at[place[:, :, None], place[:, None, :]].set(law.block)
+
+
+def settle(
+    problem: Problem, free: Float[Array, " n"], start: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """Impulses from any start, and whether the iterations ended in time."""
-    compliance, free = problem.compliance, problem.free
+    compliance = problem.compliance
 
     def one(carry):
         impulse, _, iteration = carry
         velocity = free + compliance @ impulse
-        change = _newton_step(problem, _law(problem, velocity), impulse)
+        change = _newton_step(problem, answers(problem, velocity), impulse)
         moving = compliance @ change
 
         def slope(share):
-            wanted = _law(problem, velocity + share * moving).impulse
+            wanted = answers(problem, velocity + share * moving).impulse
             return moving @ (impulse + share * change - wanted)
 
         def halve(_, bounds):
@@ -172,6 +187,26 @@ def _iterate(problem: _Problem, start: Float[Array, " n"]) -> tuple[Float[Array,
 
     impulse, going, _ = lax.while_loop(lambda c: c[1] & (c[2] < ITERATIONS), one, (start, jnp.array(True), 0))
     return impulse, ~going
+
+
+def posed(
+    compliance: Float[Array, "n n"],
+    cables: int,
+    time_step: Scalar,
+    slips: Slips | None = None,
+    contacts: Contacts | None = None,
+) -> Problem:
+    """The problem with the softness of its rows."""
+    slips = slips or Slips(jnp.zeros(0), jnp.zeros(0))
+    contacts = contacts or Contacts(jnp.zeros(0), 0.0, jnp.zeros((0, 3)))
+    diagonal = jnp.diagonal(compliance)
+    drives, mean = diagonal[:cables], jnp.mean(diagonal[cables + len(slips.impulse) :].reshape(-1, 3), axis=1)
+    usable = drives > RIGID * jnp.max(drives, initial=0.0)
+    rigid = mean <= RIGID * jnp.max(mean, initial=0.0)
+    mean = jnp.where(rigid, 1.0, mean)
+    softness = jnp.where(usable, CABLE_SOFTNESS * drives, jnp.inf)
+    normal, tangent = NORMAL_SOFTNESS * mean, TANGENT_SOFTNESS * mean
+    return Problem(compliance, softness, slips, contacts, normal, tangent, rigid, time_step)
 
 
 def solve_constraints(
@@ -196,27 +231,18 @@ def solve_constraints(
         time_step: h [s].
         give: of every cable's length per tension, over the time step squared [1/kg].
     """
-    slips = slips or Slips(jnp.zeros(0), jnp.zeros(0))
-    contacts = contacts or Contacts(jnp.zeros(0), 0.0, jnp.zeros((0, 3)))
-    cables, runs = len(previous), len(slips.impulse)
+    cables = len(previous)
+    compliance = compliance.at[jnp.arange(cables), jnp.arange(cables)].add(give)
+    problem = posed(compliance, cables, time_step, slips, contacts)
+    slips, contacts = problem.slips, problem.contacts
+    runs = len(slips.impulse)
     if not len(free):
         return Impulses(previous, slips.mobilised, slips.impulse, jnp.zeros((0, 3)), jnp.array(True))
-    compliance = compliance.at[jnp.arange(cables), jnp.arange(cables)].add(give)
-    diagonal = jnp.diagonal(compliance)
-    drives, mean = diagonal[:cables], jnp.mean(diagonal[cables + runs :].reshape(-1, 3), axis=1)
-    usable = drives > RIGID * jnp.max(drives, initial=0.0)
-    stiff = mean <= RIGID * jnp.max(mean, initial=0.0)
-    mean = jnp.where(stiff, 1.0, mean)
-    contacts = contacts._replace(opening=jnp.where(stiff, APART, contacts.opening))
-    softness = jnp.where(usable, CABLE_SOFTNESS * drives, jnp.inf)
-    problem = _Problem(
-        compliance, free, softness, slips, contacts, NORMAL_SOFTNESS * mean, TANGENT_SOFTNESS * mean, time_step
-    )
     start = jnp.concatenate([previous, jnp.zeros(runs), contacts.before.ravel()])
-    found, converged = lax.stop_gradient(_iterate(*lax.stop_gradient((problem, start))))
+    found, converged = lax.stop_gradient(settle(*lax.stop_gradient((problem, free, start))))
     # One more iteration, which carries the derivatives and changes the impulses by rounding only.
-    law = _law(problem, free + compliance @ found)
-    held = _Law(law.impulse, *lax.stop_gradient((law.line, law.block)))
+    law = answers(problem, free + compliance @ found)
+    held = Law(law.impulse, *lax.stop_gradient((law.line, law.block)))
     impulse = found + _newton_step(problem, held, found)
     share = slips.mobilised - time_step / PRESLIDING * (free + compliance @ impulse)[cables : cables + runs]
     return Impulses(

@@ -15,9 +15,9 @@ Scalar = Float[Array, ""] | float
 
 
 class BendingLaw(NamedTuple):
-    """How the moments of a layer answer its bending and twist, beyond its linear section; null 0 for all."""
+    """How the moments of a section answer its bending and twist, beyond its profile; null 0 for all."""
 
-    stiffening: Scalar = 0.0  # relative increase of the bending moment where the body bends 1 rad in its length
+    fibre: Scalar = 0.0  # c: energy of a fibre E (x^2 - c x^3) / 2 of its strain x; -1 St. Venant-Kirchhoff, 2/3 rubber
     anisotropy: Scalar = 0.0  # ln of EI in the xz plane over EI in the yz plane; their product stays
     cross_plane: Scalar = 0.0  # EI_xy / sqrt(EI_x EI_y)
     twist_x: Scalar = 0.0  # coupling of twist and rotation about x, relative to sqrt(EI GJ)
@@ -66,6 +66,6 @@ class Memory(NamedTuple):
     """What the effects that are present remember from step to step."""
 
     clock: Float[Array, ""] | None = None  # [s] since the start
-    branch: Float[Array, "layers dofs"] | None = None  # strain of the Prony branch's dashpot, as a displacement [m]
+    branch: Float[Array, "elements 6"] | None = None  # strains of the Prony branch's dashpot
     slip: Float[Array, "kinds cables cable_runs"] | None = None  # share of the friction mobilised, -1 to 1
     segment: Float[Array, "cables guides"] | None = None  # tension in front of every guide [N]

@@ -1,127 +1,249 @@
-"""Static equilibrium under gravity, external forces and cables: where a rollout starts."""
+"""Static equilibrium under gravity, external forces and cables: where a rollout starts, and quasi-static motion.
+
+Newton's method with the tangent and the constraints of a step. What friction of the cables has mobilised goes on from
+the state before, so that its path counts. Derivatives are those of the equations at the solution, with all terms.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rfdropo_bayes.fem import corotational
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
-from rfdropo_bayes.fem.cables import lengths_and_jacobian
-from rfdropo_bayes.fem.constrained_step import Pull, constrained_step
-from rfdropo_bayes.fem.dynamics import (
-    Prepared,
-    State,
-    System,
-    accept,
-    frames_and_displacements,
-    free_solve,
-    resistance,
-    section_means,
-    shared,
-    state_at_rest,
-    strings,
-    with_section_matrix,
-)
-from rfdropo_bayes.fem.surroundings import section_load
-from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
+from rfdropo_bayes.fem.cable_friction import PRESLIDING, Slip, slip_problem, slip_rows, slipped
+from rfdropo_bayes.fem.cables import threads
+from rfdropo_bayes.fem.components import turned
+from rfdropo_bayes.fem.constraints import Slips
+from rfdropo_bayes.fem.derivatives import pushed_forward
+from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, accept, displaced, stage_body, state_at_rest
+from rfdropo_bayes.fem.integrators import Stage
+from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Way, all_rows, linearised, solved_stage
 
 ITERATIONS = 60
+SETTLED = 1e-9
+"""Largest motion in the last iteration, in body lengths and radians."""
 TOLERANCE = 1e-6
 """Largest force out of balance, relative to the loads, that counts as equilibrium."""
 LONGEST_STEP = 0.1
-"""No node moves further than this many body lengths in an iteration."""
+"""No station moves further than this many body lengths in an iteration."""
+WIDEST_TURN = 0.5
+"""No section turns further [rad] in an iteration."""
 SMALLEST_RELAXATION = 0.1
+NO_TIME = Stage(0.0, 1.0, 0.0, True)
+"""A stage whose "velocities" are the motion itself."""
 
 
 class EquilibriumInfo(NamedTuple):
     """How well the body is in equilibrium."""
 
-    residual: Float[Array, ""]  # largest nodal force out of balance / sum of the loads
+    residual: Float[Array, ""]  # largest force on a station out of balance / sum of the loads
     converged: Bool[Array, ""]  # residual within TOLERANCE, cable problem solved
     diverged: Bool[Array, ""]
+    iterations: Float[Array, ""]  # linear solves
+
+
+class Task(NamedTuple):
+    """What an equilibrium is computed from."""
+
+    prepared: Prepared
+    start: State  # where the iterations start; the slip of cables counts from there
+    displacement: Float[Array, " cables"]
+    external: Float[Array, "stations 6"]
+    slip: Slip | None
+
+
+class Found(NamedTuple):
+    """An equilibrium."""
+
+    position: Float[Array, "stations 3"]
+    orientation: Float[Array, "stations 4"]
+    impulse: Float[Array, " rows"]  # tensions, and forces of friction [N]
+    solved: Float[Array, ""]  # 1 if the last constraint problem was
+    iterations: Float[Array, ""]
+    softness: Float[Array, " cables"]  # of the constraints [m/N]
 
 
 class _Iterate(NamedTuple):
-    position: Float[Array, "nodes 3"]
-    tension: Float[Array, " cables"]
-    increment: Float[Array, "nodes 3"]
+    place: State
+    impulse: Float[Array, " rows"]
+    increment: Float[Array, "stations 6"]
     relaxation: Float[Array, ""]
+    moving: Bool[Array, ""]
+    solved: Float[Array, ""]
+    iterations: Float[Array, ""]
+    softness: Float[Array, " cables"]
 
 
-class _Forces(NamedTuple):
-    body: Float[Array, "nodes 3"]  # of the body and of what surrounds it
-    tangent: BlockTridiagonal
-    cable: Float[Array, "nodes 3"]
-    length: Float[Array, " cables"]
-    jacobian: Float[Array, "cables nodes 3"]
+def _body(system: System, task: Task, place: State) -> StageBody:
+    """The body without inertia and without anything that time does to it."""
+    prepared = task.prepared
+    timeless = prepared._replace(effects=prepared.effects._replace(drag=None, viscoelasticity=None))
+    still = place._replace(velocity=jnp.zeros_like(place.velocity), spin=jnp.zeros_like(place.spin))
+    body = stage_body(system, timeless, still, 1.0, task.external, NO_TIME)
+    none = jnp.zeros(())
+    light = body._replace(mass=jnp.zeros_like(body.mass), inertia=jnp.zeros_like(body.inertia))
+    return light._replace(lookahead=jnp.ones(()), behind=none, loss=none, gain=None, branch=None)
 
 
-def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
-    """Forces of the body and of its cables in the current shape, and the tangent of the former."""
-    frame, local = frames_and_displacements(system, prepared, iterate.position)
-    local_force, packed = resistance(prepared, local)
-    if prepared.firmness is not None:
-        local_force, packed = prepared.firmness * local_force, prepared.firmness * packed
-    body = corotational.internal_force(frame, local_force).reshape(-1, 3)
-    length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
-    cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
-    stiffening = lateral_stiffening(system.body, frame, layer_tension(system.body, local_force, cable, frame))
-    packed = packed + corotational.pack(strings(system, prepared, frame, iterate.position, iterate.tension))
-    tangent = jax.tree.map(jnp.add, corotational.tangent(packed, frame), stiffening)
-    centre = section_means(system, iterate.position)
-    around = section_load(system.body, prepared.effects, centre, jnp.zeros_like(centre))
-    if around is not None:
-        body = body + shared(system, around.force)
-        tangent = with_section_matrix(system, tangent, around.stiffness)
-    return _Forces(body, tangent, cable, length, jacobian)
+def _bonds(system: System, task: Task, place: State, previous: Float[Array, " cables"]) -> Bonds:
+    compliance = task.prepared.effects.cable_compliance
+    bonds = Bonds(
+        thread=threads(system.cables),
+        reach=task.prepared.rest_length - task.displacement,
+        previous=previous,
+        give=jnp.zeros(()) if compliance is None else jnp.asarray(compliance, dtype=float),
+        follows=jnp.ones(()),
+    )
+    if task.slip is None:
+        return bonds
+    rows, length = slip_rows(system.cables, task.slip, place.position, place.orientation)
+    before = slip_rows(system.cables, task.slip, task.start.position, task.start.orientation)[1]
+    slips = Slips(task.slip.strength, task.slip.mobilised)
+    weight = jnp.zeros((len(length), len(length)))
+    return bonds._replace(rows=rows, base=length - before, compliance=weight, slips=slips)
+
+
+def _find(system: System, iterations: int, task: Task) -> Found:
+    """Newton's method. The increments are limited in length, and relaxed more whenever two in a row point against each
+    other, which makes soft bodies far from straight converge, too."""
+    way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
+    length = system.body.length
+
+    def one(current: _Iterate) -> _Iterate:
+        bonds = _bonds(system, task, current.place, current.impulse[:cables])
+        found, softness = solved_stage(way, _body(system, task, current.place), bonds)
+        increment = found.change.T
+        size = jnp.array([1.0 / length] * 3 + [1.0] * 3)
+        now, before = increment * size, current.increment * size
+        opposed = jnp.sum(now * before) < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
+        relaxation = jnp.clip(current.relaxation * jnp.where(opposed, 0.6, 1.2), SMALLEST_RELAXATION, 1.0)
+        largest = jnp.max(jnp.abs(now))
+        far = jnp.max(jnp.abs(now[:, :3])) / LONGEST_STEP, jnp.max(jnp.abs(now[:, 3:])) / WIDEST_TURN
+        scale = jnp.minimum(relaxation, 1.0 / jnp.maximum(jnp.maximum(*far), 1e-300))
+        moved = displaced(current.place, scale * increment)
+        count = current.iterations + 1.0
+        return _Iterate(
+            moved, found.impulse, increment, relaxation, largest > SETTLED, found.converged, count, softness
+        )
+
+    runs = 0 if task.slip is None else len(task.slip.strength)
+    impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
+    none, whole = jnp.zeros((len(task.start.position), 6)), jnp.ones(())
+    first = _Iterate(task.start, impulse, none, whole, jnp.array(True), whole, jnp.zeros(()), jnp.zeros(cables))
+    last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
+    return Found(last.place.position, last.place.orientation, last.impulse, last.solved, last.iterations, last.softness)
+
+
+def _unbalanced(
+    system: System, task: Task, found: Found, change: Float[Array, "stations 6"], impulse: Float[Array, " rows"]
+) -> tuple[Float[Array, "6 free"], Float[Array, " rows"]]:
+    """Forces out of balance, and what constraints lack, near an equilibrium."""
+    place = displaced(task.start._replace(position=found.position, orientation=found.orientation), change)
+    body, cables = _body(system, task, place), len(found.softness)
+    bonds = _bonds(system, task, place, found.impulse[:cables])
+    line, way = linearised(body), Way(system.clamped_stations, True, system.cables)
+    rows, reached = all_rows(way, body, bonds, line.frame)
+    forces = line.right + jnp.einsum("sir,r->is", rows, impulse)
+    tension = impulse[:cables]
+    slack = bonds.reach - reached + (bonds.give + found.softness) * tension
+    lacking = jnp.where(found.impulse[:cables] > 0.0, slack, tension)
+    if task.slip is not None and bonds.base is not None:
+        share = jnp.clip(task.slip.mobilised - bonds.base / PRESLIDING, -1.0, 1.0)
+        lacking = jnp.concatenate([lacking, impulse[cables:] - task.slip.strength * share])
+    return forces[:, system.clamped_stations :], lacking
+
+
+def _balanced(system: System, iterations: int, task: Task) -> Found:
+    """The equilibrium, with derivatives by the implicit function theorem."""
+
+    @jax.custom_jvp
+    def solution(task: Task) -> Found:
+        return _find(system, iterations, task)
+
+    def rule(primals: Any, tangents: Any) -> tuple[Found, Found]:
+        found = lax.stop_gradient(_find(system, iterations, *primals))
+        held, stations = system.clamped_stations, len(found.position)
+        free = 6 * (stations - held)
+
+        def lacking(task: Task, unknown: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+            change = jnp.concatenate([jnp.zeros((held, 6)), unknown[:free].reshape(-1, 6)])
+            forces, rows = _unbalanced(system, task, found, change, unknown[free:])
+            return jnp.concatenate([forces.T.ravel(), rows])
+
+        at = jnp.concatenate([jnp.zeros(free), found.impulse])
+        slope = lax.stop_gradient(jax.jacfwd(partial(lacking, *primals))(at))
+        missing = pushed_forward(lambda task: lacking(task, at), primals, tangents)
+        change = jnp.linalg.solve(slope, -missing)
+        moved = jnp.concatenate([jnp.zeros((held, 6)), change[:free].reshape(-1, 6)])
+        turning = jax.jvp(lambda a: turned(found.orientation.T, a).T, (jnp.zeros((3, stations)),), (moved[:, 3:].T,))[1]
+        return found, Found(moved[:, :3], turning, change[free:], *jax.tree.map(jnp.zeros_like, (found[3:])))
+
+    solution.defjvp(rule, symbolic_zeros=True)
+    return solution(task)
+
+
+def settled(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    displacement: Float[Array, " cables"],
+    external_force: Float[Array, "stations 6"] | float = 0.0,
+    iterations: int = ITERATIONS,
+) -> tuple[State, EquilibriumInfo]:
+    """The equilibrium that a state comes to under commanded cable displacements [m] and forces [N] and moments [N m] on
+    the stations: a row of quasi-static motion.
+
+    Friction of the cables that the state's memory holds goes on; what flows has relaxed. Needs a clamped station.
+    """
+    memory, slip = state.memory, None
+    if memory.slip is not None and memory.segment is not None:
+        slip = slip_problem(
+            system.cables, prepared.effects, memory.slip, memory.segment, state.position, state.orientation
+        )
+    external = jnp.broadcast_to(jnp.asarray(external_force, dtype=float), (len(state.position), 6))
+    task = Task(prepared, state._replace(memory=memory._replace(slip=None, segment=None)), displacement, external, slip)
+    found = _balanced(system, iterations, task)
+    cables, unknown = len(displacement), jnp.zeros((len(state.position), 6))
+    forces = _unbalanced(system, task, found, unknown, found.impulse)[0]
+    loads = jnp.sum(jnp.abs(prepared.weight)) + jnp.sum(jnp.abs(external)) + jnp.sum(jnp.abs(found.impulse))
+    residual = lax.stop_gradient(jnp.max(jnp.abs(forces[:3]), initial=0.0) / jnp.maximum(loads, 1e-300))
+    tension = jnp.maximum(found.impulse[:cables], 0.0)
+    if slip is not None:
+        strength = jnp.where(slip.strength > 0.0, slip.strength, 1.0)
+        shares, segment = slipped(system.cables, slip, found.impulse[cables:] / strength, tension)
+        memory = memory._replace(slip=shares, segment=segment)
+    none = jnp.zeros_like(state.velocity)
+    moved = state._replace(
+        position=found.position, orientation=found.orientation, velocity=none, spin=none, tension=tension, memory=memory
+    )
+    taken, info = accept(system, state, moved, found.solved > 0.5)
+    converged = (residual < TOLERANCE) & info.converged & ~info.diverged
+    return taken, EquilibriumInfo(residual, converged, info.diverged, found.iterations)
 
 
 def static_equilibrium(
     system: System,
     prepared: Prepared,
     displacement: Float[Array, " cables"],
-    external_force: Float[Array, "nodes 3"] | float = 0.0,
+    external_force: Float[Array, "stations 6"] | float = 0.0,
     iterations: int = ITERATIONS,
 ) -> tuple[State, EquilibriumInfo]:
-    """Body at rest under its weight, the external nodal forces [N] and the commanded cable displacements [m].
+    """Body at rest under its weight, forces [N] and moments [N m] on the stations, and the commanded cable
+    displacements [m], from the undeformed body; see `settled`. Cables enter without friction."""
+    return settled(system, prepared, state_at_rest(system), displacement, external_force, iterations)
 
-    Newton's method with the corotational tangent from the undeformed body. The increments are limited in length, and
-    relaxed more whenever two in a row point against each other, which makes soft bodies far from straight converge too.
-    A fixed number of iterations, so that both modes of differentiation work. Needs at least one clamped station.
-    Cables enter without friction, and what flows has relaxed.
-    """
-    load = prepared.weight + external_force
-    longest = LONGEST_STEP * (system.body.station[-1] - system.body.station[0])
-    compliance = prepared.effects.cable_compliance
-    give = 0.0 if compliance is None else compliance
 
-    def iterate(current: _Iterate, _: None) -> tuple[_Iterate, Bool[Array, ""]]:
-        forces = _forces(system, prepared, current)
-        slack = prepared.rest_length - displacement - forces.length
-        pull = Pull(forces.jacobian, slack, current.tension, give)
-        still = jnp.zeros_like(current.position)
-        found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull)
-        increment, tension, converged = found.increment, found.impulses.cable, found.impulses.converged
-        now, before = lax.stop_gradient((increment, current.increment))
-        along = jnp.sum(now * before)
-        opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
-        relaxation = jnp.clip(current.relaxation * jnp.where(opposed, 0.6, 1.2), SMALLEST_RELAXATION, 1.0)
-        scale = jnp.minimum(relaxation, longest / jnp.maximum(jnp.max(jnp.abs(now)), 1e-300))
-        return _Iterate(current.position + scale * increment, tension, increment, relaxation), converged
-
-    start = state_at_rest(system)
-    first = _Iterate(start.position, start.tension, jnp.zeros_like(start.position), jnp.array(1.0))
-    last, solved = lax.scan(iterate, first, None, length=iterations)
-    forces = _forces(system, prepared, last)
-    unbalanced = (forces.body + forces.cable + load)[system.clamped_stations * system.body.section_nodes :]
-    loads = jnp.sum(jnp.abs(load)) + jnp.sum(last.tension)
-    residual = jnp.max(jnp.abs(unbalanced)) / jnp.maximum(loads, 1e-300)
-    moved = State(last.position, jnp.zeros_like(last.position), last.tension)
-    state, info = accept(system, prepared, start, moved, solved[-1])
-    converged = (residual < TOLERANCE) & info.converged & ~info.diverged
-    return state, EquilibriumInfo(residual, converged, info.diverged)
+def quasi_static_step(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    displacement: Float[Array, " cables"],
+    external_force: Float[Array, "stations 6"] | float = 0.0,
+) -> tuple[State, StepInfo]:
+    """A row of quasi-static motion, in place of ``dynamics.step``."""
+    moved, info = settled(system, prepared, state, displacement, external_force)
+    return moved, StepInfo(info.diverged, info.converged)

@@ -14,6 +14,8 @@ SDIRK2 is the L-stable scheme of second order with g = 1 - 1 / sqrt(2) (Alexande
 F of stage 1 is M (V - v0) / (g h): carried is (1 - g) / g - 1. What has a rate, as the dashpot of a Prony branch and
 mobilised friction have, goes on in the same way.
 
+Quasi-static motion has no time: every row is an equilibrium that is found from the row before (``equilibrium``).
+
 An impact is no smooth force: a body that it stopped would rebound. Impulses of contacts that stop surfaces in stage 1
 are not carried on. Where surfaces close in stage 2, the velocity of stage 1 has taken them through each other for most
 of the step, which that of stage 2 must not make good in the g h that it acts for. There stage 2 is implicit over all
@@ -27,7 +29,7 @@ from __future__ import annotations
 import math
 from typing import Any, Literal, NamedTuple
 
-Integrator = Literal["euler", "sdirk2"]
+Integrator = Literal["euler", "sdirk2", "quasi-static"]
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 """Of SDIRK2: the root that makes it L-stable."""
 
@@ -60,6 +62,7 @@ class Stage(NamedTuple):
 STAGES: dict[str, tuple[Stage, ...]] = {
     "euler": (Stage(1.0, 1.0, 0.0, False),),
     "sdirk2": (Stage(GAMMA, GAMMA, 0.0, True), Stage(1.0 - GAMMA, GAMMA, (1.0 - 2.0 * GAMMA) / GAMMA, True)),
+    "quasi-static": (),  # every row is an equilibrium: no step in time
 }
 EULER = STAGES["euler"][0]
 

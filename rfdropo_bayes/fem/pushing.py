@@ -15,9 +15,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rfdropo_bayes.fem.components import rotation
 from rfdropo_bayes.fem.effects import Scalar
-from rfdropo_bayes.fem.layered import LayeredBody, attach, centre_gradient
+from rfdropo_bayes.fem.points import point_positions
 from rfdropo_bayes.fem.rigid_body import CORNERS, Cube, CubeState, rotation_matrix
+from rfdropo_bayes.fem.rod import PointMap, Rod, attach
 
 NEAREST = 24
 """Spheres that the reference engine looks at, nearest to the cube and to the plate: more than ever come near them."""
@@ -29,7 +31,14 @@ FITTED = 24
 
 
 class Spheres(NamedTuple):
-    """Spheres along a body's centre line, bound to its nodes; NumPy arrays, fixed for a simulation."""
+    """Spheres along the centre line of a rod, bound to its sections; NumPy arrays, fixed for a simulation."""
+
+    centre: PointMap
+    radius: Float[np.ndarray, " spheres"]  # [m]
+
+
+class MeshSpheres(NamedTuple):
+    """Spheres along the centre line of a mesh, bound to its nodes; NumPy arrays, fixed for a simulation."""
 
     node: Int[np.ndarray, "spheres width"]
     centre: Float[np.ndarray, "spheres width"]  # weights of the nodes' positions
@@ -40,7 +49,7 @@ class Spheres(NamedTuple):
 class PushGeometry(NamedTuple):
     """What does not change between rollouts; static, never traced."""
 
-    spheres: Spheres
+    spheres: Spheres | MeshSpheres
     plate_normal: Float[np.ndarray, "3"]  # unit vector out of the plate
     plate_height: float  # of the plate's top along its normal [m]
     contact_distance: float  # [m]
@@ -53,12 +62,15 @@ class Touch(NamedTuple):
     frame: Float[Array, "contacts 3 3"]  # rows: normal, two tangents
     on_cube: Float[Array, "contacts 3 6"]  # relative velocity by the cube's velocity and spin
     pair: Int[Array, " contacts"]  # that a contact is: corners on the plate, spheres on the cube, spheres on the plate
-    trunk_node: Int[Array, "trunk_contacts width"]  # of the contacts that the trunk takes part in
-    trunk_weight: Float[Array, "trunk_contacts 3 width"]  # of its nodes in each row
+    rows: Float[Array, "stations 6 rows"]  # relative velocity by the stations' velocities and spins; three a contact
 
 
 def push_scene(
-    spheres: Spheres, *, plate_normal: Float[np.ndarray, "3"], plate_height: float, contact_distance: float
+    spheres: Spheres | MeshSpheres,
+    *,
+    plate_normal: Float[np.ndarray, "3"],
+    plate_height: float,
+    contact_distance: float,
 ) -> PushGeometry:
     """Scene of a body with these spheres before a plate of any normal."""
     normal = np.asarray(plate_normal, float)
@@ -71,23 +83,17 @@ def sphere_heights(start: float, tip: float, tip_radius: float) -> Float[np.ndar
     return np.linspace(start, tip - tip_radius, count)
 
 
-def layered_spheres(body: LayeredBody) -> Spheres:
-    """Spheres of a layered body with the mean half width of its sections."""
+def rod_spheres(body: Rod) -> Spheres:
+    """Spheres of a rod with the mean half width of its sections."""
     half = body.half_width.mean(axis=1)
     height = sphere_heights(float(body.station[0]), float(body.station[-1]), float(half[-1]))
     points = np.stack([0.0 * height, 0.0 * height, height], axis=1)
-    centre, section = attach(body, points), body.section_nodes
-    layer = np.clip(np.searchsorted(body.station, height, side="right") - 1, 0, len(body.station) - 2)
-    node = layer[:, None] * section + np.arange(2 * section)
-    weight = np.zeros(node.shape)
-    for sphere, (nodes, weights) in enumerate(zip(*centre, strict=True)):
-        np.add.at(weight[sphere], nodes - node[sphere, 0], weights)
-    return Spheres(node, weight, centre_gradient(body)[layer], np.interp(height, body.station, half))
+    return Spheres(attach(body, points), np.interp(height, body.station, half))
 
 
 def mesh_spheres(
     rest: Float[np.ndarray, "nodes 3"], station: Float[np.ndarray, " stations"], radius: Float[np.ndarray, " stations"]
-) -> Spheres:
+) -> MeshSpheres:
     """Spheres of a mesh along the z axis, whose outline has these radii [m] at these heights [m].
 
     A sphere's centre and the deformation around it are those of the affine motion that fits the nodes around its height
@@ -98,7 +104,7 @@ def mesh_spheres(
     width = max(len(node) for node, _ in fits)
     node = np.stack([np.pad(node, (0, width - len(node))) for node, _ in fits])
     fit = np.stack([np.pad(weight, ((0, 0), (0, width - len(node)))) for node, weight in fits])
-    return Spheres(node, fit[:, 0], np.swapaxes(fit[:, 1:], 1, 2), np.interp(height, station, radius))
+    return MeshSpheres(node, fit[:, 0], np.swapaxes(fit[:, 1:], 1, 2), np.interp(height, station, radius))
 
 
 def _affine_fit(
@@ -158,25 +164,39 @@ def _nearest(gap: Float[Array, " spheres"]) -> Int[Array, " contacts"]:
     return jnp.sort(lax.top_k(-lax.stop_gradient(gap), min(NEAREST, len(gap)))[1])
 
 
-def _trunk_weights(
-    spheres: Spheres, chosen: Int[Array, " contacts"], normal: Float[Array, "contacts 3"], position: Array
-) -> tuple[Array, Array]:
-    """Nodes of the chosen spheres, and their weights in the rows of a contact with this normal."""
-    node = jnp.asarray(spheres.node)[chosen]
-    centre, gradient = jnp.asarray(spheres.centre)[chosen], jnp.asarray(spheres.gradient)[chosen]
-    deformation = jnp.einsum("cki,ckj->cij", position[node], gradient)
-    place = jnp.linalg.solve(deformation, normal[..., None])[..., 0]
-    rubbing = centre - jnp.asarray(spheres.radius)[chosen, None] * jnp.einsum("ckj,cj->ck", gradient, place)
-    return node, jnp.stack([centre, rubbing, rubbing], axis=1)
+def _trunk_rows(
+    spheres: Spheres,
+    chosen: Int[Array, " contacts"],
+    frame: Float[Array, "contacts 3 3"],
+    orientation: Float[Array, "stations 4"],
+) -> Float[Array, "stations 6 rows"]:
+    """Derivatives of the relative velocities of the chosen spheres by the velocities and spins of the stations."""
+    station, weight, arm = (jnp.asarray(part)[chosen] for part in spheres.centre)
+    turn = jnp.moveaxis(rotation(orientation.T), -1, 0)[station]
+    lever = jnp.einsum("csij,csj->csi", turn, arm)
+    rubbing = lever - jnp.asarray(spheres.radius)[chosen, None, None] * weight[..., None] * frame[:, None, 0]
+    lever = jnp.stack([lever, rubbing, rubbing], axis=1)
+    force = weight[:, None, :, None] * frame[:, :, None, :]
+    moment = jnp.cross(lever, jnp.broadcast_to(frame[:, :, None, :], lever.shape))
+    bound = station[..., None] == jnp.arange(len(orientation))
+    rows = jnp.einsum("crsi,csn->nicr", jnp.concatenate([force, moment], axis=-1), bound.astype(float))
+    return rows.reshape(len(orientation), 6, -1)
 
 
-def find_contacts(scene: PushGeometry, cube: Cube, state: CubeState, position: Float[Array, "nodes 3"]) -> Touch:
-    """Contacts at the start of a step, from the positions of the body's nodes [m]."""
+def find_contacts(
+    scene: PushGeometry,
+    cube: Cube,
+    state: CubeState,
+    position: Float[Array, "stations 3"],
+    orientation: Float[Array, "stations 4"],
+) -> Touch:
+    """Contacts at the start of a step, from the places of the stations [m] and the quaternions of their sections."""
     spheres, up = scene.spheres, jnp.asarray(scene.plate_normal)
+    assert isinstance(spheres, Spheres)
     turn, radius = rotation_matrix(state.orientation), jnp.asarray(spheres.radius)
     corner = cube.side * CORNERS @ turn.T
     clearance = corner @ up + state.position @ up - scene.plate_height
-    centre = jnp.einsum("sk,ski->si", spheres.centre, position[spheres.node])
+    centre = point_positions(spheres.centre, position, orientation)
     distance, outward = distance_to_box(centre, state.position, turn, cube.side)
     height = centre @ up - scene.plate_height
     pushing, lying = _nearest(distance - radius), _nearest(height - radius)
@@ -188,29 +208,19 @@ def find_contacts(scene: PushGeometry, cube: Cube, state: CubeState, position: F
     sign = np.repeat([1.0, -1.0, 0.0], [len(corner), len(pushing), len(lying)])
     chosen = jnp.concatenate([pushing, lying])
     gap = jnp.concatenate([clearance, (distance - radius)[pushing], (height - radius)[lying]])
+    rows = _trunk_rows(spheres, chosen, frame[len(corner) :], orientation)
     return Touch(
         gap - scene.contact_distance,
         frame,
         jnp.asarray(sign)[:, None, None] * jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2),
         jnp.concatenate([jnp.arange(len(corner)), len(corner) + pushing, len(corner) + len(radius) + lying]),
-        *_trunk_weights(spheres, chosen, normal, position),
+        jnp.concatenate([jnp.zeros((len(position), 6, 3 * len(corner))), rows], axis=2),
     )
 
 
 def untouched(scene: PushGeometry) -> Float[Array, "pairs 3"]:
     """Impulses of all pairs that can touch, before the first step."""
     return jnp.zeros((len(CORNERS) + 2 * len(scene.spheres.radius), 3))
-
-
-def trunk_rows(touch: Touch, nodes: int) -> Float[Array, "rows nodes 3"]:
-    """Derivatives of the contacts' relative velocities with respect to the velocities of the body's nodes; zero for the
-    contacts between cube and plate."""
-    count, corners = len(touch.trunk_node), len(touch.gap) - len(touch.trunk_node)
-    weight = jnp.zeros((count, 3, nodes))
-    place = jnp.arange(count)[:, None, None], jnp.arange(3)[:, None], touch.trunk_node[:, None, :]
-    weight = weight.at[place].add(touch.trunk_weight)
-    rows = jnp.einsum("crn,cri->crni", weight, touch.frame[corners:]).reshape(3 * count, nodes, 3)
-    return jnp.concatenate([jnp.zeros((3 * corners, nodes, 3)), rows])
 
 
 def unchanged(cube: CubeState, moved: CubeState, taken: Bool[Array, ""]) -> CubeState:

@@ -10,12 +10,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, remembering, step
 from rfdropo_bayes.fem.effects import Scalar
+from rfdropo_bayes.fem.equilibrium import quasi_static_step
 from rfdropo_bayes.fem.integrators import Integrator
-from rfdropo_bayes.fem.layered import PointMap, point_positions
+from rfdropo_bayes.fem.points import point_positions
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.fem.rod import PointMap
 from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 
 
@@ -43,6 +46,7 @@ class Motion(NamedTuple):
     converged: Bool[Any, "*batch"]  # whether the impulses of every step's constraints were found
     pose: Float[Any, "*batch row 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
     peak: Float[Any, "*batch cable"] | None = None  # largest tension at the steps of a session's last call [N]
+    solves: Float[Any, "*batch"] | None = None  # linear solves of a quasi-static motion's rows
 
 
 class _Progress(NamedTuple):
@@ -78,10 +82,10 @@ def roll(
     def recorded(state: Any) -> Recorded:
         cube = state.cube
         pose = None if cube is None else jnp.concatenate([cube.position, cube.orientation])
-        return point_positions(points, state.position), state.tension, pose
+        return point_positions(points, state.position, state.orientation), state.tension, pose
 
     def row(progress: _Progress, commands: Any) -> tuple[_Progress, Recorded]:
-        progress = lax.scan(one, progress, commands)[0]
+        progress = lax.scan(jax.checkpoint(one, prevent_cse=False), progress, commands)[0]
         return progress, recorded(progress.state)
 
     def next_row(index: Int[Array, ""], carry: tuple[_Progress, Any]) -> tuple[_Progress, Any]:
@@ -117,10 +121,15 @@ def simulate(
     is where it starts. ``horizon`` as for `roll`. Where a step has several stages, ``state.commanded`` are the
     displacements before the first step, zero where that is None. ``loads`` act in every step besides.
     """
+    still = integrator == "quasi-static"
+    if still and scene is not None:
+        raise InputError("a cube cannot be pushed in quasi-static motion", where="[simulator] motion")
     if loads is not None:
 
         def pushed(before: State, given: tuple[Float[Array, " cables"], Int[Array, ""]]) -> tuple[State, StepInfo]:
             under, force = loaded(system, prepared, loads, given[1])
+            if still:
+                return quasi_static_step(system, under, before, given[0], force)
             return step(system, under, before, given[0], time_step, force, scene, cube, integrator)
 
         number = 1 + jnp.arange(displacement.shape[0] * displacement.shape[1]).reshape(displacement.shape[:2])
@@ -128,6 +137,8 @@ def simulate(
         return roll(pushed, begin, (displacement, number), points, horizon)
 
     def take(before: State, commanded: Float[Array, " cables"]) -> tuple[State, StepInfo]:
+        if still:
+            return quasi_static_step(system, prepared, before, commanded)
         return step(system, prepared, before, commanded, time_step, scene=scene, cube=cube, integrator=integrator)
 
     return roll(take, remembering(system, prepared, state, scene, integrator), displacement, points, horizon)

@@ -1,4 +1,4 @@
-"""What acts on a layered body from step to step beside its weight: forces on sections, factors on its stiffness and
+"""What acts on a rod from step to step beside its weight: forces on sections, factors on its stiffness and
 damping, and a change of gravity."""
 
 from __future__ import annotations
@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.blocktridiagonal import multiply
-from rfdropo_bayes.fem.dynamics import Prepared, System, shared
+from rfdropo_bayes.fem.dynamics import Prepared, System
 
 
 class SectionLoads(NamedTuple):
@@ -31,18 +30,15 @@ class SectionLoads(NamedTuple):
 
 def loaded(
     system: System, prepared: Prepared, loads: SectionLoads, row: Any
-) -> tuple[Prepared, Float[Array, "nodes 3"]]:
-    """The body under one row of loads, and the forces on its nodes [N]."""
-    stations, nodes = len(system.body.station), system.body.section_nodes
+) -> tuple[Prepared, Float[Array, "stations 6"]]:
+    """The body under one row of loads, and the forces [N] and moments [N m] on its stations."""
     force, stiffness, damping, gravity = (jnp.asarray(part)[row] for part in loads[:4])
-    change = jnp.broadcast_to(gravity, (stations, nodes, 3))
     loss = jnp.exp(damping)
     changed = prepared._replace(
         firmness=jnp.exp(stiffness),
         rayleigh_mass=loss * prepared.rayleigh_mass,
         rayleigh_stiffness=loss * prepared.rayleigh_stiffness,
         gravity=prepared.gravity + gravity,
-        weight=prepared.weight + multiply(prepared.mass, change).reshape(-1, 3),
     )
-    pushed = jnp.zeros((stations, 3)).at[jnp.asarray(loads.station)].set(force)
-    return changed, shared(system, pushed)
+    pushed = jnp.zeros((len(system.body.station), 6)).at[jnp.asarray(loads.station, dtype=int), :3].set(force)
+    return changed, pushed

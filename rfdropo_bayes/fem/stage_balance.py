@@ -1,4 +1,4 @@
-"""Forces and energies of rollouts whose states do not tell what the stages of a step did: they are simulated again.
+"""Forces and energies of rollouts of a rod: they are simulated again, stage by stage.
 
 Over a step of two stages the momentum changes by all impulses of the second and by those of the first times
 1 + going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the
@@ -14,32 +14,33 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem import corotational
-from rfdropo_bayes.fem.balance import Balance, Energies, cable_force, check_effects, energies
-from rfdropo_bayes.fem.blocktridiagonal import multiply
+from rfdropo_bayes.fem.balance import Balance, Energies, check_effects, energies
+from rfdropo_bayes.fem.cables import courses, station_rows, threads
+from rfdropo_bayes.fem.components import dot, rotation
 from rfdropo_bayes.fem.dynamics import (
     Prepared,
     StageBegun,
     State,
     System,
     begin_stage,
-    frames_and_displacements,
-    linearised,
-    mass_times,
     remembering,
-    resistance,
+    stage_body,
     take_stage,
+    twist_of,
 )
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.integrators import STAGES, Integrator
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.fem.rod_elements import strain_rates
+from rfdropo_bayes.fem.sections import linear
+from rfdropo_bayes.fem.stage_solve import inertia_times, linearised, matrix_times
 
 
 class _Done(NamedTuple):
-    """Impulses [N s] and work [J] of a stage, or of a step."""
+    """Impulses [N s], [N m s] and work [J] of a stage, or of a step."""
 
-    residual: Float[Array, "nodes 3"]  # of what holds and touches the body
+    residual: Float[Array, "stations 6"]  # of what holds and touches the body
     held: Float[Array, ""]  # its work
     pulled: Float[Array, ""]  # work of the cables
     lost: Float[Array, ""]  # to Rayleigh damping
@@ -48,23 +49,30 @@ class _Done(NamedTuple):
 class _Reached(NamedTuple):
     """Where a step ends, and what it did."""
 
-    position: Float[Array, "nodes 3"]
+    position: Float[Array, "stations 3"]
     done: _Done
     stored: Energies
 
 
+def cable_wrench(system: System, state: State, tension: Float[Array, " cables"]) -> Float[Array, "stations 6"]:
+    """Forces [N] and moments [N m] of the cables on the stations."""
+    thread = threads(system.cables)
+    course = courses(system.cables, thread, state.position.T, rotation(state.orientation.T))
+    rows = station_rows(system.cables, thread, course.lever, course.pull, len(state.position))
+    return -jnp.einsum("sic,c->si", rows, tension)
+
+
 def _done(system: System, prepared: Prepared, before: State, after: State, begun: StageBegun, length: Scalar) -> _Done:
     """What a stage did, of this length [s]."""
-    at, stations, velocity = begun.at, len(system.body.station), after.velocity
-    cable = length * cable_force(system.cables, prepared.guides, at.position, after.tension)
-    change = (velocity - before.velocity).reshape(stations, -1, 1)
-    residual = multiply(begun.linear.matrix, change).reshape(-1, 3) - begun.linear.right - cable
-    frame, local = frames_and_displacements(system, prepared, at.position)
-    tangent = corotational.tangent(resistance(prepared, local)[1], frame)
-    strained = multiply(tangent, velocity.reshape(stations, -1, 1)).reshape(-1, 3)
-    dragged = prepared.rayleigh_mass * mass_times(system, prepared, velocity)
-    lost = length * jnp.sum(velocity * (dragged + prepared.rayleigh_stiffness * strained))
-    return _Done(residual, jnp.sum(residual * velocity), jnp.sum(cable * velocity), lost)
+    body, twist = begun.body, twist_of(after)
+    line, cable = linearised(body), length * cable_wrench(system, begun.at, after.tension)
+    change = (twist - twist_of(before)).T
+    residual = (matrix_times(body, line, change) - line.right).T - cable
+    rates = strain_rates(line.elements, twist.T)
+    viscous = jnp.sum(body.length * dot(rates, linear(line.slope, rates)))
+    dragged = jnp.sum(twist.T * inertia_times(body, line.frame, twist.T))
+    lost = length * (body.loss * dragged + prepared.rayleigh_stiffness * viscous)
+    return _Done(residual, jnp.sum(residual * twist), jnp.sum(cable * twist), lost)
 
 
 def _step(
@@ -83,7 +91,7 @@ def _step(
         begun = begin_stage(system, prepared, here, stage, carried, **around)
         if carried is not None and done is not None:
             going = begun.stage.going
-            impact, velocity = going * carried.sudden, here.velocity
+            impact, velocity = going * carried.sudden, twist_of(here)
             done = jax.tree.map(lambda part, share=1.0 + going: share * part, done)
             done = done._replace(residual=done.residual - impact, held=done.held - jnp.sum(impact * velocity))
         given = start + elapsed * (displacement - start)
@@ -107,7 +115,7 @@ def stepped_balance(
     scene: PushGeometry | None = None,
     cube: Cube | None = None,
 ) -> Balance:
-    """Forces and energies of a rollout of a layered body.
+    """Forces and energies of a rollout of a rod.
 
     Args:
         state: where it starts, with the commanded displacements before the first step.
@@ -124,9 +132,9 @@ def stepped_balance(
     reached = lax.scan(lambda before, to: _step(system, prepared, before, to, integrator, around), first, displacement)[
         1
     ]
-    pulled = cable_force(system.cables, prepared.guides, first.position, first.tension)
-    still = -linearised(system, prepared, first, time_step).right / time_step - pulled
-    held = (jnp.arange(len(still)) < system.clamped_stations * system.body.section_nodes)[:, None]
+    body = stage_body(system, prepared, first, time_step)
+    still = -linearised(body).right.T / time_step - cable_wrench(system, first, first.tension)
+    held = (jnp.arange(len(still)) < system.clamped_stations)[:, None]
     acting = jnp.concatenate([still[None], reached.done.residual / time_step])
     clamp = jnp.where(held, acting, 0.0)
     touch = (acting - clamp).at[0].set(0.0)  # no step leads to the initial state: it may be about to fall
@@ -139,9 +147,9 @@ def stepped_balance(
 
     position = jnp.concatenate([first.position[None], reached.position])
     return Balance(
-        base_force=clamp.sum(axis=1),
-        base_moment=jnp.cross(position, clamp).sum(axis=1),
-        contact_force=touch.sum(axis=1),
+        base_force=clamp[..., :3].sum(axis=1),
+        base_moment=(jnp.cross(position, clamp[..., :3]) + clamp[..., 3:]).sum(axis=1),
+        contact_force=touch[..., :3].sum(axis=1),
         kinetic_energy=stored.kinetic,
         elastic_energy=stored.elastic,
         gravitational_energy=stored.gravitational,

@@ -1,6 +1,6 @@
 """What surrounds a body and acts on its sections as wholes: the drag of a fluid, and a wall.
 
-Both act on the mean motion of a section, with their derivatives by place and velocity, for the implicit step.
+Both act at the centre of a section, with their derivatives by place and velocity, for the implicit step.
 """
 
 from __future__ import annotations
@@ -8,11 +8,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem.effects import BodyEffects, Scalar, Wall
-from rfdropo_bayes.fem.layered import LayeredBody
+from rfdropo_bayes.fem.rod import Rod, drag_areas, tributary_lengths
 
 STILL = 1e-6
 """Speed [m/s] below which drag is linear."""
@@ -28,17 +27,6 @@ class SectionLoad(NamedTuple):
     damping: Float[Array, "stations 3 3"]  # [N s/m]
 
 
-def tributary_lengths(body: LayeredBody) -> Float[np.ndarray, " stations"]:
-    """Length of the body [m] that each station stands for."""
-    half = np.diff(body.station) / 2.0
-    return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
-
-
-def drag_areas(body: LayeredBody) -> Float[np.ndarray, " stations"]:
-    """Width times length [m2] that each station stands for."""
-    return tributary_lengths(body) * np.sum(body.half_width, axis=1)
-
-
 def _contact(depth: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Force of a one-sided spring of unit stiffness and its derivative: zero, then quadratic, then linear."""
     into = jnp.clip(depth + WALL_SOFTNESS, 0.0, 2.0 * WALL_SOFTNESS)
@@ -46,7 +34,7 @@ def _contact(depth: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array
     return 0.5 * slope * into + jnp.maximum(depth - WALL_SOFTNESS, 0.0), slope
 
 
-def _wall_load(body: LayeredBody, wall: Wall, centre: Float[Array, "stations 3"]) -> SectionLoad:
+def _wall_load(body: Rod, wall: Wall, centre: Float[Array, "stations 3"]) -> SectionLoad:
     azimuth = jnp.asarray(wall.azimuth)
     normal = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth), jnp.zeros_like(azimuth)])
     force, slope = _contact(centre @ normal - wall.distance)
@@ -58,7 +46,7 @@ def _wall_load(body: LayeredBody, wall: Wall, centre: Float[Array, "stations 3"]
     )
 
 
-def _drag_load(body: LayeredBody, drag: Scalar, velocity: Float[Array, "stations 3"], steep: bool) -> SectionLoad:
+def _drag_load(body: Rod, drag: Scalar, velocity: Float[Array, "stations 3"], steep: bool) -> SectionLoad:
     """Drag -c A |v| v with the speed of a stage's start and the velocity of its end, which never adds energy; or with
     its whole derivative, ``steep``, without which no scheme would be of second order."""
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=1) + STILL**2)
@@ -71,14 +59,14 @@ def _drag_load(body: LayeredBody, drag: Scalar, velocity: Float[Array, "stations
 
 
 def section_load(
-    body: LayeredBody,
+    body: Rod,
     effects: BodyEffects,
     centre: Float[Array, "stations 3"],
     velocity: Float[Array, "stations 3"],
     *,
     steep: bool = False,
 ) -> SectionLoad | None:
-    """Load on the sections whose nodes have this mean place [m] and velocity [m/s]; None if nothing surrounds them.
+    """Load on the sections whose centres have this place [m] and velocity [m/s]; None if nothing surrounds them.
 
     ``steep``: drag with the derivative of its speed.
     """

@@ -1,8 +1,7 @@
-"""Corotational linear tetrahedra: frames, forces and tangents of any tetrahedral mesh.
+"""Corotational linear tetrahedra: frames, forces of any tetrahedral mesh.
 
 Each element is linear elastic in a frame that turns with it: f_a = -V Q S(H) g_a with g_a the gradients of the shape
-functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law; the tangent is Q K Q', without the
-geometric terms. Two frames:
+functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law. Two frames:
 
 - ``"polar"``: rotation of the polar decomposition of the deformation gradient (Mueller and Gross 2004, Graphics
   Interface);
@@ -22,17 +21,22 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sparse
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.cables import CableLayout, routed
-from rfdropo_bayes.fem.corotational import rotation
-from rfdropo_bayes.fem.dynamics import POISSON_LIMIT
-from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.cable_drive import DriveLimits
+from rfdropo_bayes.fem.mesh_points import NodeCables, NodePoints, node_cables
 
 FRAMES = ("polar", "edges")
+POLAR_ITERATIONS = 6
+"""Converge to round-off for stretches between 0.3 and 3."""
+POISSON_LIMIT = 0.499
+"""Larger Poisson ratios are taken as this one: the displacement element has no incompressible limit."""
 LARGEST_WEIGHTS = 8
-"""Nodes that `PointMap` and `CableLayout` reserve for each point; a tetrahedron uses the first four."""
+"""Nodes that `NodePoints` and `NodeCables` reserve for each point; a tetrahedron uses the first four."""
 
 
 class TetrahedralBody(NamedTuple):
@@ -52,6 +56,26 @@ class TetrahedralBody(NamedTuple):
         return len(self.rest)
 
 
+class TetrahedralSystem(NamedTuple):
+    """What does not change between rollouts; static, never traced."""
+
+    body: TetrahedralBody
+    cables: NodeCables
+    limits: DriveLimits
+
+
+class TetrahedralMaterial(NamedTuple):
+    """Physical parameters of one rollout."""
+
+    young_modulus: Float[Array, ""]  # [Pa]
+    poisson_ratio: Float[Array, ""]
+    node_mass: Float[Array, " nodes"]  # [kg]
+    rayleigh_mass: Float[Array, ""]  # [1/s]
+    rayleigh_stiffness: Float[Array, ""]  # [s]
+    gravity: Float[Array, "3"]  # [m/s2]
+    stiffness_scale: Float[Array, " elements"]  # factor on the stiffness of each element
+
+
 def tetrahedral_body(
     rest: Float[np.ndarray, "nodes 3"],
     element: Int[np.ndarray, "elements 4"],
@@ -61,8 +85,8 @@ def tetrahedral_body(
     """Body from node coordinates [m], tetrahedra of positive volume, and which nodes are held.
 
     Raises:
-        InputError: an unknown kind of frame, arrays that do not fit together, a flat or inverted element, or no held
-        node.
+        InputError: an unknown kind of frame, arrays that do not fit together, a flat or inverted element, no held node,
+        or parts of the mesh that hang on none.
     """
     rest, element, fixed = np.asarray(rest, float), np.asarray(element, int), np.asarray(fixed, bool)
     if frames not in FRAMES:
@@ -77,6 +101,7 @@ def tetrahedral_body(
         raise InputError(f"shapes {rest.shape}, {element.shape} and {fixed.shape} do not fit together", where="mesh")
     if not np.any(fixed):
         raise InputError("no node is held", where="mesh", remedy="fix the nodes of the clamped end")
+    _check_held(element, fixed)
     edges = np.swapaxes(rest[element[:, 1:]] - rest[element[:, :1]], 1, 2)
     volume = np.linalg.det(edges) / 6.0
     if not np.all(volume > 0.0):
@@ -89,6 +114,19 @@ def tetrahedral_body(
     return TetrahedralBody(rest, element, fixed, gradient, volume, rest_frame, frames)
 
 
+def _check_held(element: Int[np.ndarray, "elements 4"], fixed: Bool[np.ndarray, " nodes"]) -> None:
+    """Raise InputError for a free node that no chain of elements ties to a held one."""
+    first, second = np.repeat(element[:, 0], 3), element[:, 1:].ravel()
+    graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(fixed), len(fixed)))
+    part = connected_components(graph, directed=False)[1]
+    loose = ~np.isin(part, part[fixed])
+    if np.any(loose):
+        raise InputError(
+            f"{np.sum(loose)} nodes hang on no held node, the first is {int(np.argmax(loose))}",
+            where="mesh", remedy="remove loose parts and unused nodes",
+        )  # fmt: skip
+
+
 def _edge_axes(corners: Float[Array, "elements 4 3"]) -> Float[Array, "elements 3 3"]:
     """Rows: unit vectors along edge 0-1, in the face 0-1-2 across it, and normal to that face."""
     along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -96,6 +134,24 @@ def _edge_axes(corners: Float[Array, "elements 4 3"]) -> Float[Array, "elements 
     normal = jnp.cross(first, across)
     normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
     return jnp.stack([first, jnp.cross(normal, first), normal], axis=1)
+
+
+def cofactor(matrix: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+    """Cofactors of 3 x 3 matrices, det(F) F^-T: no LAPACK call for a matrix this small."""
+    first, second, third = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    return jnp.stack([jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)], axis=-2)
+
+
+def polar_rotation(deformation: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+    """Rotation R of the polar decomposition F = R U, for det F > 0, by Newton's iteration (Higham 1986, SIAM J. Sci.
+    Stat. Comput. 7:1160-1174)."""
+
+    def average(_: Int[Array, ""], current: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+        adjugate = cofactor(current)
+        determinant = jnp.sum(current[..., :1, :] * adjugate[..., :1, :], axis=-1, keepdims=True)
+        return 0.5 * (current + adjugate / determinant)
+
+    return lax.fori_loop(0, POLAR_ITERATIONS, average, deformation)
 
 
 def lame_constants(
@@ -112,7 +168,7 @@ def element_rotations(body: TetrahedralBody, position: Float[Array, "nodes 3"]) 
     corners = position[body.element]
     if body.frames == "edges":
         return jnp.einsum("eki,ekj->eij", _edge_axes(corners), body.rest_frame)
-    return rotation(jnp.einsum("eai,eaj->eij", corners, body.gradient))
+    return polar_rotation(jnp.einsum("eai,eaj->eij", corners, body.gradient))
 
 
 def _slope(
@@ -167,18 +223,6 @@ def nodal_force(
     return jnp.zeros_like(body.rest).at[body.element].add(force)
 
 
-def element_tangents(
-    body: TetrahedralBody, turn: Float[Array, "elements 3 3"], lame: tuple[Float[Array, "..."], Float[Array, "..."]]
-) -> Float[Array, "elements 4 4 3 3"]:
-    """Tangent stiffness Q K Q' [N/m] of every element: block (a, b) couples node a's force to node b's displacement."""
-    first, shear = (jnp.broadcast_to(value * 1.0, body.volume.shape) * body.volume for value in lame)
-    gradient = jnp.einsum("eij,eaj->eai", turn, body.gradient)
-    pairs = jnp.einsum("eai,ebj->eabij", gradient, gradient)
-    dots = jnp.einsum("eai,ebi->eab", gradient, gradient)
-    scaled = (slice(None), None, None, None, None)
-    return first[scaled] * pairs + shear[scaled] * (jnp.swapaxes(pairs, 3, 4) + dots[..., None, None] * jnp.eye(3))
-
-
 def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> Float[Array, " nodes"]:
     """A quarter of every element's mass on each of its nodes [kg]."""
     volume = np.zeros(len(body.rest))
@@ -186,7 +230,7 @@ def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> F
     return jnp.asarray(density) * volume
 
 
-def locate(body: TetrahedralBody, points: Float[np.ndarray, "points 3"]) -> PointMap:
+def locate(body: TetrahedralBody, points: Float[np.ndarray, "points 3"]) -> NodePoints:
     """Bind points of the undeformed body [m] to the four nodes around them (weights padded with zeros).
 
     A point in no element belongs to the one whose centroid is nearest, and follows it by extrapolation (as SOFA's
@@ -204,12 +248,12 @@ def locate(body: TetrahedralBody, points: Float[np.ndarray, "points 3"]) -> Poin
         rank = np.where(outside > 0.0, np.sum((point - centres) ** 2, axis=1), outside)
         chosen = int(np.argmin(rank))
         node[index, :4], weight[index, :4] = body.element[chosen], natural[chosen]
-    return PointMap(node, weight)
+    return NodePoints(node, weight)
 
 
-def mean_points(maps: Sequence[PointMap]) -> PointMap:
+def mean_points(maps: Sequence[NodePoints]) -> NodePoints:
     """Point k is the mean of the k-th points of all maps."""
-    return PointMap(
+    return NodePoints(
         np.concatenate([points.node for points in maps], axis=1),
         np.concatenate([points.weight for points in maps], axis=1) / len(maps),
     )
@@ -217,6 +261,6 @@ def mean_points(maps: Sequence[PointMap]) -> PointMap:
 
 def route_cables(
     body: TetrahedralBody, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
-) -> CableLayout:
-    """Cables of a tetrahedral body; see `fem.cables.routed`."""
-    return routed(partial(locate, body), anchors, guides)
+) -> NodeCables:
+    """Cables of a tetrahedral body; see `node_cables`."""
+    return node_cables(partial(locate, body), anchors, guides)

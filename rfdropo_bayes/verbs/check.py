@@ -37,6 +37,7 @@ from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
@@ -159,8 +160,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
 
 
 def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What the nominal model shows: errors of time step and mesh, and motions of another direction, order or size."""
-    say_step(f"simulating {runs[0].name} with a finer time step and a finer mesh")
+    """What the nominal model shows: errors of time step, elements and motion, and motions in another direction."""
+    say_step(f"simulating {runs[0].name} with a finer time step, more elements, and the other kind of motion")
     spec = spec_of(experiment, folder)
     found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
@@ -239,6 +240,7 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
             ("cable tensions", trajectory.tension),
             ("motor angles", trajectory.motor_angle),
             ("poses of an object", trajectory.object_pose),
+            ("orientations", trajectory.orientation),
         )
         if values is not None
     ]
@@ -303,9 +305,10 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
     if travel is not None:
         yield from _travel(travel, robot)
     asked = asked_pulls(robot, trajectory)
-    beyond = "" if asked is None or asked.max() > robot.length else cables_beyond(robot, asked)
+    doubted = asked is None or (robot.actuators[0].unit == "m" and asked.max() > robot.length)
+    beyond = "" if asked is None or doubted else cables_beyond(robot, asked)
     if beyond:
-        held = "cables are held at their displacement_limit_m where commands ask for more"
+        held = "drives are held at the limits of the robot file if commands ask for more"
         found.notes.append(f"{trajectory.name}: {held}: {beyond}")
 
 
@@ -344,8 +347,11 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
     simulator = None if spec is None else _try(found, partial(build_simulator, spec))
     if spec is None or simulator is None or not fitted:
         return
-    step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
-    found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
+    if simulator.integrator == QUASI_STATIC:
+        found.lines.append(("motion", "quasi-static: every row is an equilibrium, without time step and damping"))
+    else:
+        step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
+        found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
     model = _try(found, lambda: build_model(spec, simulator, fitted))
     if model is not None:
         for index, parameter in enumerate(model.space.parameters):
@@ -359,6 +365,7 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         "tension": any(t.tension is not None for t in fitted),
         "motor_angle": any(t.motor_angle is not None for t in fitted),
         "object_pose": any(t.object_pose is not None for t in fitted),
+        "orientation": any(t.orientation is not None for t in fitted),
     }
     for key, there in recorded.items():
         if there and not asdict(spec.channels)[key]:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rfdropo_bayes.data import lerobot, motive_csv, rosbag
+from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
@@ -21,6 +21,7 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.placement import frame_lines
+from rfdropo_bayes.verbs.slow_motion import slow_motion
 from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 PRIORS = (
@@ -155,8 +156,9 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
 
-    def write(data: list[str]) -> Experiment:
-        experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
+    def write(data: list[str], slow: str | None = None) -> Experiment:
+        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(outline, guess, rests=slow is not None)]
+        experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
     if guess is None:
@@ -172,10 +174,22 @@ def write_first_files(
         outline.gravity,
         cables=outline.cable_names(),
     )
-    frame = _frame(write(tables()), made, guess)
-    if frame:
-        write(tables(frame=frame))
+    plain = write(tables())
+    first = _first_recording(plain, folder)
+    frame, slow = _frame(plain, made, guess), None if first is None else slow_motion(made, first)
+    if frame or slow:
+        write(tables(frame=frame), slow)
     return robot, experiment
+
+
+def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
+    """The first recording to fit; None if it cannot be read, which check says, and the user runs it next."""
+    if experiment.data is None:
+        return None
+    try:
+        return load_recordings(experiment.data, folder)[0]
+    except InputError:
+        return None
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
@@ -339,8 +353,23 @@ def _random_commands(outline: RobotOutline) -> list[str]:
     ]
 
 
-def _model(outline: RobotOutline, guess: Guess | None) -> list[str]:
-    wanted = [(name, why) for name, why in PRIORS if name != "spool_radius" or outline.command_unit == "rad"]
+def _simulator(slow: str | None) -> list[str]:
+    """The table [simulator] for rows that are slow, given why."""
+    if slow is None:
+        return []
+    return [
+        "[simulator]",
+        f"# ASSUMED: {slow}. rfdropo check compares",
+        '# both motions on these commands. "dynamic" has damping, time steps, and a mass that its motion shows.',
+        'motion = "quasi-static"  # every row is an equilibrium',
+        "",
+    ]
+
+
+def _model(outline: RobotOutline, guess: Guess | None, *, rests: bool) -> list[str]:
+    absent = {"spool_radius"} if outline.command_unit != "rad" else set()
+    absent |= {"rayleigh_stiffness"} if rests else set()
+    wanted = [(name, why) for name, why in PRIORS if name not in absent]
     uses = []
     if guess is not None and guess.tensions:
         uses.append("tension = true          # forces are data: they fix the scale of stiffness and mass")

@@ -152,7 +152,7 @@ def commanded(run: Trajectory, factor: float = 1.0, order: Sequence[int] | None 
 
 
 def _paths(spec: ModelSpec, recording: Trajectory) -> Paths:
-    nominal = nominal_markers(spec, recording, longest_of(spec.simulator.body == "layered"))
+    nominal = nominal_markers(spec, recording, longest_of(spec.simulator.body == "rod"))
     names = shared_markers([recording], spec.robot.marker_names)
     index, rows = [recording.marker_names.index(name) for name in names], len(nominal)
     return Paths(nominal, recording.position[:rows, index], recording.position_mask[:rows, index])

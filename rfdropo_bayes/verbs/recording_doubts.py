@@ -146,8 +146,12 @@ def _unasked(recording: Trajectory, robot: Robot) -> list[Caution]:
     return [Caution(Code.RECORDING_DOUBTFUL, sentence)]
 
 
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
+"""Factor and unit in which what drives a cable or a chamber is shown."""
+
+
 def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows cable"] | None:
-    """How far each cable is asked to be pulled [m]; None for commands that do not fit the robot."""
+    """Demand on each cable or chamber, in SI units of its drive; None for commands that do not fit the robot."""
     if len(recording.cable_names) != len(robot.channel_names) or recording.command_unit != robot.command_unit:
         return None
     try:
@@ -159,12 +163,13 @@ def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows 
 
 
 def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
-    """Cables that are asked for more than they are allowed, in words; empty if there are none."""
+    """Cables and chambers that are asked for more than they are allowed, in words; empty if there are none."""
     low, high = asked.min(axis=0), asked.max(axis=0)
-    least, most = np.array(robot.displacement_limits()).T
+    least, most = np.array(robot.drive_limits()).T
+    factor, unit = SHOWN[robot.actuators[0].unit]
     return ", ".join(
-        f"{robot.cable_names[k]} {MILLIMETRES * low[k]:.3g} to {MILLIMETRES * high[k]:.3g} mm "
-        f"(limits {MILLIMETRES * least[k]:.3g} to {MILLIMETRES * most[k]:.3g})"
+        f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
+        f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
         for k in np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
     )
 
@@ -173,7 +178,12 @@ def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
     """Cables that are asked for more than a body has."""
     asked = asked_pulls(robot, recording)
     length = robot.length
-    if asked is None or asked.max(initial=0.0) <= length or not cables_beyond(robot, asked):
+    if (
+        robot.actuators[0].unit != "m"
+        or asked is None
+        or asked.max(initial=0.0) <= length
+        or not cables_beyond(robot, asked)
+    ):
         return []
     sentence = (
         f"{recording.name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: "

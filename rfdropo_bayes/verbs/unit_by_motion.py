@@ -32,7 +32,7 @@ def driven_motion(
     pull = _pulls(robot, command)
     if np.linalg.norm(_turns(robot, pull, place), axis=2).max() > MOST_TURN:
         return None
-    turn = _turns(robot, np.clip(pull, *np.array(robot.displacement_limits()).T), place)
+    turn = _turns(robot, np.clip(pull, *np.array(robot.drive_limits()).T), place)
     slope = turn * np.sinc(np.linalg.norm(turn, axis=2, keepdims=True) / np.pi)
     between = 0.5 * np.diff(place)[:, None, None] * (slope[1:] + slope[:-1])
     across = np.concatenate([np.zeros_like(slope[:1]), np.cumsum(between, axis=0)])

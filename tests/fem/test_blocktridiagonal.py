@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
 
 from rfdropo_bayes import fem  # noqa: F401  (switches JAX to float64)
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
 
 
 def random_system(seed: int, blocks: int, size: int) -> BlockTridiagonal:

@@ -8,20 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered
+from rfdropo_bayes.fem.native.layered_session import LayeredSession
+from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, tetrahedral_system
+from rfdropo_bayes.fem.tetrahedral_dynamics import simulate as simulate_mesh
+from rfdropo_bayes.fem.tetrahedral_dynamics import state_at_rest as mesh_at_rest
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.integrators import STAGES, Integrator
-from rfdropo_bayes.fem.native.layered_engine import NativeLayered
-from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at
 from rfdropo_bayes.fem.tetrahedra import locate, route_cables, tetrahedral_body
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, tetrahedral_system
-from rfdropo_bayes.fem.tetrahedral_dynamics import simulate as simulate_mesh
-from rfdropo_bayes.fem.tetrahedral_dynamics import state_at_rest as mesh_at_rest
 
 TIME_STEP, GRAVITY, LENGTH, SIDE, PLATE, DISTANCE = 0.01, 9.81, 0.12, 0.03, -0.055, 0.005
 REST = PLATE + DISTANCE + SIDE / 2

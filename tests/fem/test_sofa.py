@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.fem.cable_drive import DriveLimits, animated_commands
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.tetrahedra import locate, mean_points, route_cables, tetrahedral_body
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.runtime import configure_jax
 

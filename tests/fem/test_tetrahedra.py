@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.errors import InputError
@@ -23,7 +24,6 @@ from rfdropo_bayes.fem.tetrahedra import (
     route_cables,
     tetrahedral_body,
 )
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()

@@ -1,0 +1,136 @@
+"""Geometrically exact rod elements between two stations: strains, their rates, forces and tangent.
+
+Strains are those of Simo and Reissner in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with
+q_v the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
+Engng 58:79-116). An arc is longer than its chord: the stretch has h^2 (K_1^2 + K_2^2) / 24 besides, without which an
+element that is pressed together between its ends would be too stiff in bending. Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
+forces turn: under guided cables those of the rod and of the cables cancel nearly.
+
+Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
+moment, or velocity and spin, in space.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.components import (
+    Matrix,
+    Quaternion,
+    Vector,
+    cross,
+    diagonal,
+    dot,
+    normalised,
+    product,
+    rotation,
+    skew,
+    times,
+    transposed,
+    transposed_times,
+)
+
+Six = Float[Array, "6 *n"]
+
+
+class Elements(NamedTuple):
+    """Shape of all elements."""
+
+    length: Float[Array, "*n"]  # at rest [m]
+    frame: Matrix  # half-way between both sections
+    way: Vector  # from station to station [m]
+    bend: Vector  # vector part of the quaternion from section to section, in space
+    share: Float[Array, "*n"]  # 1 / (1 + scalar part)
+    strain: Six  # shear (2), stretch; curvature (2), twist [1/m]
+
+
+class Stiffness(NamedTuple):
+    """Tangent stiffness of all elements, in blocks of 3 x 3.
+
+    With translations and rotations of both stations it is [[c, -a], [-a', aa]] at the first, [[c, b], [b', bb]] at the
+    second and [[-c, a], [-b', ba]] between them, rows of the second.
+    """
+
+    c: Matrix
+    a: Matrix
+    b: Matrix
+    aa: Matrix
+    bb: Matrix
+    ba: Matrix
+
+
+def shape(length: Float[Array, "*n"], position: Vector, orientation: Quaternion) -> Elements:
+    """Shape of the elements between neighbouring stations."""
+    first, second = orientation[:, :-1], orientation[:, 1:]
+    scalar = dot(first, second)
+    sign = jnp.where(scalar < 0.0, -1.0, 1.0)
+    scalar, second = sign * scalar, sign * second
+    # Vector parts of second o conj(first) in space, and of conj(first) o second in the frames.
+    across = cross(first[1:], second[1:])
+    straight = first[0] * second[1:] - second[0] * first[1:]
+    frame = rotation(normalised(first + second))
+    way = position[:, 1:] - position[:, :-1]
+    stretch = transposed_times(frame, way) / length
+    stretch = stretch - jnp.array([0.0, 0.0, 1.0]).reshape(3, *[1] * (stretch.ndim - 1))
+    curvature = 2.0 * (straight - across) / length
+    bow = length**2 / 24.0 * (curvature[:1] ** 2 + curvature[1:2] ** 2)
+    strain = jnp.concatenate([stretch[:2], stretch[2:] + bow, curvature])
+    return Elements(length, frame, way, straight + across, 1.0 / (1.0 + scalar), strain)
+
+
+def _less_turn(elements: Elements, vector: Vector) -> Vector:
+    """W times a vector: W (da_b - da_a) is h times the change of curvature, in space."""
+    return vector - elements.bend * (elements.share * dot(elements.bend, vector))
+
+
+def _bow(elements: Elements) -> Vector:
+    """Derivative of the stretch by the curvature, an arc being longer than its chord [m]."""
+    lever = elements.length**2 / 12.0 * elements.strain[3:]
+    return jnp.concatenate([lever[:2], jnp.zeros_like(lever[:1])])
+
+
+def strain_rates(elements: Elements, twist: Six) -> Six:
+    """Rates of the strains from the velocities and spins of all stations."""
+    relative = twist[:, 1:] - twist[:, :-1]
+    spin = twist[3:]
+    lean = elements.share * elements.bend
+    middle = 0.5 * (spin[:, 1:] + spin[:, :-1]) - 0.5 * cross(lean, relative[3:])
+    stretching = transposed_times(elements.frame, relative[:3] + cross(elements.way, middle))
+    bending = transposed_times(elements.frame, _less_turn(elements, relative[3:]))
+    stretching = jnp.concatenate([stretching[:2], stretching[2:] + dot(_bow(elements), bending)[None]])
+    return jnp.concatenate([stretching, bending]) / elements.length
+
+
+def station_forces(elements: Elements, resultant: Six) -> Six:
+    """Forces and moments on all stations of the sections' forces and moments, those in the elements' frames."""
+    force = times(elements.frame, resultant[:3])
+    bent = resultant[3:] + resultant[2] * _bow(elements)
+    moment = _less_turn(elements, times(elements.frame, bent))
+    lever = cross(elements.way, force)
+    half, lean = 0.5 * lever, 0.5 * cross(elements.share * elements.bend, lever)
+    first = jnp.concatenate([force, moment + half - lean])
+    second = jnp.concatenate([-force, half + lean - moment])
+    none = jnp.zeros_like(first[:, :1])
+    return jnp.concatenate([first, none], axis=1) + jnp.concatenate([none, second], axis=1)
+
+
+def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> Stiffness:
+    """Stiffness of the elements, from the stiffness of the sections: a diagonal, and a diagonal or a matrix."""
+    frame, way = elements.frame, elements.way
+    c = product(frame * (stretch / elements.length)[None], transposed(frame))
+    turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
+    bent = product(turned / elements.length, transposed(frame))
+    for _ in range(2):  # W from the left, then, as the matrix is symmetric, from the right
+        row = transposed_times(bent, elements.bend)
+        bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
+    lean = elements.share * elements.bend
+    turn, fold = 0.5 * skew(way), 0.5 * (lean[:, None] * way[None] - diagonal(jnp.stack([dot(lean, way)] * 3)))
+    bow = _less_turn(elements, times(frame, _bow(elements)))
+    arc = frame[:, 2][:, None] * bow[None]
+    lever_a, lever_b = turn + fold - arc, turn - fold + arc
+    a, b = product(c, lever_a), product(c, lever_b)
+    back_a, back_b = transposed(lever_a), transposed(lever_b)
+    return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)

@@ -1,0 +1,93 @@
+"""What the sections of a rod answer to its strains: linear, with the laws of ``effects`` that are given.
+
+The bending law is a symmetric matrix of bending and twist. The fibre law gives every fibre of the section the energy
+E (x^2 - c x^3) / 2 of its strain x: the section's is E A (e^2 - c e^3) / 2 and (1 - 3 c e) times that of bending.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.components import diagonal, dot, times
+from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Scalar
+from rfdropo_bayes.fem.rod import SHEAR, Rod
+
+LEAST_TANGENT = 0.1
+"""Least tangent stiffness under the fibre law, relative to the linear section's: matrices stay positive definite."""
+
+
+class Sections(NamedTuple):
+    """Stiffness of the sections of all elements, at rest."""
+
+    stretch: Float[Array, "3 *n"]  # k G A twice, E A [N]
+    bending: Float[Array, "3 *n"] | Float[Array, "3 3 *n"]  # E I about x, about y, G J; with a bending law a matrix
+    fibre: Scalar | None = None  # c of the fibre law; with a bending law
+
+
+def sections(
+    body: Rod, effects: BodyEffects, young_modulus: Scalar, poisson_ratio: Scalar, scale: Float[Array, " elements"]
+) -> Sections:
+    """Stiffness of the sections of a rod."""
+    young = scale * young_modulus
+    shear = young / (2.0 * (1.0 + poisson_ratio))
+    stretch = jnp.stack([SHEAR * shear * body.axial_area] * 2 + [young * body.axial_area])
+    moment = body.bending_moment_area
+    bending = jnp.stack([young * moment[:, 1], young * moment[:, 0], shear * body.torsion_constant])
+    if effects.bending is None:
+        return Sections(stretch, bending)
+    root = jnp.sqrt(bending)
+    bending = diagonal(bending) + _coupling(effects.bending)[:, :, None] * root[:, None] * root[None]
+    return Sections(stretch, bending, jnp.asarray(effects.bending.fibre, dtype=float))
+
+
+def _coupling(law: BendingLaw) -> Float[Array, "3 3"]:
+    """Change of the moments relative to the geometric means of the stiffnesses."""
+    zero = jnp.zeros(())
+    rows = [
+        [jnp.expm1(-0.5 * law.anisotropy), law.cross_plane, law.twist_x],
+        [law.cross_plane, jnp.expm1(0.5 * law.anisotropy), law.twist_y],
+        [law.twist_x, law.twist_y, zero],
+    ]
+    return jnp.stack([jnp.stack([jnp.asarray(value, dtype=float) for value in row]) for row in rows])
+
+
+def linear(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+    """Forces [N] and moments [N m] of the sections without the fibre law."""
+    law = section.fibre is not None
+    moment = times(section.bending, strain[3:]) if law else section.bending * strain[3:]
+    return jnp.concatenate([section.stretch * strain[:3], moment])
+
+
+def answer(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+    """Forces [N] and moments [N m] of the sections."""
+    result = linear(section, strain)
+    if section.fibre is None:
+        return result
+    stretch, moment = strain[2], times(section.bending[:2, :2], strain[3:5])
+    pull = 1.5 * section.fibre * (section.stretch[2] * stretch**2 + dot(moment, strain[3:5]))
+    softer = 3.0 * section.fibre * stretch * moment
+    return result - jnp.concatenate([jnp.zeros_like(result[:2]), pull[None], softer, jnp.zeros_like(result[:1])])
+
+
+def energy(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "*n"]:
+    """Energy per length [J/m]."""
+    result = 0.5 * dot(linear(section, strain), strain)
+    if section.fibre is None:
+        return result
+    stretch, moment = strain[2], times(section.bending[:2, :2], strain[3:5])
+    return result - 0.5 * section.fibre * stretch * (section.stretch[2] * stretch**2 + 3.0 * dot(moment, strain[3:5]))
+
+
+def slopes(section: Sections, strain: Float[Array, "6 *n"]) -> Sections:
+    """Tangent stiffness of the sections. It leaves out what stretch and bending do to each other."""
+    if section.fibre is None:
+        return section
+    left = jnp.maximum(1.0 - 3.0 * section.fibre * strain[2], LEAST_TANGENT)
+    axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * left.ndim)
+    planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * left.ndim)
+    softer = left - 1.0
+    return Sections(section.stretch * (1.0 + axial * softer), section.bending * (1.0 + planar * softer))

@@ -1,0 +1,289 @@
+"""The linear system of a stage with its constraints: solved on lanes, with derivatives by the solution's own equations.
+
+A stage finds the change d of velocities and spins, and the impulses g of all constraints, from
+
+    A d = r + J' g,    g = P(J (v + d) + b)
+
+Everything dear runs on lanes of a batch (``lanes``). A derivative is one more right-hand side of the system that is
+factorised already: that of what the equations lack when the inputs change and the solution does not, which needs no
+matrix. In reverse it is the transposed system's.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem import rod_elements
+from rfdropo_bayes.fem.cable_problem import settle_cables
+from rfdropo_bayes.fem.cables import CableLayout, Threads, courses, lengths, station_rows
+from rfdropo_bayes.fem.chain import Chain, Eliminated, Factor, ascend, descend, eliminate
+from rfdropo_bayes.fem.components import (
+    Matrix,
+    Quaternion,
+    Vector,
+    cross,
+    product,
+    rotation,
+    times,
+    transposed,
+    transposed_times,
+)
+from rfdropo_bayes.fem.constraints import Contacts, Problem, Slips, answers, posed, settle, slope_matrix
+from rfdropo_bayes.fem.derivatives import pushed_forward
+from rfdropo_bayes.fem.effects import Scalar
+from rfdropo_bayes.fem.lanes import laned
+from rfdropo_bayes.fem.rod_elements import Elements, Six
+from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
+
+
+class StageBody(NamedTuple):
+    """A rod in a stage; arrays have their components first."""
+
+    length: Float[Array, "elements *lanes"]  # [m]
+    section: Sections
+    mass: Float[Array, "stations *lanes"]  # [kg]
+    inertia: Float[Array, "3 stations *lanes"]  # about the sections' axes [kg m2]
+    position: Vector  # where forces are taken [m]
+    orientation: Quaternion
+    twist: Six  # velocities and spins where the stage starts
+    load: Six  # forces and moments besides [N], [N m]
+    span: Scalar  # p [s]
+    lookahead: Scalar  # [s] times the tangent times the change of velocity is the change of force
+    behind: Scalar  # [s] of strain rates in the force
+    loss: Scalar  # Rayleigh's mass damping [1/s]
+    carried: Six | None = None  # impulses [N s] with which the motion goes on
+    added: Matrix | None = None  # to the matrix, of translations [kg]
+    gain: Scalar | None = None  # stiffness of a Prony branch, relative
+    branch: Six | None = None  # strains of its dashpot
+
+
+class Bonds(NamedTuple):
+    """Constraints of a stage: cables, then friction along them, then contacts."""
+
+    thread: Threads
+    reach: Float[Array, " cables"]  # commanded lengths [m]
+    previous: Float[Array, " cables"]  # impulses that the iterations start from [N s]
+    give: Scalar  # of every cable's length per tension [m/N]
+    follows: Scalar  # length of the stage for what has a memory [s]
+    rows: Float[Array, "stations 6 others"] | None = None  # of friction and contacts
+    base: Float[Array, " others"] | None = None  # velocities in these rows besides the body's
+    compliance: Float[Array, "others others"] | None = None  # in these rows besides the body's
+    slips: Slips | None = None
+    contacts: Contacts | None = None
+
+
+class Way(NamedTuple):
+    """What is static: how many stations are held, whether forces are taken where the velocity leads, and the cables."""
+
+    held: int
+    predicted: bool
+    layout: CableLayout
+
+
+class Solution(NamedTuple):
+    """Of a stage."""
+
+    change: Float[Array, "6 stations"]  # of velocities and spins; zero where the body is held
+    impulse: Float[Array, " rows"]  # of all constraints [N s]
+    converged: Float[Array, ""]  # 1 if the impulses were found, else 0
+
+
+class Linearised(NamedTuple):
+    """A stage's equations without constraints."""
+
+    elements: Elements
+    slope: Sections
+    frame: Matrix  # of the stations
+    right: Six
+
+
+class Kept(NamedTuple):
+    """What a derivative of the solution needs."""
+
+    factor: Factor
+    columns: Float[Array, "stations 6 rows"]  # C^-1 J'
+    system: Float[Array, "rows rows"]  # 1 + G W
+    slope: Float[Array, "rows rows"]  # G
+    problem: Problem
+
+
+def inertia_times(body: StageBody, frame: Matrix, twist: Six) -> Six:
+    """Momentum and spin about the stations' centres."""
+    turning = times(frame, body.inertia * transposed_times(frame, twist[3:]))
+    return jnp.concatenate([body.mass * twist[:3], turning])
+
+
+def linearised(body: StageBody) -> Linearised:
+    """The right-hand side of a stage, and what its matrix is made of."""
+    elements = rod_elements.shape(body.length, body.position, body.orientation)
+    slope = slopes(body.section, elements.strain)
+    rates = rod_elements.strain_rates(elements, body.twist)
+    resultant = answer(body.section, elements.strain) + body.behind * linear(slope, rates)
+    if body.branch is not None:
+        resultant = resultant + body.gain * linear(body.section, elements.strain - body.branch)
+    frame = rotation(body.orientation)
+    momentum = inertia_times(body, frame, body.twist)
+    force = rod_elements.station_forces(elements, resultant) + body.load - body.loss * momentum
+    gyroscopic = cross(body.twist[3:], momentum[3:])
+    right = body.span * (force - jnp.concatenate([jnp.zeros_like(gyroscopic), gyroscopic]))
+    if body.carried is not None:
+        right = right + body.carried
+    return Linearised(elements, slope, frame, right)
+
+
+def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
+    """A times a field."""
+    strained = linear(line.slope, rod_elements.strain_rates(line.elements, change))
+    stiff = -body.span * body.lookahead * rod_elements.station_forces(line.elements, strained)
+    result = stiff + (1.0 + body.span * body.loss) * inertia_times(body, line.frame, change)
+    if body.added is None:
+        return result
+    around = times(body.added, change[:3])
+    return result + jnp.concatenate([around, jnp.zeros_like(around)])
+
+
+def matrix(body: StageBody, line: Linearised) -> Chain:
+    """A."""
+    scale = body.span * body.lookahead
+    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, scale * line.slope.bending)
+    grown = 1.0 + body.span * body.loss
+    straight = jnp.eye(3).reshape(3, 3, *[1] * body.mass.ndim) * (grown * body.mass)
+    if body.added is not None:
+        straight = straight + body.added
+    turning = product(line.frame * (grown * body.inertia)[None], transposed(line.frame))
+    return Chain(element, straight, turning)
+
+
+def all_rows(way: Way, body: StageBody, bonds: Bonds, frame: Matrix) -> tuple[Array, Array]:
+    """J of all constraints (stations, 6, rows), and the lengths of the cables [m]."""
+    course = courses(way.layout, bonds.thread, body.position, frame)
+    rows = -station_rows(way.layout, bonds.thread, course.lever, course.pull, body.mass.shape[0])
+    if bonds.rows is not None:
+        rows = jnp.concatenate([rows, bonds.rows], axis=2)
+    return rows, lengths(course)
+
+
+def along(rows: Float[Array, "stations 6 rows"], twist: Six) -> Float[Array, " rows"]:
+    """J times velocities."""
+    return jnp.einsum("sir,is->r", rows, twist)
+
+
+def free_velocities(
+    way: Way, body: StageBody, bonds: Bonds, moving: Float[Array, "rows *lanes"], reached: Float[Array, "cables *lanes"]
+) -> Float[Array, "rows *lanes"]:
+    """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
+    cables = len(reached)
+    slack = (bonds.reach - reached) / body.span
+    free = slack if way.predicted else moving[:cables] + slack
+    return free if bonds.base is None else jnp.concatenate([free, moving[cables:] + bonds.base])
+
+
+def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Eliminated, Float[Array, "rows lanes"]]:
+    """Elimination, and the velocities of the constraints without them; on lanes."""
+    line = linearised(body)
+    rows, reached = all_rows(way, body, bonds, line.frame)
+    found = eliminate(matrix(body, line), line.right, rows, body.twist, way.held)
+    return found, free_velocities(way, body, bonds, found.moving, reached) + found.reached
+
+
+def _project(factor: Factor, columns: Array, right: Six) -> tuple[Array, Array]:
+    """C^-1 times a right-hand side, and J A^-1 times it; on lanes."""
+    return descend(factor, columns, jnp.moveaxis(right, 1, 0))
+
+
+def _finish(factor: Factor, solved: Array, columns: Array, impulse: Array) -> Six:
+    """The solution from C^-1 times its right-hand side without impulses; on lanes."""
+    pulled = sum((columns[:, :, row] * impulse[row] for row in range(columns.shape[2])), solved)
+    return jnp.moveaxis(ascend(factor, pulled), 0, 1)
+
+
+def _padded(free: Six, held: int) -> Six:
+    return jnp.concatenate([jnp.zeros_like(free[:, :1])] * held + [free], axis=1)
+
+
+def _problem(bonds: Bonds, span: Scalar, compliance: Array) -> Problem:
+    cables = len(bonds.previous)
+    compliance = compliance.at[jnp.arange(cables), jnp.arange(cables)].add(bonds.give / span**2)
+    if bonds.compliance is not None:
+        compliance = compliance.at[cables:, cables:].add(bonds.compliance)
+    return posed(compliance, cables, bonds.follows, bonds.slips, bonds.contacts)
+
+
+def _solve(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Kept]:
+    eliminated, free = laned(partial(_condense, way))(body, bonds)
+    problem = _problem(bonds, body.span, eliminated.compliance)
+    if bonds.rows is None:
+        impulse, converged = laned(settle_cables)(problem.compliance, free, problem.softness, bonds.previous)
+    else:
+        others = [jnp.zeros(len(problem.slips.impulse)), problem.contacts.before.ravel()]
+        impulse, converged = settle(problem, free, jnp.concatenate([bonds.previous, *others]))
+    factor, columns = eliminated.factor, eliminated.columns
+    change = laned(_finish)(factor, eliminated.solved, columns, impulse)
+    slope = slope_matrix(answers(problem, free + problem.compliance @ impulse))
+    system = jnp.eye(len(impulse)) + slope @ problem.compliance
+    found = Solution(_padded(change, way.held), impulse, jnp.asarray(converged, float))
+    return found, Kept(factor, columns, system, slope, problem)
+
+
+def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bonds) -> tuple[Array, Array]:
+    """What the equations of a stage lack at a solution, as functions of the inputs."""
+    line = linearised(body)
+    rows, reached = all_rows(way, body, bonds, line.frame)
+    pulled = jnp.einsum("sir,r->is", rows, found.impulse)
+    forces = matrix_times(body, line, found.change) - line.right - pulled
+    cables = len(bonds.previous)
+    velocity = free_velocities(way, body, bonds, along(rows, body.twist), reached) + along(rows, found.change)
+    velocity = velocity.at[:cables].add(bonds.give / body.span**2 * found.impulse[:cables])
+    problem = kept.problem._replace(time_step=bonds.follows)
+    if bonds.rows is not None:
+        velocity = velocity.at[cables:].add(bonds.compliance @ found.impulse[cables:])
+        problem = problem._replace(slips=bonds.slips, contacts=bonds.contacts)
+    return forces[:, way.held :], found.impulse - answers(problem, velocity)[0]
+
+
+def _linear_solve(kept: Kept, forces: Array, impulses: Array) -> tuple[Array, Array]:
+    """Solution of A d - J' g = forces, g + G (J d + ...) = impulses; in reverse, of the transposed system."""
+    factor, columns, system, slope = kept[:4]
+
+    def solve(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
+        solved, reached = laned(_project)(factor, columns, right[0])
+        impulse = jnp.linalg.solve(system, right[1] - slope @ reached)
+        return laned(_finish)(factor, solved, columns, impulse), impulse
+
+    def transpose_solve(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
+        solved, reached = laned(_project)(factor, columns, right[0])
+        impulse = jnp.linalg.solve(system.T, right[1] + reached)
+        return laned(_finish)(factor, solved, columns, -slope.T @ impulse), impulse
+
+    # The operator itself is asked for its shape only, as nothing in it has a derivative.
+    return lax.custom_linear_solve(lambda x: x, (forces, impulses), solve, transpose_solve, symmetric=True)
+
+
+def solve_stage(way: Way, body: StageBody, bonds: Bonds) -> Solution:
+    """Change of velocities and impulses of a stage."""
+
+    @jax.custom_jvp
+    def solution(body: StageBody, bonds: Bonds) -> Solution:
+        return _solve(way, body, bonds)[0]
+
+    def rule(primals: Any, tangents: Any) -> tuple[Solution, Solution]:
+        found, kept = lax.stop_gradient(_solve(way, *primals))
+        lacking = partial(_lacking, way, found, kept)
+        forces, impulses = pushed_forward(lacking, primals, tangents)
+        change, impulse = _linear_solve(kept, -forces, -impulses)
+        return found, Solution(_padded(change, way.held), impulse, jnp.zeros_like(found.converged))
+
+    solution.defjvp(rule, symbolic_zeros=True)
+    return solution(body, bonds)
+
+
+def solved_stage(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Float[Array, " cables"]]:
+    """`solve_stage` without derivatives, and the softness of the cables' constraints."""
+    found, kept = _solve(way, body, bonds)
+    return found, kept.problem.softness
