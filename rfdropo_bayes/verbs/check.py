@@ -165,7 +165,10 @@ def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequen
     spec = spec_of(experiment, folder)
     found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
-    found.doubts += [caution.sentence for caution in _try(found, partial(measure_motion, spec, runs, columns)) or []]
+    compared = _try(found, partial(measure_motion, spec, runs, columns))
+    if compared is not None:
+        found.lines.append(("motion", compared.words))
+        found.doubts += [caution.sentence for caution in compared.cautions]
 
 
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:

@@ -110,8 +110,15 @@ def _order_words(order: Reordered, columns: CsvColumns | None, names: Sequence[s
     return f"commands = [{listed}] in [data.columns]"
 
 
-def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> list[Caution]:
-    """Simulate recordings with the nominal model, and say what speaks against frame, order and unit of their commands.
+class Compared(NamedTuple):
+    """A comparison with the nominal model in words, and what speaks against frame, order and unit of the commands."""
+
+    words: str
+    cautions: list[Caution]
+
+
+def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> Compared:
+    """Simulate recordings with the nominal model, and compare what markers do.
 
     Args:
         spec: of a robot; values are nominal or fixed.
@@ -131,7 +138,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
             raise
         measured = f"the markers moved by {1e3 * found[1].measured:.3g} mm"
         words = f"{error.what} under the commands as they were read, and {measured}; {unit_words(columns, found)}"
-        return [Caution(Code.UNIT_DOUBTFUL, words)]
+        return Compared(error.what, [Caution(Code.UNIT_DOUBTFUL, words)])
     direction, size = direction_of(paths), size_of(paths)
     order = _order(spec, runs, direction) if direction.straight < AGREES else None
     unit = None
@@ -139,7 +146,12 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
         run = runs[0] if order is None else commanded(runs[0], order=order.columns)
         unit = _explained(spec, run, likely_units(units, size))
     motion = Motion(direction, size, order, unit)
-    return motion_cautions(motion, columns, runs[0].cable_names, runs[0].command_unit)
+    in_unit = runs[0].command_unit if columns is None else f"{columns.command_unit} (command_unit)"
+    words = (
+        f"the markers move by {1e3 * size.measured:.3g} mm, the nominal model under commands in {in_unit} by "
+        f"{1e3 * size.nominal:.3g} mm; agreement {direction.straight:.2f}"
+    )
+    return Compared(words, motion_cautions(motion, columns, runs[0].cable_names, runs[0].command_unit))
 
 
 def commanded(run: Trajectory, factor: float = 1.0, order: Sequence[int] | None = None) -> Trajectory:

@@ -63,8 +63,11 @@ def _pulls(robot: Robot, command: Float[np.ndarray, "row channel"]) -> Float[np.
 
 
 def spread(position: Float[np.ndarray, "row marker axis"]) -> float:
-    """Root mean square motion of markers about their mean [m]; rows without a marker are passed over."""
-    return float(np.sqrt(np.nanmean(np.sum((position - np.nanmean(position, axis=0)) ** 2, axis=2))))
+    """Root mean square motion of markers about their mean [m]; 0 if none is seen."""
+    lost = ~np.isfinite(position).all(axis=2)
+    places = [own[~gone] for own, gone in zip(np.moveaxis(position, 1, 0), lost.T, strict=True) if not gone.all()]
+    squares = [np.sum((own - own.mean(axis=0)) ** 2, axis=1) for own in places]
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
 
 
 def unit_of_motion(
@@ -83,10 +86,13 @@ def unit_of_motion(
         heights: of the same markers on the robot [m].
         guessed: the unit by the size of the commands.
     """
-    kind, size = COMMAND_UNITS[guessed.unit]
+    kind, size = COMMAND_UNITS.get(guessed.unit, ("", 1.0))
     if kind not in IMPOSED or kind != robot.command_unit or not np.isfinite(command).all():
         return guessed
-    measured, moved = spread(position), dict[str, Size]()
+    seen = np.where((position == 0.0).all(axis=2, keepdims=True), np.nan, position)  # how some trackers lose a marker
+    measured, moved = spread(seen), dict[str, Size]()
+    if measured == 0.0:
+        return guessed
     for name, (other, own) in COMMAND_UNITS.items():
         driven = driven_motion(robot, own * command, list(heights.values())) if other == kind else None
         if driven is not None:

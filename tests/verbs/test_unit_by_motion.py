@@ -47,9 +47,10 @@ def test_the_unit_that_explains_the_motion_is_taken_with_its_evidence(segments, 
     command = opposed(0.005 / size, segments)
     across = 1.6 * driven_motion(arm, size * command, list(HEIGHTS.values()))  # a body is no arc
     position = np.concatenate([across, np.full((*across.shape[:2], 1), 0.1)], axis=2)
-    position[3, 0] = np.nan
+    position[3, 0], position[4, 1] = np.nan, 0.0
     found = unit_of_motion(arm, command, position, HEIGHTS, Unit(guessed, evidence="c1 to c4 reach 5"))
     assert found.unit == true
+    position[4, 1] = np.nan
     assert found.evidence.startswith(f"c1 to c4 reach 5; the markers move by {1e3 * spread(position):.3g} mm")
     assert f"in {guessed} " in found.evidence
 
@@ -68,3 +69,5 @@ def test_a_motion_that_no_unit_explains_keeps_the_guess():
     found = unit_of_motion(robot(), opposed(1e-4), position, HEIGHTS, Unit("mm", evidence="x"))
     assert found.unit == "mm"
     assert "in mm" in found.evidence
+    lost = np.full((90, 2, 3), np.nan)
+    assert unit_of_motion(robot(), opposed(1e-4), lost, HEIGHTS, Unit("mm", evidence="x")).evidence == "x"
