@@ -2,7 +2,7 @@
 
     python benchmarks/engines.py [--truth mujoco] [--pieces 20] [--refine 2] [--poisson 0.42 0.1 0] [--seed 1]
 
-The recordings are the four different fitted ones of the study's data set with a payload (`rfdropo benchmark audit
+The recordings are the four different fitted ones of the study's data set with a payload (`python -m studies audit
 --truth mujoco`), the truth's values are given to ours, with the compliance of the servos. Each row is a difference of
 two arms: of their tips, root mean square; and its linear fit by the total mass, the damping, the servos' compliance,
 a payload and a tilt of gravity, with the deviations that the study's noise gives them. Poisson's ratio is held.

@@ -2,7 +2,7 @@
 
     python benchmarks/prior_alarms.py [--datasets 10] [--seed 7] [--spread 0.3] [--out reports/audit_power/prior_alarms]
 
-Data sets of the study of audits' power with nothing hidden (`rfdropo benchmark audit`, condition null). The base model
+Data sets of the study of audits' power with nothing hidden (`python -m studies audit`, condition null). The base model
 is fitted under the known noise, from the truth on, and cautioned about as at an audit's end; no candidate is screened.
 ``spread`` is how far truths lie from the middle of their priors, in deviations of these: the study's 0.3, or 1 for
 truths as the priors have them. A line of the ledger for each data set; one that is in it is not fitted again.
