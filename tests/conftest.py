@@ -75,7 +75,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
-MOST_MEMORY = 1.0e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
+MOST_MEMORY = 2.5e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -174,7 +174,7 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, nam
     assert content["numerical_error_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(moved**2, axis=-1))), rel=1e-4)
 
 
-@pytest.mark.parametrize("left", [0.0, SMALL / 2])
+@pytest.mark.parametrize("left", [pytest.param(0.0, marks=pytest.mark.slow), SMALL / 2])
 def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(left):
     """Also where the finer simulator has half of the error itself, as with time steps of first order."""
     answer = audit(on_a_coarse_mesh(problem(TRUTH, 102), SMALL, left))
@@ -335,7 +335,7 @@ def test_a_base_model_without_the_time_for_its_fit_is_refused():
 @pytest.mark.parametrize(
     "share", [pytest.param(0.0, marks=pytest.mark.slow), 0.5, pytest.param(0.95, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
     """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""
     asked = problem({**TRUTH, "play": 1.0}, 1)
@@ -537,7 +537,10 @@ def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
     np.testing.assert_allclose(answer.target.noise.scale, NOISE, rtol=0.1)
 
 
-@pytest.mark.parametrize(("size", "play", "suspected"), [(1 / 3, 0.0, True), (1.0, 0.0, False), (1.0, 3.0, False)])
+@pytest.mark.parametrize(
+    ("size", "play", "suspected"),
+    [(1 / 3, 0.0, True), (1.0, 0.0, False), pytest.param(1.0, 3.0, False, marks=pytest.mark.slow)],
+)
 def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(size, play, suspected):
     stated = Stacked((Autoregression(np.full(12, size * NOISE), np.array([1.0, 0.6]), STATED, np.inf),))
     answer = audit(replace(unrepeated({"play": play}, 6), stated_noise=stated))

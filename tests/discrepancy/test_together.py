@@ -39,6 +39,7 @@ def test_two_effects_that_pay_only_together_are_named_together(opposed):
         assert abs(sizes.mean() - true) < 4 * sizes.std()
 
 
+@pytest.mark.slow
 def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
     monkeypatch.setattr(ExtensionSearch, "_pair", lambda *given: [])
     assert audit(opposed).causes.steps == []
