@@ -59,9 +59,7 @@ and in a row of a quasi-static motion. What is left is a tenth of it at most: it
 
 # When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
 # resolves them.
-_NUMERICS = {
-    name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")
-}
+_NUMERICS = {name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")}
 
 
 class Run(NamedTuple):
@@ -81,9 +79,7 @@ class Run(NamedTuple):
         pose = None if self.poses is None else self.poses.pose
         diverged = output.diverged.view(bool) | ~self.commanded
         solved = output.converged.view(bool)
-        return Motion(
-            output.position, output.tension, diverged, output.imbalance, solved, pose, solves=output.solves
-        )
+        return Motion(output.position, output.tension, diverged, output.imbalance, solved, pose, solves=output.solves)
 
     @property
     def commanded(self) -> Bool[np.ndarray, " batch"]:
@@ -157,7 +153,7 @@ class NativeRod:
         self._runs = runs_of(system.cables)
         self._steps: Integrator = "euler" if integrator == "quasi-static" else integrator
         if scene is not None and integrator == "quasi-static":
-            raise InputError("a body that touches a cube and is always at rest", remedy='use another integrator')
+            raise InputError("a body that touches a cube and is always at rest", remedy="use another integrator")
         self._scene = None if scene is None else rod_scene(scene, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()

@@ -23,7 +23,6 @@ from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
 
-
 ROW_ITERATIONS = 30
 """Of a row of a quasi-static motion, at most."""
 
@@ -58,7 +57,9 @@ class RodOutput(NamedTuple):
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
-    converged: UInt8[np.ndarray, " batch"]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
+    converged: UInt8[
+        np.ndarray, " batch"
+    ]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
     imbalance: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium
     solves: Float[np.ndarray, " batch"]  # of the equilibria of all rows
     records: int
@@ -90,18 +91,22 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
     def rows(**sizes: int) -> dict[str, np.ndarray]:
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
-    values = stations * SIZE
     samples = rows(
         moduli=2, density=1, scale=elements, point_mass=stations, section=SECTION * elements, gravity=3, damping=2,
         law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
+    state = dict.fromkeys(
+        ("velocity", "solution", "field", "before", "sudden", "way", "change", "went", "older", "earlier", "branch"),
+        stations * SIZE,
+    )
+    once = dict.fromkeys(
+        ("unsolved", "accepted", "lost", "failed", "moving", "solves", "imbalance", "softness", "firmness", "loss"), 1
+    )
     work = rows(
-        turn=4 * stations, frame=FRAME * stations, velocity=values, pivot=BLOCK * stations, coupling=BLOCK * stations,
-        border=PANEL * panels * stations, condensed=9 * panels**2, solution=values, field=values, weight=3 * panels,
-        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
-        commanded=cables, unsolved=1, accepted=1, lost=1, failed=1, points=3 * tables.points, before=values,
-        sudden=values, way=values, change=values, went=values, older=values, earlier=values, moving=1, solves=1, imbalance=1, softness=1, firmness=1, loss=1,
-        pushed=3 * stations, given=3 * stations, branch=values,
+        turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
+        border=PANEL * panels * stations, condensed=9 * panels**2, weight=3 * panels, element=ELEMENT,
+        lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
+        commanded=cables, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state, **once,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
     return RodSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, RodWork(**work)

@@ -78,7 +78,10 @@ def _remember(tables, work, token):
 def _mixing(tables, work, number, token):
     """Shares of the last two changes of the increment that cancel it best."""
     zero, one, tiny = fill(0.0, work.frame, token), fill(1.0, work.frame, token), fill(TINY, work.frame, token)
-    first, along = _product(tables, work.change, work.change, token), _product(tables, work.change, work.solution, token)
+    first, along = (
+        _product(tables, work.change, work.change, token),
+        _product(tables, work.change, work.solution, token),
+    )
     alone = along / where_greater(first, tiny, first, one)
     alone = where_greater(first, tiny, alone, zero)
     if number < 2:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import (
     BLOCK,
     PANEL,
@@ -22,7 +21,18 @@ from rfdropo_bayes.fem.native.rod_assembly import (
 )
 from rfdropo_bayes.fem.native.rod_effects import GAIN, GIVE, SHARE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, magnitude, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import (
+    fill,
+    fma,
+    fnma,
+    kernel,
+    load,
+    load3,
+    magnitude,
+    square_root,
+    store,
+    where_greater,
+)
 from rfdropo_bayes.fem.native.vectors import added, cross, dot, minus, plus, put, scaled
 
 LARGEST = 1e30
@@ -245,7 +255,9 @@ def near(tables, work, length, predicted, token):
     accepted, zero = fill(1.0, work.frame, token), fill(0.0, work.frame, token)
     reach, largest = fill(tables.reach, work.frame, token), fill(LARGEST, work.frame, token)
     for station in range(tables.stations):
-        there = plus(load3(work.frame, FRAME * station, token), _step_of(work, SIZE * station, length, predicted, token))
+        there = plus(
+            load3(work.frame, FRAME * station, token), _step_of(work, SIZE * station, length, predicted, token)
+        )
         turn = _step_of(work, SIZE * station + 3, length, predicted, token)
         rest = zero, zero, fill(tables.rest[station], work.frame, token)
         for i in range(3):
@@ -275,7 +287,11 @@ def move_stations(tables, accepted, work, token):
     zero = fill(0.0, work.frame, token)
     for station in range(tables.held, tables.stations):
         frame, row, t = FRAME * station, SIZE * station, 4 * station
-        here, scalar, vector = load3(work.frame, frame, token), load(work.turn, t, token), load3(work.turn, t + 1, token)
+        here, scalar, vector = (
+            load3(work.frame, frame, token),
+            load(work.turn, t, token),
+            load3(work.turn, t + 1, token),
+        )
         put(work.frame, frame, chosen(accepted, plus(load3(work.solution, row, token), here), here))
         turn_station(work, station, load3(work.solution, row + 3, token), token)
         store(work.turn, t, where_greater(accepted, zero, load(work.turn, t, token), scalar))

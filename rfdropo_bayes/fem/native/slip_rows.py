@@ -58,7 +58,11 @@ def weigh_guides(runs, samples, friction, direction, token):
 @kernel
 def _inverse(friction, row, token):
     """One over the friction of a run, or one if there is none."""
-    zero, one, whole = fill(0.0, friction.whole, token), fill(1.0, friction.whole, token), load(friction.whole, row, token)
+    zero, one, whole = (
+        fill(0.0, friction.whole, token),
+        fill(1.0, friction.whole, token),
+        load(friction.whole, row, token),
+    )
     return one / where_greater(whole, zero, whole, one)
 
 

@@ -89,7 +89,9 @@ def row_entry(scene, arm, touch, slot, k, r, token):
     if arm is None:
         if r > 0:
             x, y, z = load3(touch.offset, 3 * slot, token)
-            centre = fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2])) + centre
+            centre = (
+                fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2])) + centre
+            )
         return scaled(way, centre)
     if scene.place[k] % SIZE == 0:
         return scaled(way, centre)
