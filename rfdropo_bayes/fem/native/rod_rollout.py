@@ -17,7 +17,13 @@ from rfdropo_bayes.fem.native.rod_assembly import measure_element
 from rfdropo_bayes.fem.native.rod_constraints import constrained_stage
 from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED, follow_branch
 from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
-from rfdropo_bayes.fem.native.rod_statics import come_to_rest, keep_found, measure_imbalance, put_at_rest
+from rfdropo_bayes.fem.native.rod_statics import (
+    come_to_rest,
+    forget_iterations,
+    keep_found,
+    measure_imbalance,
+    put_at_rest,
+)
 from rfdropo_bayes.fem.native.rod_step import predict_stations, set_factors
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
@@ -140,6 +146,7 @@ def start_rollouts(tables, batch, samples, work, first, token):
         samples.present[flag] = batch.present[flag]
     _prepare(tables, samples, token)
     put_at_rest(tables, nothing, work, token)
+    forget_iterations(tables, work, token)
     clear(work.tension, 0, tables.cables, token)
     clear(work.velocity, 0, values, token)
     clear(work.branch, 0, values, token)
