@@ -70,7 +70,7 @@ def _keep(rows, row, value, moving, token):
 
 @kernel
 def _remember(tables, work, again, moving, token):
-    """Keep the increment; and if there was one before it, how it has changed, by which way, and the pair before that."""
+    """Keep the increment, and if there was one before it its change, the way that made it, and the pair before that."""
     for row in range(SIZE * tables.held, SIZE * tables.stations):
         now = load(work.solution, row, token)
         if again:
