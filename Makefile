@@ -71,8 +71,8 @@ matrix-drawn: $(DEV) ## a tenth of the matrix, drawn by the commit
 notebook-drawn: $(DEV) ## one notebook, drawn by the commit
 	$(PYTEST) -m notebook --drawn 1 --by $(COMMIT) tests/test_notebooks.py
 
-test-compiler: $(DEV) ## the layered engine, its kernels compiled by Numba's own compilers (docs/native.md)
-	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_layered.py tests/fem/test_native_session.py tests/fem/test_compilers.py
+test-compiler: $(DEV) ## the engine of rods, its kernels compiled by Numba's own compilers (docs/native.md)
+	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_rod.py tests/fem/test_native_session.py tests/fem/test_compilers.py
 
 lint: $(DEV) ## ruff, its formatter, and mypy
 	$(BIN)/ruff check .
