@@ -31,19 +31,19 @@ class Chain(NamedTuple):
 class Factor(NamedTuple):
     """A = C C', with C lower block-bidiagonal."""
 
-    pivot: Float[Array, "stations 6 6 *lanes"]  # lower triangles of C's diagonal blocks, their diagonals inverted
-    coupling: Float[Array, "stations 6 6 *lanes"]  # transposed blocks below the diagonal; zero at the first station
+    pivot: Float[Array, "stations 6 6 ..."]  # lower triangles of C's diagonal blocks, their diagonals inverted
+    coupling: Float[Array, "stations 6 6 ..."]  # transposed blocks below the diagonal; zero at the first station
 
 
 class Eliminated(NamedTuple):
     """What elimination finds."""
 
     factor: Factor
-    solved: Float[Array, "stations 6 *lanes"]  # y = C^-1 times the right-hand side
-    columns: Float[Array, "stations 6 rows *lanes"]  # Y = C^-1 J'
-    compliance: Float[Array, "rows rows *lanes"]  # Y' Y = J A^-1 J'
-    reached: Float[Array, "rows *lanes"]  # Y' y
-    moving: Float[Array, "rows *lanes"]  # J times the velocities
+    solved: Float[Array, "stations 6 ..."]  # y = C^-1 times the right-hand side
+    columns: Float[Array, "stations 6 rows ..."]  # Y = C^-1 J'
+    compliance: Float[Array, "rows rows ..."]  # Y' Y = J A^-1 J'
+    reached: Float[Array, "rows ..."]  # Y' y
+    moving: Float[Array, "rows ..."]  # J times the velocities
 
 
 def _triangle(block: Any) -> Array:
@@ -78,15 +78,15 @@ def _at(values: Any, index: Array) -> Any:
     return jax.tree.map(lambda part: lax.dynamic_index_in_dim(part, index, 2, keepdims=False), values)
 
 
-def _block(one: Matrix, two: Matrix, three: Matrix, four: Matrix) -> Float[Array, "6 6 *n"]:
+def _block(one: Matrix, two: Matrix, three: Matrix, four: Matrix) -> Float[Array, "6 6 ..."]:
     return jnp.concatenate([jnp.concatenate([one, two], axis=1), jnp.concatenate([three, four], axis=1)])
 
 
 def eliminate(
     chain: Chain,
-    right: Float[Array, "6 stations lanes"],
-    rows: Float[Array, "stations 6 rows lanes"],
-    twist: Float[Array, "6 stations lanes"],
+    right: Float[Array, "6 stations ..."],
+    rows: Float[Array, "stations 6 rows ..."],
+    twist: Float[Array, "6 stations ..."],
     held: int,
 ) -> Eliminated:
     """Factorise and go down with a right-hand side and the rows J of constraints, over the stations that are free."""
@@ -131,8 +131,8 @@ def eliminate(
 
 
 def descend(
-    factor: Factor, columns: Float[Array, "stations 6 rows lanes"], right: Float[Array, "stations 6 lanes"]
-) -> tuple[Float[Array, "stations 6 lanes"], Float[Array, "rows lanes"]]:
+    factor: Factor, columns: Float[Array, "stations 6 rows ..."], right: Float[Array, "stations 6 ..."]
+) -> tuple[Float[Array, "stations 6 ..."], Float[Array, "rows ..."]]:
     """y = C^-1 times a right-hand side, and Y' y."""
 
     def one(before: tuple[Array, Array], here: tuple[Array, ...]) -> tuple[Any, Array]:
@@ -147,7 +147,7 @@ def descend(
     return solved, total
 
 
-def ascend(factor: Factor, right: Float[Array, "stations 6 lanes"]) -> Float[Array, "stations 6 lanes"]:
+def ascend(factor: Factor, right: Float[Array, "stations 6 ..."]) -> Float[Array, "stations 6 ..."]:
     """C'^-1 times a right-hand side."""
 
     def one(after: tuple[Array, Array], here: tuple[Array, Array, Array]) -> tuple[Any, Array]:
