@@ -52,20 +52,20 @@ class Shapes(NamedTuple):
 
 
 def euler(angle: Float[np.ndarray, "shapes 3"]) -> Float[np.ndarray, "shapes 3 3"]:
-    """Rotation Rz Ry Rx from angles about x, y and z [rad]."""
+    """Rotation Rx Ry Rz from angles about x, y and z [rad]."""
     sine, cosine = np.sin(angle), np.cos(angle)
     x, y, z = (np.tile(np.eye(3), (len(angle), 1, 1)) for _ in range(3))
     for matrix, axis, (i, k) in ((x, 0, (1, 2)), (y, 1, (2, 0)), (z, 2, (0, 1))):
         matrix[:, i, i] = matrix[:, k, k] = cosine[:, axis]
         matrix[:, i, k], matrix[:, k, i] = -sine[:, axis], sine[:, axis]
-    return z @ y @ x
+    return x @ y @ z
 
 
 def read(file: Path) -> Shapes:
     """The shapes of a file."""
     rows = [line.split(",")[1:] for line in file.read_text().splitlines()[2:]]
     values = np.array(rows, dtype=float).reshape(-1, 6, 17)
-    angles, places = values[:, :3], values[:, 3:] 
+    angles, places = values[:, :3], values[:, 3:]
     ends = [9, 16]
     frame = np.stack([TURN @ euler(angles[:, :, k]) @ TURN.T for k in ends], axis=1)
     wrench = np.concatenate([places[:, :, 1:3], angles[:, :, 1:3]], axis=1)
@@ -105,12 +105,8 @@ def settle(rod: Rod, gravity: jax.Array, wrench: jax.Array) -> tuple[jax.Array, 
 
 
 def errors(rod: Rod, shapes: Shapes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors of places [m] and rotations [rad] of middle and tip, and which shapes settled.
-
-    Wrenches are given in the frames of their sections, which the files tell.
-    """
-    local = np.stack([shapes.middle, shapes.tip], axis=1).reshape(-1, 2, 2, 3)
-    wrench = np.einsum("seij,sebj->sebi", shapes.frame, local).reshape(-1, 2, 6)
+    """Errors of places [m] and rotations [rad] of middle and tip, and which shapes settled."""
+    wrench = np.stack([shapes.middle, shapes.tip], axis=1)
     place, turn, settled = jax.jit(jax.vmap(partial(settle, rod)))(shapes.gravity, wrench)
     w, x, y, z = np.moveaxis(np.asarray(turn), -1, 0)
     frame = np.array(
@@ -128,7 +124,8 @@ def errors(rod: Rod, shapes: Shapes) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def main() -> None:
     """Print the errors."""
     folder, many = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else None
-    print(f"{'rod':16}{'shapes':>8}{'settled':>8}{'mean mm':>9}{'worst mm':>10}{'of length':>11}{'mean rad':>10}{'worst':>8}")
+    titles = f"{'mean mm':>9}{'worst mm':>10}{'of length':>11}{'mean rad':>10}{'worst':>8}"
+    print(f"{'tip of':16}{'shapes':>8}{'settled':>8}{titles}")
     for name, rod in RODS.items():
         shapes = Shapes(*(part[:many] for part in read(folder / f"{name}.csv")))
         far, turned, settled = errors(rod, shapes)

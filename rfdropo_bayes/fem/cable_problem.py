@@ -43,13 +43,9 @@ def settle_cables(
     start: Float[Array, "n ..."],
 ) -> tuple[Float[Array, "n ..."], Float[Array, " ..."]]:
     """Impulses, and 1 where they were found."""
-    size = len(free)
-    lanes = max(part.shape[-1] for part in (compliance, free, softness, start))
+    size, lanes = free.shape
     if not size:
         return jnp.zeros((0, lanes)), jnp.ones(lanes)
-    compliance, free, softness, start = (
-        jnp.broadcast_to(part, (*part.shape[:-1], lanes)) for part in (compliance, free, softness, start)
-    )
     usable = jnp.isfinite(softness)
     soft = jnp.where(usable, softness, 1.0)
     eye = jnp.eye(size)[:, :, None]
@@ -95,9 +91,7 @@ def settle_cables(
             return now.impulse + share * change, pulling(velocity + share * moving), still & (now.iteration > 0)
 
         done = now.found | same
-        impulse, active, still = lax.cond(
-            jnp.all(done), lambda: (aim, now.active, jnp.zeros(lanes, bool)), go_on
-        )
+        impulse, active, still = lax.cond(jnp.all(done), lambda: (aim, now.active, jnp.zeros(lanes, bool)), go_on)
         impulse = jnp.where(now.found, now.impulse, jnp.where(same, aim, impulse))
         return _Iterate(impulse, jnp.where(done, now.active, active), done | still, now.iteration + 1)
 

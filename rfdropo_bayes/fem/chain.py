@@ -90,8 +90,7 @@ def eliminate(
     held: int,
 ) -> Eliminated:
     """Factorise and go down with a right-hand side and the rows J of constraints, over the stations that are free."""
-    stations, many = right.shape[1], rows.shape[2]
-    lanes = max(part.shape[-1] for part in jax.tree.leaves((chain, right, rows, twist)))
+    stations, many, lanes = right.shape[1], rows.shape[2], right.shape[-1]
 
     def one(before: Any, here: tuple[Array, Array]) -> tuple[Any, Any]:
         triangle, solved, columns, compliance, reached, moving = before
@@ -125,8 +124,8 @@ def eliminate(
         none,
         none,
     )
-    free = jnp.arange(held, stations), jnp.broadcast_to(rows[held:], (*rows[held:].shape[:-1], lanes))
-    last, (pivot, coupling, solved, columns) = lax.scan(one, first, free)
+    along = jnp.arange(held, stations), rows[held:]
+    last, (pivot, coupling, solved, columns) = lax.scan(one, first, along)
     return Eliminated(Factor(pivot, coupling), solved, columns, *last[3:])
 
 
@@ -141,8 +140,7 @@ def descend(
         solved = _down(triangle, values - sum(coupling[z] * solved[z] for z in range(SIZE)))
         return (solved, total + sum(others[z] * solved[z] for z in range(SIZE))), solved
 
-    lanes = max(part.shape[-1] for part in (*factor, columns, right))
-    start = jnp.zeros((SIZE, lanes)), jnp.zeros((columns.shape[2], lanes))
+    start = jnp.zeros_like(right[0]), jnp.zeros_like(columns[0, 0])
     (_, total), solved = lax.scan(one, start, (factor.pivot, factor.coupling, columns, right))
     return solved, total
 
@@ -156,6 +154,5 @@ def ascend(factor: Factor, right: Float[Array, "stations 6 ..."]) -> Float[Array
         solved = _up(triangle, values - sum(coupling[:, k] * solved[k] for k in range(SIZE)))
         return (solved, own), solved
 
-    lanes = max(part.shape[-1] for part in (*factor, right))
-    start = jnp.zeros((SIZE, lanes)), jnp.zeros_like(factor.coupling[0])
+    start = jnp.zeros_like(right[0]), jnp.zeros_like(factor.coupling[0])
     return lax.scan(one, start, (factor.pivot, factor.coupling, right), reverse=True)[1]

@@ -90,4 +90,6 @@ def slopes(section: Sections, strain: Float[Array, "6 ..."]) -> Sections:
     axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * left.ndim)
     planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * left.ndim)
     softer = left - 1.0
-    return Sections(section.stretch * (1.0 + axial * softer), section.bending * (1.0 + planar * softer))
+    return section._replace(
+        stretch=section.stretch * (1.0 + axial * softer), bending=section.bending * (1.0 + planar * softer)
+    )

@@ -95,8 +95,12 @@ def test_rigid_motions_strain_nothing(motion):
     before = rod_elements.shape(LENGTH, position, quaternion)
     moved = rod_elements.shape(LENGTH, matrix @ position + shift, after)
     np.testing.assert_allclose(moved.strain, before.strain, atol=1e-12)
-    twist = jnp.concatenate([jnp.asarray(shift) + cross(jnp.asarray(angle)[:, None] + 0.0 * position, position),
-                             jnp.asarray(angle)[:, None] + 0.0 * position])
+    twist = jnp.concatenate(
+        [
+            jnp.asarray(shift) + cross(jnp.asarray(angle)[:, None] + 0.0 * position, position),
+            jnp.asarray(angle)[:, None] + 0.0 * position,
+        ]
+    )
     np.testing.assert_allclose(rod_elements.strain_rates(before, twist), 0.0, atol=1e-10)
 
 
@@ -107,7 +111,9 @@ def test_an_element_bent_to_an_arc_is_not_stretched():
         radius = 0.1 / angle
         place = np.array([[0.0, radius * (1 - np.cos(angle))], [0.0, 0.0], [0.0, radius * np.sin(angle)]])
         turn = np.array([[1.0, np.cos(angle / 2)], [0.0, 0.0], [0.0, np.sin(angle / 2)], [0.0, 0.0]])
-        stretches.append(float(rod_elements.shape(jnp.array([0.1]), jnp.asarray(place), jnp.asarray(turn)).strain[2, 0]))
+        stretches.append(
+            float(rod_elements.shape(jnp.array([0.1]), jnp.asarray(place), jnp.asarray(turn)).strain[2, 0])
+        )
     assert abs(stretches[1]) < 0.4**4 / 300
     assert stretches[1] / stretches[0] == pytest.approx(16.0, rel=0.05)
 
