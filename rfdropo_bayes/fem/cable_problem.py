@@ -1,21 +1,29 @@
 """The constraint problem of cables alone, on lanes of a batch: a complementarity problem, solved by its active set.
 
-With cables only, Newton's step of ``constraints`` is the solution of R g + W g = -b over the cables that pull now. It is
-taken whole, or to where the line search of that module ends, until the set stays.
+With cables only, Newton's step of ``constraints`` is the solution of R g + W g = -b over the cables that pull. It is the
+answer if these cables are the same after it. Most steps need no more than the set of the step before; else Newton's
+method goes on from the impulses of that step, with the line search of that module.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.fem.constraints import HALVINGS, ITERATIONS, TOLERANCE
 
 
-def _solve(matrix: Float[Array, "n n lanes"], right: Float[Array, "n lanes"]) -> Float[Array, "n lanes"]:
+class _Iterate(NamedTuple):
+    impulse: Float[Array, "n ..."]
+    active: Bool[Array, "n ..."]  # cables that are taken to pull
+    found: Bool[Array, " ..."]
+    iteration: Int[Array, ""]
+
+
+def _solve(matrix: Float[Array, "n n ..."], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Solution with a positive definite matrix, by elimination above and below each pivot."""
     whole = jnp.concatenate([matrix, right[:, None]], axis=1)
 
@@ -29,19 +37,15 @@ def _solve(matrix: Float[Array, "n n lanes"], right: Float[Array, "n lanes"]) ->
 
 
 def settle_cables(
-    compliance: Float[Array, "n n lanes"],
-    free: Float[Array, "n lanes"],
-    softness: Float[Array, "n lanes"],
-    start: Float[Array, "n lanes"],
-) -> tuple[Float[Array, "n lanes"], Float[Array, " lanes"]]:
+    compliance: Float[Array, "n n ..."],
+    free: Float[Array, "n ..."],
+    softness: Float[Array, "n ..."],
+    start: Float[Array, "n ..."],
+) -> tuple[Float[Array, "n ..."], Float[Array, " ..."]]:
     """Impulses, and 1 where they were found."""
-    size = len(free)
-    lanes = max(part.shape[-1] for part in (compliance, free, softness, start))
+    size, lanes = free.shape
     if not size:
         return jnp.zeros((0, lanes)), jnp.ones(lanes)
-    compliance, free, softness, start = (
-        jnp.broadcast_to(part, (*part.shape[:-1], lanes)) for part in (compliance, free, softness, start)
-    )
     usable = jnp.isfinite(softness)
     soft = jnp.where(usable, softness, 1.0)
     eye = jnp.eye(size)[:, :, None]
@@ -49,20 +53,16 @@ def settle_cables(
     def product(impulse: Array) -> Array:
         return sum((compliance[:, k] * impulse[k] for k in range(1, size)), compliance[:, 0] * impulse[0])
 
-    def pulled(velocity: Array) -> Array:
-        return jnp.where(usable & (velocity < 0.0), -velocity / soft, 0.0)
+    def pulling(velocity: Array) -> Array:
+        return usable & (velocity < 0.0)
 
-    def one(carry: Any) -> Any:
-        impulse, _, iteration = carry
-        velocity = free + product(impulse)
-        active = usable & (velocity < 0.0)
-        both = active[:, None] & active[None]
-        matrix = jnp.where(both, compliance, 0.0) + eye * jnp.where(active, soft, 1.0)[None]
-        change = _solve(matrix, jnp.where(active, -free, 0.0)) - impulse
-        moving = product(change)
+    def searched(current: Array, change: Array, velocity: Array, moving: Array) -> Array:
+        """How far to go along a change of the impulses."""
 
         def slope(share: Any) -> Array:
-            return jnp.sum(moving * (impulse + share * change - pulled(velocity + share * moving)), axis=0)
+            reached = velocity + share * moving
+            wanted = jnp.where(pulling(reached), -reached / soft, 0.0)
+            return jnp.sum(moving * (current + share * change - wanted), axis=0)
 
         def halve(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
             low, high = bounds
@@ -70,16 +70,31 @@ def settle_cables(
             ahead = slope(middle) > 0.0
             return jnp.where(ahead, low, middle), jnp.where(ahead, middle, high)
 
-        largest = jnp.maximum(jnp.max(jnp.abs(free), axis=0), jnp.max(jnp.abs(velocity), axis=0))
-        going = jnp.max(jnp.abs(moving), axis=0) > TOLERANCE * largest
-        beyond = (slope(1.0) > 0.0) & going
-        none, whole = jnp.zeros(lanes), jnp.ones(lanes)
-        low, high = lax.cond(
-            jnp.any(beyond), lambda: lax.fori_loop(0, HALVINGS, halve, (none, whole)), lambda: (none, whole)
-        )
-        share = jnp.where(beyond, 0.5 * (low + high), 1.0)
-        return impulse + share * change, going, iteration + 1
+        low, high = lax.fori_loop(0, HALVINGS, halve, (jnp.zeros(lanes), jnp.ones(lanes)))
+        return jnp.where(slope(1.0) > 0.0, 0.5 * (low + high), 1.0)
 
-    first = start, jnp.ones(lanes, bool), 0
-    impulse, going, _ = lax.while_loop(lambda c: jnp.any(c[1]) & (c[2] < ITERATIONS), one, first)
-    return impulse, jnp.where(going, 0.0, 1.0)
+    def one(now: _Iterate) -> _Iterate:
+        both = now.active[:, None] & now.active[None]
+        matrix = jnp.where(both, compliance, 0.0) + eye * jnp.where(now.active, soft, 1.0)[None]
+        aim = _solve(matrix, jnp.where(now.active, -free, 0.0))
+        reached = free + product(aim)
+        same = jnp.all(pulling(reached) == now.active, axis=0)
+
+        def go_on() -> tuple[Array, Array, Array]:
+            velocity = free + product(now.impulse)
+            change, moving = aim - now.impulse, reached - velocity
+            largest = jnp.maximum(jnp.max(jnp.abs(free), axis=0), jnp.max(jnp.abs(velocity), axis=0))
+            still = jnp.max(jnp.abs(moving), axis=0) <= TOLERANCE * largest
+            share = jnp.where(still, 1.0, searched(now.impulse, change, velocity, moving))
+            # The set of the step before is not that of its impulses: no Newton step leads on from there.
+            share = jnp.where(now.iteration > 0, share, 0.0)
+            return now.impulse + share * change, pulling(velocity + share * moving), still & (now.iteration > 0)
+
+        done = now.found | same
+        impulse, active, still = lax.cond(jnp.all(done), lambda: (aim, now.active, jnp.zeros(lanes, bool)), go_on)
+        impulse = jnp.where(now.found, now.impulse, jnp.where(same, aim, impulse))
+        return _Iterate(impulse, jnp.where(done, now.active, active), done | still, now.iteration + 1)
+
+    first = _Iterate(start, usable & (start > 0.0), jnp.zeros(lanes, bool), jnp.zeros((), int))
+    last = lax.while_loop(lambda now: ~jnp.all(now.found) & (now.iteration < ITERATIONS), one, first)
+    return last.impulse, last.found.astype(float)

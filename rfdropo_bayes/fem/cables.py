@@ -82,20 +82,20 @@ def routes(layout: CableLayout, body: Rod) -> list[Float[np.ndarray, "points 3"]
 class Threads(NamedTuple):
     """The numbers of a layout, components first."""
 
-    anchor: Float[Array, "3 cables *lanes"]
-    weight: Float[Array, "cables guides sides *lanes"]
-    arm: Float[Array, "3 cables guides sides *lanes"]
+    anchor: Float[Array, "3 cables ..."]
+    weight: Float[Array, "cables guides sides ..."]
+    arm: Float[Array, "3 cables guides sides ..."]
 
 
 class Courses(NamedTuple):
     """Where cables run."""
 
-    length: Float[Array, "cables guides *lanes"]  # from the point before to each guide [m]; zero where unused
-    direction: Float[Array, "3 cables guides *lanes"]  # unit vectors, zero where unused
-    lever: Float[Array, "3 cables guides sides *lanes"]  # of the guides, in space [m]
+    length: Float[Array, "cables guides ..."]  # from the point before to each guide [m]; zero where unused
+    direction: Float[Array, "3 cables guides ..."]  # unit vectors, zero where unused
+    lever: Float[Array, "3 cables guides sides ..."]  # of the guides, in space [m]
 
     @property
-    def pull(self) -> Float[Array, "3 cables guides *lanes"]:
+    def pull(self) -> Float[Array, "3 cables guides ..."]:
         """Derivatives of the cables' lengths by the guides' places."""
         return self.direction - jnp.concatenate(
             [self.direction[:, :, 1:], jnp.zeros_like(self.direction[:, :, :1])], axis=2
@@ -119,7 +119,7 @@ def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"
     return station[longest : longest + 1] if same.all() else station
 
 
-def _gathered(values: Float[Array, "k n *lanes"], index: Int[np.ndarray, " m"]) -> Float[Array, "m k *lanes"]:
+def _gathered(values: Float[Array, "k n ..."], index: Int[np.ndarray, " m"]) -> Float[Array, "m k ..."]:
     """Parts of the second axis, which becomes the first.
 
     On lanes a loop copies long rows. Without, a product with ones and zeros is quick in both modes of differentiation.
@@ -164,10 +164,10 @@ def _entries(station: Int[np.ndarray, " bound"], used: Bool[np.ndarray, " bound"
 def station_rows(
     layout: CableLayout,
     thread: Threads,
-    lever: Float[Array, "3 cables guides sides *lanes"],
-    pull: Float[Array, "3 cables guides *lanes"],
+    lever: Float[Array, "3 cables guides sides ..."],
+    pull: Float[Array, "3 cables guides ..."],
     stations: int,
-) -> Float[Array, "stations 6 cables *lanes"]:
+) -> Float[Array, "stations 6 cables ..."]:
     """Forces and moments on the stations of one pull at every guide, for every cable."""
     pulled = jnp.broadcast_to(pull[:, :, :, None], lever.shape)
     parts = jnp.concatenate([thread.weight * pulled, cross(lever, pulled)])
@@ -187,11 +187,11 @@ def station_rows(
 
 
 def _at_stations(
-    parts: Float[Array, "k guides sides *lanes"],
+    parts: Float[Array, "k guides sides ..."],
     station: Int[np.ndarray, "guides sides"],
     bound: Bool[np.ndarray, "guides sides"],
     stations: int,
-) -> Float[Array, "stations k *lanes"]:
+) -> Float[Array, "stations k ..."]:
     """Sums over what is bound to each station."""
     flat = parts.reshape(len(parts), -1, *parts.shape[3:])
     flat = jnp.concatenate([flat, jnp.zeros_like(flat[:, :1])], axis=1)
@@ -199,7 +199,7 @@ def _at_stations(
     return sum((_gathered(flat, places) for places in index[1:]), _gathered(flat, index[0]))
 
 
-def lengths(course: Courses) -> Float[Array, "cables *lanes"]:
+def lengths(course: Courses) -> Float[Array, "cables ..."]:
     """Lengths of the cables [m]."""
     parts = course.length
     return sum((parts[:, k] for k in range(1, parts.shape[1])), parts[:, 0])

@@ -31,19 +31,19 @@ class Chain(NamedTuple):
 class Factor(NamedTuple):
     """A = C C', with C lower block-bidiagonal."""
 
-    pivot: Float[Array, "stations 6 6 *lanes"]  # lower triangles of C's diagonal blocks, their diagonals inverted
-    coupling: Float[Array, "stations 6 6 *lanes"]  # transposed blocks below the diagonal; zero at the first station
+    pivot: Float[Array, "stations 6 6 ..."]  # lower triangles of C's diagonal blocks, their diagonals inverted
+    coupling: Float[Array, "stations 6 6 ..."]  # transposed blocks below the diagonal; zero at the first station
 
 
 class Eliminated(NamedTuple):
     """What elimination finds."""
 
     factor: Factor
-    solved: Float[Array, "stations 6 *lanes"]  # y = C^-1 times the right-hand side
-    columns: Float[Array, "stations 6 rows *lanes"]  # Y = C^-1 J'
-    compliance: Float[Array, "rows rows *lanes"]  # Y' Y = J A^-1 J'
-    reached: Float[Array, "rows *lanes"]  # Y' y
-    moving: Float[Array, "rows *lanes"]  # J times the velocities
+    solved: Float[Array, "stations 6 ..."]  # y = C^-1 times the right-hand side
+    columns: Float[Array, "stations 6 rows ..."]  # Y = C^-1 J'
+    compliance: Float[Array, "rows rows ..."]  # Y' Y = J A^-1 J'
+    reached: Float[Array, "rows ..."]  # Y' y
+    moving: Float[Array, "rows ..."]  # J times the velocities
 
 
 def _triangle(block: Any) -> Array:
@@ -78,20 +78,19 @@ def _at(values: Any, index: Array) -> Any:
     return jax.tree.map(lambda part: lax.dynamic_index_in_dim(part, index, 2, keepdims=False), values)
 
 
-def _block(one: Matrix, two: Matrix, three: Matrix, four: Matrix) -> Float[Array, "6 6 *n"]:
+def _block(one: Matrix, two: Matrix, three: Matrix, four: Matrix) -> Float[Array, "6 6 ..."]:
     return jnp.concatenate([jnp.concatenate([one, two], axis=1), jnp.concatenate([three, four], axis=1)])
 
 
 def eliminate(
     chain: Chain,
-    right: Float[Array, "6 stations lanes"],
-    rows: Float[Array, "stations 6 rows lanes"],
-    twist: Float[Array, "6 stations lanes"],
+    right: Float[Array, "6 stations ..."],
+    rows: Float[Array, "stations 6 rows ..."],
+    twist: Float[Array, "6 stations ..."],
     held: int,
 ) -> Eliminated:
     """Factorise and go down with a right-hand side and the rows J of constraints, over the stations that are free."""
-    stations, many = right.shape[1], rows.shape[2]
-    lanes = max(part.shape[-1] for part in jax.tree.leaves((chain, right, rows, twist)))
+    stations, many, lanes = right.shape[1], rows.shape[2], right.shape[-1]
 
     def one(before: Any, here: tuple[Array, Array]) -> tuple[Any, Any]:
         triangle, solved, columns, compliance, reached, moving = before
@@ -125,14 +124,14 @@ def eliminate(
         none,
         none,
     )
-    free = jnp.arange(held, stations), jnp.broadcast_to(rows[held:], (*rows[held:].shape[:-1], lanes))
-    last, (pivot, coupling, solved, columns) = lax.scan(one, first, free)
+    along = jnp.arange(held, stations), rows[held:]
+    last, (pivot, coupling, solved, columns) = lax.scan(one, first, along)
     return Eliminated(Factor(pivot, coupling), solved, columns, *last[3:])
 
 
 def descend(
-    factor: Factor, columns: Float[Array, "stations 6 rows lanes"], right: Float[Array, "stations 6 lanes"]
-) -> tuple[Float[Array, "stations 6 lanes"], Float[Array, "rows lanes"]]:
+    factor: Factor, columns: Float[Array, "stations 6 rows ..."], right: Float[Array, "stations 6 ..."]
+) -> tuple[Float[Array, "stations 6 ..."], Float[Array, "rows ..."]]:
     """y = C^-1 times a right-hand side, and Y' y."""
 
     def one(before: tuple[Array, Array], here: tuple[Array, ...]) -> tuple[Any, Array]:
@@ -141,13 +140,12 @@ def descend(
         solved = _down(triangle, values - sum(coupling[z] * solved[z] for z in range(SIZE)))
         return (solved, total + sum(others[z] * solved[z] for z in range(SIZE))), solved
 
-    lanes = max(part.shape[-1] for part in (*factor, columns, right))
-    start = jnp.zeros((SIZE, lanes)), jnp.zeros((columns.shape[2], lanes))
+    start = jnp.zeros_like(right[0]), jnp.zeros_like(columns[0, 0])
     (_, total), solved = lax.scan(one, start, (factor.pivot, factor.coupling, columns, right))
     return solved, total
 
 
-def ascend(factor: Factor, right: Float[Array, "stations 6 lanes"]) -> Float[Array, "stations 6 lanes"]:
+def ascend(factor: Factor, right: Float[Array, "stations 6 ..."]) -> Float[Array, "stations 6 ..."]:
     """C'^-1 times a right-hand side."""
 
     def one(after: tuple[Array, Array], here: tuple[Array, Array, Array]) -> tuple[Any, Array]:
@@ -156,6 +154,5 @@ def ascend(factor: Factor, right: Float[Array, "stations 6 lanes"]) -> Float[Arr
         solved = _up(triangle, values - sum(coupling[:, k] * solved[k] for k in range(SIZE)))
         return (solved, own), solved
 
-    lanes = max(part.shape[-1] for part in (*factor, right))
-    start = jnp.zeros((SIZE, lanes)), jnp.zeros_like(factor.coupling[0])
+    start = jnp.zeros_like(right[0]), jnp.zeros_like(factor.coupling[0])
     return lax.scan(one, start, (factor.pivot, factor.coupling, right), reverse=True)[1]

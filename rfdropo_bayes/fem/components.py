@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-Vector = Float[Array, "3 *n"]
-Quaternion = Float[Array, "4 *n"]
-Matrix = Float[Array, "3 3 *n"]
+Vector = Float[Array, "3 ..."]
+Quaternion = Float[Array, "4 ..."]
+Matrix = Float[Array, "3 3 ..."]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -20,17 +20,17 @@ def cross(a: Vector, b: Vector) -> Vector:
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def dot(a: Float[Array, "k *n"], b: Float[Array, "k *n"]) -> Float[Array, "*n"]:
+def dot(a: Float[Array, "k ..."], b: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """Sum of the products of the components."""
     return sum((a[i] * b[i] for i in range(1, len(a))), a[0] * b[0])
 
 
-def times(matrix: Float[Array, "i k *n"], vector: Float[Array, "k *n"]) -> Float[Array, "i *n"]:
+def times(matrix: Float[Array, "i k ..."], vector: Float[Array, "k ..."]) -> Float[Array, "i ..."]:
     """Matrix times vector, or matrix times matrix."""
     return sum((matrix[:, k] * vector[k] for k in range(1, len(vector))), matrix[:, 0] * vector[0])
 
 
-def transposed_times(matrix: Float[Array, "k i *n"], vector: Float[Array, "k *n"]) -> Float[Array, "i *n"]:
+def transposed_times(matrix: Float[Array, "k i ..."], vector: Float[Array, "k ..."]) -> Float[Array, "i ..."]:
     """Transpose of a matrix times a vector."""
     return sum((matrix[k] * vector[k] for k in range(1, len(vector))), matrix[0] * vector[0])
 
@@ -60,7 +60,7 @@ def diagonal(values: Vector) -> Matrix:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def normalised(values: Float[Array, "k *n"]) -> Float[Array, "k *n"]:
+def normalised(values: Float[Array, "k ..."]) -> Float[Array, "k ..."]:
     """Unit vector."""
     return values * lax.rsqrt(dot(values, values))
 

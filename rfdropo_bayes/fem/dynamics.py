@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import rod_elements
@@ -332,17 +333,36 @@ def in_stages(
     displacement: Float[Array, " cables"],
     stages: Sequence[Stage],
 ) -> tuple[State, StepInfo]:
-    """A step, given how a stage is taken; commands within the step lie on the way to those at its end."""
-    here = state
-    start = here.commanded
-    if start is None:
-        return take(here, displacement, stages[0], None)[:2]
-    elapsed, codes, carried = 0.0, StepInfo(jnp.array(False), jnp.array(True)), None
-    for stage in stages:
-        elapsed += stage.elapsed
-        here, info, carried = take(here, start + elapsed * (displacement - start), stage, carried)
-        codes = StepInfo(codes.diverged | info.diverged, codes.converged & info.converged)
-    return here._replace(commanded=displacement), codes
+    """A step, given how a stage is taken; commands within the step lie on the way to those at its end.
+
+    Several stages are one loop, compiled once: before the first, nothing is carried on.
+    """
+    if len(stages) == 1:
+        return take(state, displacement, stages[0], None)[:2]
+    start = jnp.zeros_like(displacement) if state.commanded is None else state.commanded
+
+    def one(
+        before: tuple[State, StepInfo, Carried], timed: Float[Array, "4"]
+    ) -> tuple[tuple[State, StepInfo, Carried], None]:
+        here, codes, carried = before
+        elapsed, length, share, until = timed
+        stage = Stage(elapsed, length, share, stages[0].predicted)
+        moved, info, done = take(here, start + until * (displacement - start), stage, carried)
+        assert done is not None
+        return (moved, StepInfo(codes.diverged | info.diverged, codes.converged & info.converged), done), None
+
+    times = np.array([[stage.elapsed, stage.length, stage.carried] for stage in stages])
+    times = np.concatenate([times, np.cumsum(times[:, :1], axis=0)], axis=1)
+    codes = StepInfo(jnp.array(False), jnp.array(True))
+    (after, codes, _), _ = lax.scan(one, (state, codes, _nothing_carried(state)), jnp.asarray(times))
+    return after._replace(commanded=displacement), codes
+
+
+def _nothing_carried(state: State) -> Carried:
+    none = jnp.zeros((len(state.position), 6))
+    twist = None if state.cube is None else jnp.zeros(6)
+    slip = None if state.memory.slip is None else jnp.zeros_like(state.memory.slip)
+    return Carried(none, none, twist, slip)
 
 
 class StageBegun(NamedTuple):

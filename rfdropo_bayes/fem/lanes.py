@@ -32,18 +32,21 @@ def _merged(array: Array, batched: bool, size: int, width: int) -> Array:
 def laned(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function of arrays without lanes, given how it acts on arrays with lanes in their last axis.
 
-    Arguments and results are trees of arrays. An argument may have one lane where others have many. There are no
-    derivatives: whoever calls it defines them.
+    Arguments and results are trees of arrays. There are no derivatives: whoever calls it defines them.
     """
 
     @custom_vmap
     def with_lanes(*arguments: Any) -> Any:
         width = _width(arguments)
-        return jax.tree.map(lambda part: jnp.broadcast_to(part, (*part.shape[:-1], width)), function(*arguments))
+
+        def whole(part: Array) -> Array:
+            return jnp.broadcast_to(part, (*part.shape[:-1], width))
+
+        return jax.tree.map(whole, function(*jax.tree.map(whole, arguments)))
 
     @with_lanes.def_vmap
     def more_lanes(size: int, batched: Any, *arguments: Any) -> Any:
-        width = max(part.shape[-1] for part in jax.tree.leaves(arguments))
+        width = _width(arguments)
         merged = jax.tree.map(lambda part, new: _merged(part, new, size, width), arguments, tuple(batched))
         result = with_lanes(*merged)
         split = jax.tree.map(lambda part: jnp.moveaxis(part.reshape(*part.shape[:-1], width, size), -1, 0), result)

@@ -69,7 +69,7 @@ def meet(
         place = moved(state, twist_of(state), stage.elapsed * time_step)
     touch, going, wide = find_contacts(scene, cube, place, position, orientation), state, None
     if change is not None:
-        wide = _widened(touch, place, twist, stage, time_step)
+        wide = jnp.where(stage.carried > 0.0, _widened(touch, place, twist, stage, time_step), 1.0)
         stage = stage._replace(wide=wide)
         change = stage.going * change
         going = state._replace(velocity=state.velocity + change[:3], spin=state.spin + change[3:])

@@ -2,9 +2,10 @@
 
 Strains are those of Simo and Reissner in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with
 q_v the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
-Engng 58:79-116). An arc is longer than its chord: the stretch has h^2 (K_1^2 + K_2^2) / 24 besides, without which an
-element that is pressed together between its ends would be too stiff in bending. Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
+Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
 forces turn: under guided cables those of the rod and of the cables cancel nearly.
+
+An arc is longer than its chord: the stretch of an element is that of its chord and h^2 / 24 times its squared curvature.
 
 Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
 moment, or velocity and spin, in space.
@@ -33,17 +34,17 @@ from rfdropo_bayes.fem.components import (
     transposed_times,
 )
 
-Six = Float[Array, "6 *n"]
+Six = Float[Array, "6 ..."]
 
 
 class Elements(NamedTuple):
     """Shape of all elements."""
 
-    length: Float[Array, "*n"]  # at rest [m]
+    length: Float[Array, "..."]  # at rest [m]
     frame: Matrix  # half-way between both sections
     way: Vector  # from station to station [m]
     bend: Vector  # vector part of the quaternion from section to section, in space
-    share: Float[Array, "*n"]  # 1 / (1 + scalar part)
+    share: Float[Array, "..."]  # 1 / (1 + scalar part)
     strain: Six  # shear (2), stretch; curvature (2), twist [1/m]
 
 
@@ -62,7 +63,7 @@ class Stiffness(NamedTuple):
     ba: Matrix
 
 
-def shape(length: Float[Array, "*n"], position: Vector, orientation: Quaternion) -> Elements:
+def shape(length: Float[Array, "..."], position: Vector, orientation: Quaternion) -> Elements:
     """Shape of the elements between neighbouring stations."""
     first, second = orientation[:, :-1], orientation[:, 1:]
     scalar = dot(first, second)
@@ -74,10 +75,9 @@ def shape(length: Float[Array, "*n"], position: Vector, orientation: Quaternion)
     frame = rotation(normalised(first + second))
     way = position[:, 1:] - position[:, :-1]
     stretch = transposed_times(frame, way) / length
-    stretch = stretch - jnp.array([0.0, 0.0, 1.0]).reshape(3, *[1] * (stretch.ndim - 1))
     curvature = 2.0 * (straight - across) / length
-    bow = length**2 / 24.0 * (curvature[:1] ** 2 + curvature[1:2] ** 2)
-    strain = jnp.concatenate([stretch[:2], stretch[2:] + bow, curvature])
+    longer = length**2 * dot(curvature[:2], curvature[:2]) / 24.0 - 1.0
+    strain = jnp.concatenate([stretch[:2], stretch[2:] + longer, curvature])
     return Elements(length, frame, way, straight + across, 1.0 / (1.0 + scalar), strain)
 
 
@@ -86,10 +86,9 @@ def _less_turn(elements: Elements, vector: Vector) -> Vector:
     return vector - elements.bend * (elements.share * dot(elements.bend, vector))
 
 
-def _bow(elements: Elements) -> Vector:
-    """Derivative of the stretch by the curvature, an arc being longer than its chord [m]."""
-    lever = elements.length**2 / 12.0 * elements.strain[3:]
-    return jnp.concatenate([lever[:2], jnp.zeros_like(lever[:1])])
+def _bow(elements: Elements) -> Float[Array, "2 ..."]:
+    """Derivative of the stretch by the curvature [m]."""
+    return elements.length**2 / 12.0 * elements.strain[3:5]
 
 
 def strain_rates(elements: Elements, twist: Six) -> Six:
@@ -100,15 +99,15 @@ def strain_rates(elements: Elements, twist: Six) -> Six:
     middle = 0.5 * (spin[:, 1:] + spin[:, :-1]) - 0.5 * cross(lean, relative[3:])
     stretching = transposed_times(elements.frame, relative[:3] + cross(elements.way, middle))
     bending = transposed_times(elements.frame, _less_turn(elements, relative[3:]))
-    stretching = jnp.concatenate([stretching[:2], stretching[2:] + dot(_bow(elements), bending)[None]])
-    return jnp.concatenate([stretching, bending]) / elements.length
+    longer = dot(_bow(elements), bending[:2])
+    return jnp.concatenate([stretching[:2], stretching[2:] + longer, bending]) / elements.length
 
 
 def station_forces(elements: Elements, resultant: Six) -> Six:
     """Forces and moments on all stations of the sections' forces and moments, those in the elements' frames."""
     force = times(elements.frame, resultant[:3])
-    bent = resultant[3:] + resultant[2] * _bow(elements)
-    moment = _less_turn(elements, times(elements.frame, bent))
+    bowed = jnp.concatenate([resultant[3:5] + _bow(elements) * resultant[2], resultant[5:]])
+    moment = _less_turn(elements, times(elements.frame, bowed))
     lever = cross(elements.way, force)
     half, lean = 0.5 * lever, 0.5 * cross(elements.share * elements.bend, lever)
     first = jnp.concatenate([force, moment + half - lean])
@@ -128,9 +127,9 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> St
         bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
     lean = elements.share * elements.bend
     turn, fold = 0.5 * skew(way), 0.5 * (lean[:, None] * way[None] - diagonal(jnp.stack([dot(lean, way)] * 3)))
-    bow = _less_turn(elements, times(frame, _bow(elements)))
-    arc = frame[:, 2][:, None] * bow[None]
-    lever_a, lever_b = turn + fold - arc, turn - fold + arc
+    bow = _less_turn(elements, times(frame[:, :2], _bow(elements)))
+    fold = fold - frame[:, 2][:, None] * bow[None]
+    lever_a, lever_b = turn + fold, turn - fold
     a, b = product(c, lever_a), product(c, lever_b)
     back_a, back_b = transposed(lever_a), transposed(lever_b)
     return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)

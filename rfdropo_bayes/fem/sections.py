@@ -23,8 +23,8 @@ LEAST_TANGENT = 0.1
 class Sections(NamedTuple):
     """Stiffness of the sections of all elements, at rest."""
 
-    stretch: Float[Array, "3 *n"]  # k G A twice, E A [N]
-    bending: Float[Array, "3 *n"] | Float[Array, "3 3 *n"]  # E I about x, about y, G J; with a bending law a matrix
+    stretch: Float[Array, "3 ..."]  # k G A twice, E A [N]
+    bending: Float[Array, "3 ..."] | Float[Array, "3 3 ..."]  # E I about x, about y, G J; with a bending law a matrix
     fibre: Scalar | None = None  # c of the fibre law; with a bending law
 
 
@@ -55,14 +55,14 @@ def _coupling(law: BendingLaw) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([jnp.asarray(value, dtype=float) for value in row]) for row in rows])
 
 
-def linear(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+def linear(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "6 ..."]:
     """Forces [N] and moments [N m] of the sections without the fibre law."""
     law = section.fibre is not None
     moment = times(section.bending, strain[3:]) if law else section.bending * strain[3:]
     return jnp.concatenate([section.stretch * strain[:3], moment])
 
 
-def answer(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+def answer(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "6 ..."]:
     """Forces [N] and moments [N m] of the sections."""
     result = linear(section, strain)
     if section.fibre is None:
@@ -73,7 +73,7 @@ def answer(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "6 *
     return result - jnp.concatenate([jnp.zeros_like(result[:2]), pull[None], softer, jnp.zeros_like(result[:1])])
 
 
-def energy(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "*n"]:
+def energy(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "..."]:
     """Energy per length [J/m]."""
     result = 0.5 * dot(linear(section, strain), strain)
     if section.fibre is None:
@@ -82,7 +82,7 @@ def energy(section: Sections, strain: Float[Array, "6 *n"]) -> Float[Array, "*n"
     return result - 0.5 * section.fibre * stretch * (section.stretch[2] * stretch**2 + 3.0 * dot(moment, strain[3:5]))
 
 
-def slopes(section: Sections, strain: Float[Array, "6 *n"]) -> Sections:
+def slopes(section: Sections, strain: Float[Array, "6 ..."]) -> Sections:
     """Tangent stiffness of the sections. It leaves out what stretch and bending do to each other."""
     if section.fibre is None:
         return section
@@ -90,4 +90,6 @@ def slopes(section: Sections, strain: Float[Array, "6 *n"]) -> Sections:
     axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * left.ndim)
     planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * left.ndim)
     softer = left - 1.0
-    return Sections(section.stretch * (1.0 + axial * softer), section.bending * (1.0 + planar * softer))
+    return section._replace(
+        stretch=section.stretch * (1.0 + axial * softer), bending=section.bending * (1.0 + planar * softer)
+    )

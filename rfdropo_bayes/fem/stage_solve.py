@@ -45,10 +45,10 @@ from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
 class StageBody(NamedTuple):
     """A rod in a stage; arrays have their components first."""
 
-    length: Float[Array, "elements *lanes"]  # [m]
+    length: Float[Array, "elements ..."]  # [m]
     section: Sections
-    mass: Float[Array, "stations *lanes"]  # [kg]
-    inertia: Float[Array, "3 stations *lanes"]  # about the sections' axes [kg m2]
+    mass: Float[Array, "stations ..."]  # [kg]
+    inertia: Float[Array, "3 stations ..."]  # about the sections' axes [kg m2]
     position: Vector  # where forces are taken [m]
     orientation: Quaternion
     twist: Six  # velocities and spins where the stage starts
@@ -175,8 +175,8 @@ def along(rows: Float[Array, "stations 6 rows"], twist: Six) -> Float[Array, " r
 
 
 def free_velocities(
-    way: Way, body: StageBody, bonds: Bonds, moving: Float[Array, "rows *lanes"], reached: Float[Array, "cables *lanes"]
-) -> Float[Array, "rows *lanes"]:
+    way: Way, body: StageBody, bonds: Bonds, moving: Float[Array, "rows ..."], reached: Float[Array, "cables ..."]
+) -> Float[Array, "rows ..."]:
     """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
     cables = len(reached)
     slack = (bonds.reach - reached) / body.span
@@ -184,7 +184,7 @@ def free_velocities(
     return free if bonds.base is None else jnp.concatenate([free, moving[cables:] + bonds.base])
 
 
-def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Eliminated, Float[Array, "rows lanes"]]:
+def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Eliminated, Float[Array, "rows ..."]]:
     """Elimination, and the velocities of the constraints without them; on lanes."""
     line = linearised(body)
     rows, reached = all_rows(way, body, bonds, line.frame)
