@@ -66,7 +66,7 @@ def test_what_a_document_shows_can_be_run(document, command, words):
 
 
 def test_no_two_documented_runs_share_a_folder():
-    """Of calibrations and audits in reports/, each with the experiment and groups that it is of."""
+    """Of calibrations and audits in reports/ and runs/, each with the experiment and groups that it is of."""
     runs: dict[str, set] = {}
     for _, command, words in COMMANDS:
         name, options = parsed(command) if not words else ("", {})
@@ -76,4 +76,6 @@ def test_no_two_documented_runs_share_a_folder():
         title = experiment_name(Path(options["experiment"]))
         folder = options["out"] or Path("runs") / (title if name == "calibrate" else f"{title}_{name}")
         runs.setdefault(str(folder), set()).add((name, stem, tuple(options.get("between") or ())))
-    assert {folder: found for folder, found in runs.items() if len(found) > 1 and folder.startswith("reports/")} == {}
+    assert {
+        folder: found for folder, found in runs.items() if len(found) > 1 and folder.startswith(("reports/", "runs/"))
+    } == {}
