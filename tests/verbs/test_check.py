@@ -261,7 +261,9 @@ def test_recordings_alike_share_a_note(tmp_path):
     assert any(note.startswith("run, again: the first row is ") for note in found.doubts)
 
 
-@pytest.mark.parametrize(("factor", "doubtful"), [pytest.param(1.0, False, marks=pytest.mark.slow), (10.0, False), (100.0, True)])
+@pytest.mark.parametrize(
+    ("factor", "doubtful"), [pytest.param(1.0, False, marks=pytest.mark.slow), (10.0, False), (100.0, True)]
+)
 def test_pulls_longer_than_the_body_are_doubtful_and_those_beyond_a_limit_a_note(tmp_path, factor, doubtful):
     """Commands in another unit than the file says; a line for each recording, whatever its cables."""
     checked(tmp_path)
