@@ -193,7 +193,11 @@ def guess_columns(
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
         sent=source[commands].to_numpy(dtype=float),
         seen=table[names_of(positions)].to_numpy(dtype=float).reshape(len(table), -1, 3),
-        **{key: unit.unit for key, unit in units.items()},
+        time_unit=units["time_unit"].unit,
+        command_unit=units["command_unit"].unit,
+        position_unit=units["position_unit"].unit,
+        command_time_unit=units["command_time_unit"].unit,
+        motor_angle_unit=units["motor_angle_unit"].unit,
     )
 
 
