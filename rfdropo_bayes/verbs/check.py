@@ -335,18 +335,18 @@ def _say_unasked(found: Check, trajectory: Trajectory, robot: Robot) -> None:
         )
 
 
-SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
-"""Factor and unit in which what drives a cable or a chamber is shown."""
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N")}
+"""Factor and unit in which what drives a cable is shown."""
 
 
 def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:
-    """Cables and chambers that are asked for more than they are allowed, or for more than a body has."""
+    """Cables that are asked for more than they are allowed, or for more than a body has."""
     low, high = asked.min(axis=0), asked.max(axis=0)
     least, most = np.array(robot.drive_limits()).T
     beyond = np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
     if not len(beyond):
         return
-    factor, unit = SHOWN[robot.actuators[0].unit]
+    factor, unit = SHOWN[robot.cables[0].unit]
     words = ", ".join(
         f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
         f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
