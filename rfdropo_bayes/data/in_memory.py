@@ -52,8 +52,7 @@ def from_arrays(
             by default.
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
-        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", "Pa", "kPa",
-            "bar", "psi", or "-".
+        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
         largest_command: that is to be believed, in ``command_unit``, of drives that go farther than 20 rad or 5 m.
         tension: [N]; not a number where it is missing.
         motor_angle: [rad]; not a number where it is missing.

@@ -34,15 +34,11 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "deg": ("rad", np.pi / 180.0),
     "N": ("N", 1.0),
     "N m": ("N m", 1.0),
-    "Pa": ("Pa", 1.0),
-    "kPa": ("Pa", 1e3),
-    "bar": ("Pa", 1e5),
-    "psi": ("Pa", 6894.757293168),
     "-": ("-", 1.0),
 }
 COUNTS = "counts"
 """Of an encoder, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "bar", "psi", "-"]
+CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "-"]
 
 
 ROWS = "rows"
@@ -100,8 +96,7 @@ class CsvColumns(BaseModel):
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
     )
     command_unit: CommandUnit = Field(
-        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force, torque or "
-        "pressure; "
+        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force or torque; "
         '"-" for what a simulator of one\'s own takes'
     )
     counts_per_turn: float | None = Field(

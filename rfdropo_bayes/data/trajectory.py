@@ -88,7 +88,7 @@ class Trajectory:
             given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
                 marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
                 away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
-                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in
                 force until the next; ``markers`` and ``channels``, their names. These five are required.
                 ``command_time``: from when each command is in force, on the clock of ``time``; ``initial_command``, in
                 force before the first; ``largest_command`` that is to be believed, of drives of many turns.
@@ -190,7 +190,7 @@ class Trajectory:
 
     @property
     def command_unit(self) -> str:
-        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"``, ``"Pa"`` or ``"-"``."""
+        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"`` or ``"-"``."""
         return str(self.dataset["command"].attrs["unit"])
 
     @property

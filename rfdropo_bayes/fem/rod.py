@@ -116,7 +116,7 @@ def profile_rod(
     )
 
 
-def refined(body: Rod, elements: int | Sequence[int]) -> Rod:
+def refined(body: Rod, elements: int | Int[np.ndarray, " elements"]) -> Rod:
     """The rod with every element cut into so many equal elements of the same section, all alike or each as said."""
     counts = np.broadcast_to(elements, body.elements)
     rows = np.arange(body.elements + 1)

@@ -302,7 +302,9 @@ class CableCompliance:
 
     def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Put the compliance in series with every cable."""
-        return material._replace(effects=material.effects._replace(cable_compliance=values["cable_compliance"]))
+        before = material.effects.cable_compliance
+        compliance = values["cable_compliance"] if before is None else before + values["cable_compliance"]
+        return material._replace(effects=material.effects._replace(cable_compliance=compliance))
 
 
 class QuadraticDrag:

@@ -91,15 +91,14 @@ def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[
 
 
 class Channels(RobotTable):
-    """How commands become what drives cables and chambers: ``radius * gain @ command``."""
+    """How commands become what drives cables: ``radius * gain @ command``."""
 
     names: tuple[Name, ...] = Field(
         min_length=1,
         description="the command channels, in the order of the columns of gain",
     )
     gain: tuple[tuple[float, ...], ...] = Field(
-        description="one row per cable, then per chamber, one column per channel: displacement [m], tension [N] or "
-        "pressure [Pa] = gain @ command, times the radius where commands are angles; pull > 0",
+        description="one row per cable, one column per channel: displacement [m] or tension [N] = gain @ command, times the radius where commands are angles; pull > 0",
     )
     radius_parameter: Name | None = Field(
         default=None,

@@ -15,7 +15,6 @@ from rfdropo_bayes.groups import Patterns, group_of, whole
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
-from rfdropo_bayes.robots.chamber import Chamber
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.outline import RobotOutline, not_given, outlined_tables
@@ -43,8 +42,8 @@ ZEROS = "initial_displacement"
 class CommandTiming(RobotTable):
     """Timing of commands."""
 
-    unit: Literal["m", "rad", "N", "Pa"] = Field(
-        description='of the commands: "m" of cable, "rad" of a motor, "N" of tension, or "Pa" of pressure',
+    unit: Literal["m", "rad", "N"] = Field(
+        description='of the commands: "m" of cable, "rad" of a motor, or "N" of tension',
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
@@ -107,8 +106,7 @@ class Robot(RobotTable):
     )
     command: CommandTiming = Field(description="unit and timing of commands")
     channels: Channels = Field(description="from commands to cable displacements")
-    cables: tuple[Cable, ...] = Field(default=(), description="the cables")
-    chambers: tuple[Chamber, ...] = Field(default=(), description="chambers under pressure")
+    cables: tuple[Cable, ...] = Field(min_length=1, description="the cables")
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
     markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
     orientations: tuple[OrientedSection, ...] = Field(default=(), description="sections whose orientation is measured")
@@ -128,16 +126,11 @@ class Robot(RobotTable):
         for kind, names in named.items():
             if len(set(names)) != len(names):
                 raise ValueError(f"two of its {kind}s share a name")
-        if not self.actuators:
-            raise ValueError("the robot has neither cables nor chambers")
-        if len(self.channels.gain) != len(self.actuators):
-            kinds = "cables and chambers" if self.chambers else "cables"
-            raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.actuators)} {kinds}")
-        for actuator in self.actuators:
-            if actuator.unit != ("m" if self.command.unit == "rad" else self.command.unit):
-                raise ValueError(
-                    f"{actuator.name} is driven in {actuator.unit}, and commands are in {self.command.unit}"
-                )
+        if len(self.channels.gain) != len(self.cables):
+            raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.cables)} cables")
+        for cable in self.cables:
+            if cable.unit != ("m" if self.command.unit == "rad" else self.command.unit):
+                raise ValueError(f"{cable.name} is driven in {cable.unit}, and commands are in {self.command.unit}")
         if (self.command.unit == "rad") != (self.channels.radius_parameter is not None):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and only for those")
         masses = [mass.parameter for mass in self.body.point_masses]
@@ -181,8 +174,6 @@ class Robot(RobotTable):
         station = np.array(self.body.station_m)
         half = np.array(self.body.half_width_m)
         points = {f"guide of {cable.name}": cable.guides() for cable in self.cables}
-        for chamber in self.chambers:
-            points[f"end of {chamber.name}"] = np.stack([chamber.line(station, end)[-1] for end in chamber.z_m])
         points |= {f"section {each.name}": np.array([[0.0, 0.0, each.z_m]]) for each in self.orientations}
         points |= {f"marker {marker.name}": np.array([marker.point_m]) for marker in self.markers}
         for name, place in points.items():
@@ -287,13 +278,8 @@ class Robot(RobotTable):
 
     @property
     def cable_names(self) -> tuple[str, ...]:
-        """Names of the cables and the chambers."""
-        return tuple(actuator.name for actuator in self.actuators)
-
-    @property
-    def actuators(self) -> tuple[Cable | Chamber, ...]:
-        """Cables, then chambers."""
-        return (*self.cables, *self.chambers)
+        """Names of the cables."""
+        return tuple(cable.name for cable in self.cables)
 
     @property
     def stroke(self) -> float:
@@ -337,9 +323,8 @@ class Robot(RobotTable):
         return float(self.body.station_m[-1] - self.body.station_m[0])
 
     def drive_limits(self) -> Float[np.ndarray, "cable 2"]:
-        """Least and greatest of what drives each cable and chamber: displacement [m], pull > 0, tension [N] or pressure
-        [Pa]."""
-        return np.array([actuator.limit for actuator in self.actuators])
+        """Least and greatest of what drives each cable: displacement [m], pull > 0, or tension [N]."""
+        return np.array([cable.limit for cable in self.cables])
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
         """Least and greatest command of each channel [m or rad] at nominal parameters.

@@ -65,6 +65,8 @@ EFFECT_SIZES = BodyEffects(
 """Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
 QUASI_STATIC = "quasi-static"
 """Motion of a body that is at rest in every row."""
+FAR_WOUND = 10.0
+"""[m] No cable is wound in so far."""
 CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
 FRICTION = 0.1
@@ -354,4 +356,10 @@ def input_sizes(inputs: Inputs) -> Inputs:
         cube = CubeInputs(solid._replace(friction=jnp.abs(cube.cube.friction) + FRICTION), place)
     if loads is not None:
         loads = jax.tree.map(lambda part, size: jnp.full_like(part, size), loads, BODY_SIGNALS)
-    return Inputs(magnitudes, jnp.full_like(start, LENGTH), jnp.full_like(displacement, LENGTH), cube, loads)
+    return Inputs(magnitudes, _length_of(start), _length_of(displacement), cube, loads)
+
+
+def _length_of(displacement: Float[Array, "*row cable"]) -> Float[Array, "*row cable"]:
+    """Size of a displacement: its own if it winds a soft spring, which is far more than a cable's length."""
+    size = jnp.abs(displacement)
+    return jnp.where(size > FAR_WOUND, size, LENGTH)

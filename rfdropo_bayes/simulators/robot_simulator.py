@@ -42,6 +42,8 @@ PASSES = 2
 softening are within 5 % of what they do after eight."""
 DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
 """Parameters that a body at rest does not have."""
+SOFT = 1e4
+"""[m/N] Compliance between a cable and a drive that holds its tension: what a length of 1 m changes is 0.1 mN."""
 DYNAMIC = 'set motion = "dynamic" under [simulator]'
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
@@ -331,6 +333,8 @@ class RobotSimulator(ExtendedSimulator):
             stiffness_scale=stiffness_scale,
             point_mass=point_mass,
         )
+        if self.robot.command_unit == "N":
+            material = material._replace(effects=material.effects._replace(cable_compliance=jnp.asarray(SOFT)))
         for mechanism in self.mechanisms:
             if self.at_rest and QUASI_STATIC not in motions_of(mechanism):
                 words = f"the mechanism {mechanism.name!r} acts on a body in motion"
@@ -388,21 +392,18 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.command.unit
 
     def pretension(self, values: Values) -> Float[Array, " cable"]:
-        """What drives each cable and chamber at zero command [m, N or Pa]."""
-        names = self.robot.initial_displacement_names
-        if not names:
-            return jnp.zeros(len(self.robot.actuators))
-        return jnp.stack([values[name] for name in names])
+        """Cable displacements at zero command [m]."""
+        return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
 
-    def exerted(self, values: Values, level: Float[Array, "*row actuator"]) -> Float[Array, "*row cable"]:
-        """What the engine's cables are given, displacements [m] or tensions [N], at levels of the drives."""
-        return level + self.pretension(values)
+    def exerted(self, values: Values, level: Float[Array, " cable"]) -> Float[Array, " cable"]:
+        """Displacements of the cables [m] at levels of their drives [m or N]: a drive that holds a tension winds a
+        spring that is so soft that the cable's own length does not count."""
+        return SOFT * level if self.robot.command_unit == "N" else level + self.pretension(values)
 
     def wound(
         self, values: Values, commands: Commands, time_step: float
     ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
-        """What the engine's cables are given before the first step and at the end of every step, by drives with end
-        stops."""
+        """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
         initial, command = self.actuated(values, commands, time_step)
         start = self.unwound(values, initial)
         levels = jax.lax.scan(lambda drives, sent: self.wind(values, drives, sent), start, command)[1]
@@ -417,7 +418,7 @@ class RobotSimulator(ExtendedSimulator):
     def wind(
         self, values: Values, drives: Wound, sent: Float[Array, " channel"]
     ) -> tuple[Wound, Float[Array, " cable"]]:
-        """The drives at the end of a step, and what the engine's cables are given, by the command that reached them."""
+        """The drives at the end of a step, and the cables' displacements [m], given the command that reached them."""
         limits = jnp.asarray(self.robot.drive_limits())
         move = jnp.asarray(self.robot.channel_matrix(values)) @ (sent - drives.sent)
         # A drive at its limit ignores further pulls, and answers the first release at once.

@@ -308,7 +308,7 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
     if travel is not None:
         yield from _travel(travel, robot)
     asked = asked_pulls(robot, trajectory)
-    doubted = asked is None or (robot.actuators[0].unit == "m" and asked.max() > robot.length)
+    doubted = asked is None or (robot.cables[0].unit == "m" and asked.max() > robot.length)
     beyond = "" if asked is None or doubted else cables_beyond(robot, asked)
     if beyond:
         held = "drives are held at the limits of the robot file if commands ask for more"

@@ -146,12 +146,12 @@ def _unasked(recording: Trajectory, robot: Robot) -> list[Caution]:
     return [Caution(Code.RECORDING_DOUBTFUL, sentence)]
 
 
-SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
-"""Factor and unit in which what drives a cable or a chamber is shown."""
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N")}
+"""Factor and unit in which the drive of a cable is shown."""
 
 
 def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows cable"] | None:
-    """Demand on each cable or chamber, in SI units of its drive; None for commands that do not fit the robot."""
+    """Demand on each cable, in SI units of its drive; None for commands that do not fit the robot."""
     if len(recording.cable_names) != len(robot.channel_names) or recording.command_unit != robot.command_unit:
         return None
     try:
@@ -163,10 +163,10 @@ def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows 
 
 
 def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
-    """Cables and chambers that are asked for more than they are allowed, in words; empty if there are none."""
+    """Cables that are asked for more than they are allowed, in words; empty if there are none."""
     low, high = asked.min(axis=0), asked.max(axis=0)
     least, most = np.array(robot.drive_limits()).T
-    factor, unit = SHOWN[robot.actuators[0].unit]
+    factor, unit = SHOWN[robot.cables[0].unit]
     return ", ".join(
         f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
         f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
@@ -179,7 +179,7 @@ def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
     asked = asked_pulls(robot, recording)
     length = robot.length
     if (
-        robot.actuators[0].unit != "m"
+        robot.cables[0].unit != "m"
         or asked is None
         or asked.max(initial=0.0) <= length
         or not cables_beyond(robot, asked)

@@ -12,6 +12,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
+from rfdropo_bayes.fem.mesh_points import NodePoints
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.body_engine import Backend, Engine
@@ -45,7 +46,8 @@ def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
     commands, values = every_step(trunk, 20), trunk.complete(SOFT)
     found = jax.jit(trunk.balance)(SOFT, commands)
     material, assembly = trunk.material(values), trunk.assembly
-    engine = trunk.engine.recording(every_node(len(assembly.system.body.rest)))
+    nodes = assembly.system.body.nodes
+    engine = trunk.engine.recording(NodePoints(np.arange(nodes)[:, None], np.ones((nodes, 1))))
     motion = engine.motion(*trunk.inputs(values, commands))
     mass, position = np.asarray(material.node_mass), np.asarray(motion.position)
     momentum = np.einsum("n,rni->ri", mass, np.diff(position, axis=0, prepend=position[:1]) / TIME_STEP)

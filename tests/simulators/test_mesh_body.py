@@ -216,7 +216,7 @@ def test_every_mechanism_says_whether_it_runs_on_a_mesh(sofa, name):
         jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))
     else:
         assert obstacle(mechanism, "tetrahedra", "numba") is not None
-        with pytest.raises(InputError, match="layered bodies only"):
+        with pytest.raises(InputError, match="rods only"):
             jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))
 
 

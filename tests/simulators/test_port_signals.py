@@ -50,7 +50,7 @@ def signals(simulator, given, size=1.0, seed=1):
     ("integrator", "settled", "mechanisms"),
     [
         pytest.param("euler", True, (), marks=pytest.mark.slow),
-        ("sdirk2", False, ("viscoelasticity", "bending_stiffening", "softening")),
+        ("sdirk2", False, ("viscoelasticity", "fibre_law", "softening")),
     ],
 )
 def test_two_engines_give_the_same_motion_under_signals(integrator, settled, mechanisms):
@@ -59,7 +59,7 @@ def test_two_engines_give_the_same_motion_under_signals(integrator, settled, mec
         simulator = arm(engine, settled, mechanisms, integrator=integrator)
         given = commands(simulator)
         given = given._replace(signals=signals(simulator, given))
-        values = {"softening_rate": 0.2, "bending_stiffening": 0.3} if mechanisms else {}
+        values = {"softening_rate": 0.2, "fibre_law": 0.3} if mechanisms else {}
         found.append(simulator.rollout({k: jnp.asarray(v) for k, v in values.items()}, given))
     assert [int(each.status) for each in found] == [0, 0]
     assert np.abs(found[0].position - found[1].position).max() < 1e-9

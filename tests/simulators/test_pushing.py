@@ -174,8 +174,8 @@ def test_contacts_act_equally_on_both_sides(beside, trunk):
 
 
 @pytest.mark.slow
-def test_a_layered_body_pushes_too():
-    """The same robot as layers, softened: it lies on a heavy cube that its outline keeps at a distance."""
+def test_a_rod_pushes_too():
+    """The same robot as a rod, softened: it lies on a heavy cube that its outline keeps at a distance."""
     discretisation = Discretisation(TIME_STEP)
     assembly = assemble(ROBOT, discretisation)
     trunk = TrunkSimulator(ROBOT, Engine(assembly, TIME_STEP), assembly, discretisation)
@@ -233,7 +233,8 @@ class Standing(NamedTuple):
     markers: int
     ending: dict
     lanes: int = 1
-    layered: bool = False
+    is_rod: bool = False
+    at_rest: bool = False
     scene: str = "a cube on a plate"
 
     def describe(self) -> dict:

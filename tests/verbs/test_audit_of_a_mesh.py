@@ -71,12 +71,12 @@ def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, 
     own = ["own.py:Glue", "own.py:Fur"]
     read = experiment(bar_mesh, candidates=own, exclude=["softening"])
     asked = build_problem(spec_of(read, tmp_path), read.audit, [recording()], [], seed=0)
-    layered = {name for name, kind in REGISTRY.items() if bodies_of(kind) == ("layered",)}
-    assert len(layered) == 10
-    assert set(asked.left_out) == layered - {"softening"} | {"own.py:Glue"}
-    assert "layered bodies only" in asked.left_out["coulomb_friction"]
-    assert "layered bodies only" in asked.left_out["own.py:Glue"]
-    assert {c.name for c in asked.candidates} == set(REGISTRY) - layered | {"fur", "initial_displacement"}
+    of_rods = {name for name, kind in REGISTRY.items() if bodies_of(kind) == ("rod",)}
+    assert len(of_rods) == 10
+    assert set(asked.left_out) == of_rods - {"softening"} | {"own.py:Glue"}
+    assert "rod bodies only" in asked.left_out["coulomb_friction"]
+    assert "rods only" in asked.left_out["own.py:Glue"]
+    assert {c.name for c in asked.candidates} == set(REGISTRY) - of_rods | {"fur", "initial_displacement"}
     assert asked.finer is not None
     steps = [lanes.simulator.description["time_step_s"] for lanes in (asked.lanes, asked.finer[0])]
     assert steps[1] == steps[0] / 2

@@ -160,9 +160,9 @@ def test_values_set_on_the_command_line_count(sofa, tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.slow
-def test_one_switch_brings_back_the_layered_body(sofa, tmp_path, monkeypatch, capsys):
-    report = simulate(EXPERIMENTS / "sofa_reach.toml", tmp_path, monkeypatch, capsys, "simulator.body=layered")
-    assert "layers" in report["simulator"]
+def test_one_switch_makes_a_rod_of_it(sofa, tmp_path, monkeypatch, capsys):
+    report = simulate(EXPERIMENTS / "sofa_reach.toml", tmp_path, monkeypatch, capsys, "simulator.body=rod")
+    assert report["simulator"]["body"] == "rod"
 
 
 @pytest.fixture
