@@ -132,7 +132,6 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
     none, whole = jnp.zeros((len(task.start.position), 6)), jnp.ones(())
     first = _Iterate(task.start, impulse, none, whole, jnp.array(True), whole, jnp.zeros(()), jnp.zeros(cables))
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
-    solved = jnp.where(last.moving, 0.0, last.solved)
     return Found(
         last.place.position,
         last.place.orientation,
