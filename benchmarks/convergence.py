@@ -87,7 +87,7 @@ def walk(robot: Robot, motions: int, seconds: float) -> Float[np.ndarray, "motio
     """Random commands [m or rad], cumulative."""
     random = np.random.default_rng(0)
     gain = np.abs(robot.channel_matrix({})).max(axis=0)
-    low, high = robot.displacement_limits().T
+    low, high = robot.drive_limits().T
     matrix, count = np.asarray(robot.channel_matrix({})), round(seconds / PERIOD)
     two_sided = np.any(matrix < 0.0, axis=0)  # a motor that pulls one cable lets another one go
     reach = min(FARTHEST, float(np.min(high)), float(np.min(-low)))

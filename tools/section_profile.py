@@ -1,6 +1,6 @@
 """Effective section profile of a slender body along z, from a linear finite-element solution of its real geometry.
 
-A layer of a layered body is a straight prism; a notched trunk is not. The section of a layer is therefore chosen such
+An element of a rod is a straight prism; a notched trunk is not. The section of a layer is therefore chosen such
 that its two ends move relative to each other as those of the real body do: end moments, an axial force and a torque
 act on the tip face, the mean rigid motion of the cross-section is measured at every station (least squares over points
 of its plane), and the layer's EI, EA and GJ follow from the differences.
@@ -8,7 +8,7 @@ of its plane), and the layer's EI, EA and GJ follow from the differences.
     python tools/section_profile.py trunk.vtk --robot trunk_physical --necks 6 --extrapolate
     python tools/section_profile.py trunk.vtk --robot trunk_sofa --element P1 --equal-node-masses --stiffening
 
-prints the arrays of a robot file's [body], and compares sag and first modes of the layered body with the solid's.
+prints the arrays of a robot file's [body], and compares sag and first modes of the rod with the solid's.
 The mesh is in millimetres, its axis is z, its tip face is plane. Needs scikit-fem and pypardiso.
 """
 
@@ -269,7 +269,7 @@ def solid_response(solid: Solid, station: np.ndarray, young_modulus: float, dens
     return Response(float(sag * scale), solid.frequencies(4)[::2] / (2 * np.pi * np.sqrt(scale)))
 
 
-def layered_response(
+def rod_response(
     station: np.ndarray, profile: dict[str, np.ndarray], poisson_ratio: float, young_modulus: float, density: float
 ) -> Response:
     """The same of the layers as a chain of Timoshenko beams with consistent mass, bending in the y-z plane."""
@@ -351,7 +351,7 @@ def stiffening(
 
 
 def main() -> None:
-    """Print the profile and how the layered body compares with the solid."""
+    """Print the profile and how the rod compares with the solid."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("mesh", type=Path, help="VTK file of tetrahedra, in millimetres")
     parser.add_argument("--robot", default="trunk_physical", help="whose stations are used")
@@ -382,10 +382,10 @@ def main() -> None:
     material = (robot.nominal()["young_modulus"], robot.density(robot.nominal()["trunk_mass"]))
     responses = {
         "solid": solid_response(solid, station, *material),
-        "layered": layered_response(station, profile, ratio, *material),
+        "rod": rod_response(station, profile, ratio, *material),
     }
     if arguments.extrapolate:
-        responses["layered, extrapolated"] = layered_response(station, shown, ratio, *material)
+        responses["rod, extrapolated"] = rod_response(station, shown, ratio, *material)
     print(f"# {solid.basis.N} degrees of freedom")
     for name, response in responses.items():
         modes = " and ".join(f"{value:.4f}" for value in response.frequency_hz)

@@ -26,7 +26,7 @@ SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
-REFINE = "raise [simulator] refine and shorten its time_step"
+REFINE = "raise [simulator] refine and, of a motion, shorten its time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
 
 
@@ -169,8 +169,8 @@ def _remedy(answer: Answer, name: str) -> str:
     candidate = answer.problem.candidate(name)
     if candidate is not None:
         return candidate.mechanism.remedy
-    layered = "layers" in answer.problem.lanes.simulator.description
-    return REFINE if layered else SHORTEN
+    rod = answer.problem.lanes.simulator.description.get("body") == "rod"
+    return REFINE if rod else SHORTEN
 
 
 def _watch(answer: Answer) -> str:

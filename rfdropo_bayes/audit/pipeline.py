@@ -46,7 +46,7 @@ from rfdropo_bayes.errors import InputError
 
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
-GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
+GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3, "orientation": 0.01}
 
 
 @dataclass(frozen=True)

@@ -27,4 +27,5 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
     first, second, third = jax.random.split(key, 3)  # the data sets of a seed are those of earlier versions
     keys = {"markers": jax.random.split(first, 1)[0], "tension": second, "weighed": third}
     keys |= {"motor_angle": jax.random.fold_in(key, 3), "object_pose": jax.random.fold_in(key, 4)}
+    keys |= {"orientation": jax.random.fold_in(key, 5)}
     return {channel.name: np.asarray(channel.draw(keys[channel.name], seen)) for channel in problem.model.channels}

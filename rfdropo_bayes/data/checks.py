@@ -20,11 +20,14 @@ DIMS: dict[str, tuple[str, ...]] = {
     "motor_angle": ("time", "cable"),
     "motor_angle_mask": ("time", "cable"),
     "object_pose": ("time", "pose"),
+    "orientation": ("time", "section", "quaternion"),
 }
+GAPPED = frozenset({"object_pose", "orientation"})
+"""What may be missing in a row."""
 MASKS = frozenset({"position_mask", "tension_mask", "motor_angle_mask"})
 _LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres taken for metres always do
 _SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are
-_UNLIMITED = {"N": np.inf, "N m": np.inf, "-": np.inf}
+_UNLIMITED = {"N": np.inf, "N m": np.inf, "Pa": np.inf, "-": np.inf}
 _LARGEST_COMMAND = {"m": 5.0, "rad": 20.0} | _UNLIMITED  # unclipped cumulative commands stay below in the right unit
 LARGEST = "largest_command"  # among the settings of a recording: in its unit, of drives that go farther than most
 _LARGEST_COMMAND_STEP = {"m": 0.5, "rad": 20.0} | _UNLIMITED
@@ -54,15 +57,20 @@ def check_dataset(dataset: xr.Dataset) -> None:
     _check_lengths(dataset, name)
     _check_commands(dataset, name)
     if "object_pose" in dataset:
-        norm = np.linalg.norm(dataset["object_pose"].values[:, 3:], axis=1)
-        norm = np.where(np.isfinite(norm), norm, 1.0)
-        if np.any(np.abs(norm - 1.0) > 1e-2):
-            row = int(np.argmax(np.abs(norm - 1.0)))
-            raise InputError(
-                f"the quaternion of the object has norm {norm[row]:.3g}",
-                where=f"{name}, row {row}",
-                remedy="give a unit quaternion as x, y, z, w",
-            )
+        _check_turns(dataset["object_pose"].values[:, 3:], "the quaternion of the object", name)
+    if "orientation" in dataset:
+        for k, section in enumerate(dataset["section"].values):
+            _check_turns(dataset["orientation"].values[:, k], f"the quaternion of the section {section}", name)
+
+
+def _check_turns(turn: np.ndarray, what: str, name: str) -> None:
+    """Raise an InputError where quaternions are not of unit length."""
+    norm = np.linalg.norm(turn, axis=1)
+    norm = np.where(np.isfinite(norm), norm, 1.0)
+    if np.any(np.abs(norm - 1.0) > 1e-2):
+        row = int(np.argmax(np.abs(norm - 1.0)))
+        remedy = "give a unit quaternion as x, y, z, w"
+        raise InputError(f"{what} has norm {norm[row]:.3g}", where=f"{name}, row {row}", remedy=remedy)
 
 
 def check_pose(pose: np.ndarray | None, rows: int, name: str) -> None:
@@ -77,7 +85,7 @@ def check_pose(pose: np.ndarray | None, rows: int, name: str) -> None:
 
 def _check_finite(dataset: xr.Dataset, name: str) -> None:
     for key in DIMS:
-        if key in dataset and key != "object_pose":  # a row without a pose is none
+        if key in dataset and key not in GAPPED:
             bad = ~np.isfinite(dataset[key].values.astype(float))
             if bad.any():
                 index = np.argwhere(bad)[0]

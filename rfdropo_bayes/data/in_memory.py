@@ -34,6 +34,8 @@ def from_arrays(
     tension: Float[Any, "time channel"] | None = None,
     motor_angle: Float[Any, "time channel"] | None = None,
     object_pose: Float[Any, "time 7"] | None = None,
+    orientation: Float[Any, "time section 4"] | None = None,
+    sections: Sequence[str] = (),
     name: str = "recording",
     robot: str = "",
 ) -> Recorded:
@@ -49,11 +51,15 @@ def from_arrays(
             by default.
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
-        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
+        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", "Pa", "kPa",
+            "bar", "psi", or "-".
         largest_command: that is to be believed, in ``command_unit``, of drives that go farther than 20 rad or 5 m.
         tension: [N]; not a number where it is missing.
         motor_angle: [rad]; not a number where it is missing.
         object_pose: centre and unit quaternion x, y, z, w of a pushed body.
+        orientation: of sections, unit quaternions x, y, z, w from the base's axes to the section's, which are the same
+            in the undeformed body; not a number where it is missing.
+        sections: names of these sections.
         name: of the recording; robot: that was recorded.
 
     Raises:
@@ -91,6 +97,10 @@ def from_arrays(
             tension=None if tension is None else _numbers(tension, "tensions", rows | width, name),
             motor_angle=None if motor_angle is None else _numbers(motor_angle, "motor angles", rows | width, name),
             object_pose=pose,
+            orientation=None
+            if orientation is None
+            else _numbers(orientation, "orientations", rows | {"sections": len(sections), "": 4}, name),
+            section_names=sections,
         ),
     )
 
@@ -115,6 +125,7 @@ def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
         raise InputError("the coordinates of axis are not x, y, z", where=name)
     dims = {"position": ("time", "marker", "axis"), "command": (clock, channel), "initial_command": (channel,)}
     dims |= {"tension": ("time", channel), "motor_angle": ("time", channel), "object_pose": ("time", "pose")}
+    dims |= {"orientation": ("time", "section", "quaternion")}
     known = {key: wanted for key, wanted in dims.items() if key in dataset}
     for key, wanted in known.items():
         if set(dataset[key].dims) != set(wanted):
@@ -126,6 +137,8 @@ def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     for key, (unit, sizes) in _further_units(stated, name).items():
         if own.get(key, unit) not in (None, unit):
             arrays[key] = _rescaled(key, arrays[key], _unit(str(own[key]), sizes, f"{name}, {key}") / sizes[unit])
+    if "orientation" in arrays:
+        arrays["sections"] = [str(section) for section in dataset["section"].values]
     return arrays | {
         "markers": [str(marker) for marker in dataset["marker"].values],
         "channels": [str(value) for value in dataset[channel].values],

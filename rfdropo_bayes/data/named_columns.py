@@ -31,11 +31,15 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "deg": ("rad", np.pi / 180.0),
     "N": ("N", 1.0),
     "N m": ("N m", 1.0),
+    "Pa": ("Pa", 1.0),
+    "kPa": ("Pa", 1e3),
+    "bar": ("Pa", 1e5),
+    "psi": ("Pa", 6894.757293168),
     "-": ("-", 1.0),
 }
 COUNTS = "counts"
 """Of an encoder, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "-"]
+CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "bar", "psi", "-"]
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -80,7 +84,8 @@ class CsvColumns(BaseModel):
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
     )
     command_unit: CommandUnit = Field(
-        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force or torque; "
+        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force, torque or "
+        "pressure; "
         '"-" for what a simulator of one\'s own takes'
     )
     counts_per_turn: float | None = Field(
@@ -144,6 +149,16 @@ class CsvColumns(BaseModel):
         description="columns of the pushed body's centre x, y, z and unit quaternion x, y, z, w; empty rows are left "
         "out",
     )
+    orientations: list[list[str]] | None = Field(
+        default=None,
+        description="columns of the orientation of each of sections: a unit quaternion x, y, z, w, or a rotation "
+        "vector x, y, z in rotation_unit, from the undeformed body, along the file's axes; empty rows are left "
+        "out",
+    )
+    sections: list[str] | None = Field(
+        default=None, description="the robot's name of each of orientations, see its [[orientations]]"
+    )
+    rotation_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of rotation vectors")
     robot: str = Field("", description="name of the robot that was recorded")
 
     @model_validator(mode="before")
@@ -182,6 +197,11 @@ class CsvColumns(BaseModel):
             if names is not None and len(names) != count:
                 what = "marker in positions" if key == "markers" else "channel in commands"
                 raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
+        if len(self.orientations or ()) != len(self.sections or ()):
+            raise ValueError("sections names each of orientations: give as many")
+        for turn in self.orientations or ():
+            if len(turn) not in (3, 4):
+                raise ValueError(f"an orientation has 4 columns (quaternion) or 3 (rotation vector), not {len(turn)}")
         for number, point in enumerate(self.positions):
             if point in self.positions[:number]:
                 first = self.positions.index(point) + 1
@@ -249,6 +269,8 @@ def read_tables(
             tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
             motor_angle=angle,
             object_pose=_pose(table, columns),
+            orientation=_orientations(table, columns),
+            section_names=columns.sections or (),
         ),
     )
 
@@ -347,3 +369,18 @@ def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] |
     turned = np.full((len(pose), 4), np.nan)
     turned[known] = (Rotation.from_matrix(rotation) * Rotation.from_quat(pose[known, 3:])).as_quat()
     return np.hstack([pose[:, :3] @ rotation.T, turned])
+
+
+def _orientations(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows section 4"] | None:
+    """Quaternions from the base's axes to those of the sections, which are the same in the undeformed body."""
+    if not columns.orientations:
+        return None
+    turned = np.full((len(table), len(columns.orientations), 4), np.nan)
+    axes = Rotation.from_matrix(axes_matrix(columns.axes))
+    for k, names in enumerate(columns.orientations):
+        read = table.numbers(names, allow_missing=True)
+        known = np.isfinite(read).all(axis=1)
+        vector = COMMAND_UNITS[columns.rotation_unit][1] * read[known]
+        turn = Rotation.from_rotvec(vector) if len(names) == 3 else Rotation.from_quat(read[known])
+        turned[known, k] = (axes * turn * axes.inv()).as_quat()
+    return turned

@@ -86,6 +86,8 @@ class Measured:
         tension: of the cables [N].
         motor_angle: [rad].
         object_pose: centre [m] and unit quaternion x, y, z, w of a pushed body.
+        orientation: of sections, unit quaternions x, y, z, w from the base's axes to the section's.
+        section_names: of these sections.
     """
 
     time: Float[np.ndarray, " time"]
@@ -95,6 +97,8 @@ class Measured:
     tension: Float[np.ndarray, "time cable"] | None = None
     motor_angle: Float[np.ndarray, "time cable"] | None = None
     object_pose: Float[np.ndarray, "time 7"] | None = None
+    orientation: Float[np.ndarray, "time section 4"] | None = None
+    section_names: Sequence[str] = ()
 
 
 class Recorded(NamedTuple):
@@ -116,7 +120,7 @@ def assembled(recorded: Recorded) -> xr.Dataset:
     checks.check_pose(measured.object_pose, len(measured.time), origin.name)
     tension, tension_mask = present_readings(measured.tension)
     motor_angle, angle_mask = present_readings(measured.motor_angle)
-    facts |= _missing(tension_mask, angle_mask, measured.object_pose)
+    facts |= _missing(tension_mask, angle_mask, measured.object_pose, measured.orientation)
     facts |= {} if sent.largest is None else {checks.LARGEST: float(sent.largest)}
     new = _angle_mask(measured.time, motor_angle, float(facts.get("motor_angle_hold", 0.0)))
     pose, mask, initial = measured.object_pose, measured.position_mask, sent.initial_command
@@ -130,6 +134,7 @@ def assembled(recorded: Recorded) -> xr.Dataset:
         "motor_angle": motor_angle,
         "motor_angle_mask": angle_mask if new is None else (new if angle_mask is None else new & angle_mask),
         "object_pose": None if pose is None else continuous_quaternions(pose),
+        "orientation": measured.orientation,
     }
     dataset = _dataset(recorded, arrays)
     dataset["command"].attrs["unit"] = sent.command_unit
@@ -149,7 +154,7 @@ def assembled(recorded: Recorded) -> xr.Dataset:
 
 
 def _dataset(recorded: Recorded, arrays: Mapping[str, Any]) -> xr.Dataset:
-    origin, sent, measured = recorded
+    sent, measured = recorded.sent, recorded.measured
     start = measured.time[0] if len(measured.time) else 0.0
     coords = {
         "time": np.asarray(measured.time, dtype=float) - start,
@@ -157,13 +162,19 @@ def _dataset(recorded: Recorded, arrays: Mapping[str, Any]) -> xr.Dataset:
         "marker": list(measured.marker_names),
         "cable": list(sent.cable_names),
         "axis": list(AXES),
-    } | ({} if arrays["object_pose"] is None else {"pose": list(POSE)})
+    }
+    if arrays["object_pose"] is not None:
+        coords["pose"] = list(POSE)
+    if arrays["orientation"] is not None:
+        coords |= {"section": list(measured.section_names), "quaternion": list("xyzw")}
     try:
         data = {key: (checks.DIMS[key], np.array(value)) for key, value in arrays.items() if value is not None}
         return xr.Dataset(data, coords=coords)
     except ValueError as error:
         raise InputError(
-            f"recording and commands do not fit together ({error})", where=origin.name, remedy="check their lengths"
+            f"recording and commands do not fit together ({error})",
+            where=recorded.origin.name,
+            remedy="check their lengths",
         ) from None
 
 
@@ -173,12 +184,16 @@ def _angle_mask(time: np.ndarray, angle: np.ndarray | None, hold: float) -> Bool
 
 
 def _missing(
-    tension_mask: np.ndarray | None, angle_mask: np.ndarray | None, pose: np.ndarray | None
+    tension_mask: np.ndarray | None,
+    angle_mask: np.ndarray | None,
+    pose: np.ndarray | None,
+    orientation: np.ndarray | None,
 ) -> dict[str, dict[str, int]]:
     counts = {
         "tensions": 0 if tension_mask is None else int((~tension_mask).sum()),
         "motor angles": 0 if angle_mask is None else int((~angle_mask).sum()),
         "poses of the object": 0 if pose is None else int((~np.isfinite(pose).all(axis=-1)).sum()),
+        "orientations": 0 if orientation is None else int((~np.isfinite(orientation).all(axis=-1)).sum()),
     }
     found = {kind: count for kind, count in counts.items() if count}
     return {MISSING: found} if found else {}

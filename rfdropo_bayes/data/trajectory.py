@@ -36,7 +36,7 @@ from rfdropo_bayes.files import whole
 from rfdropo_bayes.signatures import see_keywords, with_keywords_of
 
 _HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
-_OPTIONAL = ("tension", "tension_mask", "motor_angle", "motor_angle_mask", "object_pose")
+_OPTIONAL = ("tension", "tension_mask", "motor_angle", "motor_angle_mask", "object_pose", "orientation")
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,7 +52,8 @@ class Trajectory:
     - ``initial_command(cable)``: in force before ``command_time[0]``, hence the state the recording starts from;
     - optionally ``tension(time, cable)`` [N] and its ``tension_mask``, False where one is missing;
       ``motor_angle(time, cable)`` [rad] and its ``motor_angle_mask``, False where one is missing or an older reading is
-      repeated; ``object_pose(time, pose)`` (x y z [m], unit quaternion x y z w; not a number where it is missing).
+      repeated; ``object_pose(time, pose)`` (x y z [m], unit quaternion x y z w; not a number where it is missing);
+      ``orientation(time, section, quaternion)``, unit quaternions x y z w from the base's axes to those of a section.
 
     ``time`` is in seconds from the first observation row. ``command_time`` shares that clock.
 
@@ -88,12 +89,13 @@ class Trajectory:
             given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
                 marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
                 away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
-                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in force
-                until the next; ``markers`` and ``channels``, their names. These five are required. ``command_time``:
-                from when each command is in force, on the clock of ``time``; ``initial_command``, in force before the
-                first; ``largest_command`` that is to be believed, of drives of many turns. ``tension`` (time, channel)
-                [N], ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7): centre and unit quaternion x, y,
-                z, w. ``name`` of the recording; ``robot`` that was recorded.
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in
+                force until the next; ``markers`` and ``channels``, their names. These five are required.
+                ``command_time``: from when each command is in force, on the clock of ``time``; ``initial_command``, in
+                force before the first; ``largest_command`` that is to be believed, of drives of many turns.
+                ``tension`` (time, channel) [N], ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7):
+                centre and unit quaternion x, y, z, w. ``orientation`` (time, section, 4), unit quaternions x, y, z, w,
+                and ``sections``, their names. ``name`` of the recording; ``robot`` that was recorded.
 
         Raises:
             InputError: an unknown or missing keyword, an unknown unit, what is not a number, shapes that do not fit,
@@ -189,7 +191,7 @@ class Trajectory:
 
     @property
     def command_unit(self) -> str:
-        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"`` or ``"-"``."""
+        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"``, ``"Pa"`` or ``"-"``."""
         return str(self.dataset["command"].attrs["unit"])
 
     @property
@@ -221,6 +223,16 @@ class Trajectory:
     def object_pose(self) -> Float[np.ndarray, "time 7"] | None:
         """Pose of the manipulated object (x y z [m], quaternion x y z w), if there is one."""
         return self._array("object_pose") if "object_pose" in self.dataset else None
+
+    @property
+    def orientation(self) -> Float[np.ndarray, "time section 4"] | None:
+        """Orientations of sections, unit quaternions x y z w from the base's axes to the section's, if measured."""
+        return self._array("orientation") if "orientation" in self.dataset else None
+
+    @property
+    def section_names(self) -> tuple[str, ...]:
+        """Names of the sections whose orientation was measured."""
+        return tuple(str(name) for name in self.dataset["section"].values) if "section" in self.dataset else ()
 
     @property
     def tension_mask(self) -> Bool[np.ndarray, "time cable"] | None:
@@ -377,6 +389,10 @@ class Trajectory:
                 data[key] = (self.dataset[key].dims, (1.0 - share) * values[left] + share * values[right])
         if "object_pose" in data:
             data["object_pose"][1][:, 3:] = _slerp(self.dataset["object_pose"].values[:, 3:], left, right, weight)
+        if "orientation" in self.dataset:
+            turns = self.dataset["orientation"].values
+            found = [_slerp(turns[:, k], left, right, weight) for k in range(turns.shape[1])]
+            data["orientation"] = (self.dataset["orientation"].dims, np.stack(found, axis=1))
         for key in checks.MASKS & set(self.dataset.variables):
             mask = self.dataset[key].values
             usable = (mask[left] | (weight == 1.0)[:, None]) & (mask[right] | (weight == 0.0)[:, None])

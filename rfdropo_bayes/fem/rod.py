@@ -116,11 +116,12 @@ def profile_rod(
     )
 
 
-def refined(body: Rod, elements: int) -> Rod:
-    """The rod with every element cut into this many equal elements of the same section."""
-    at = np.arange(body.elements * elements + 1) / elements
+def refined(body: Rod, elements: int | Sequence[int]) -> Rod:
+    """The rod with every element cut into so many equal elements of the same section, all alike or each as said."""
+    counts = np.broadcast_to(elements, body.elements)
     rows = np.arange(body.elements + 1)
-    sections = {name: np.repeat(getattr(body, name), elements, axis=0) for name in Rod._fields[2:]}
+    at = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)] + [[body.elements]])
+    sections = {name: np.repeat(getattr(body, name), counts, axis=0) for name in Rod._fields[2:]}
     half_width = np.stack([np.interp(at, rows, body.half_width[:, i]) for i in range(2)], axis=1)
     return Rod(np.interp(at, rows, body.station), half_width, **sections)
 

@@ -46,6 +46,7 @@ class Motion(NamedTuple):
     converged: Bool[Any, "*batch"]  # whether the impulses of every step's constraints were found
     pose: Float[Any, "*batch row 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
     peak: Float[Any, "*batch cable"] | None = None  # largest tension at the steps of a session's last call [N]
+    solves: Float[Any, "*batch"] | None = None  # linear solves of a quasi-static motion's rows
 
 
 class _Progress(NamedTuple):

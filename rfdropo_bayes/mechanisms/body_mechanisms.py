@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from rfdropo_bayes.fem import BendingLaw, LayeredBody, Material, Viscoelasticity, Wall
+from rfdropo_bayes.fem import BendingLaw, Material, Rod, Viscoelasticity, Wall
 from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
@@ -31,7 +31,7 @@ class Payload:
     remedy = "weigh what hangs at the tip"
     parameters = (ParameterSpec("payload_mass", "kg", 0.0, 5.0, 0.0, half_normal(0.1), "mass hung at the tip"),)
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Add the mass to the last station."""
         return material._replace(point_mass=material.point_mass.at[-1].add(values["payload_mass"]))
 
@@ -49,7 +49,7 @@ class StiffnessGradient:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Scale each layer by the gradient at its middle."""
         middle = 0.5 * (body.station[1:] + body.station[:-1])
         s = (middle - body.station[0]) / (body.station[-1] - body.station[0])
@@ -84,7 +84,7 @@ class BaseTilt:
         along = int(np.argmax(np.abs(robot.gravity)))
         return cls([axis for k, axis in enumerate(AXES) if k != along])
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Rotate gravity into the tilted base."""
         gravity = material.gravity
         for axis in self.axes:
@@ -107,7 +107,8 @@ class ViscoelasticBranch:
 
     name = "viscoelasticity"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
+    motions = ("dynamic",)
     cause = "relaxation of the elastomer: it creeps in holds and is stiffer when moved fast"
     remedy = "record a hold of a minute after a fast move, or a relaxation test of a sample"
     parameters = (
@@ -126,35 +127,39 @@ class ViscoelasticBranch:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Put the branch beside the elasticity of every layer."""
         branch = Viscoelasticity(values["prony_fraction"], values["prony_time"])
         return material._replace(effects=material.effects._replace(viscoelasticity=branch))
 
 
-class BendingStiffening:
-    """Bending moments grow with the cube of curvature too; zero is the base simulator."""
+class FibreLaw:
+    """The stiffness of the body's fibres changes with their strain: stress E (x - 3 c x^2 / 2); zero is the base
+    simulator.
 
-    name = "bending_stiffening"
+    A section then has the energy E A / 2 (e^2 - c e^3) + E I / 2 k^2 (1 - 3 c e) of its stretch e and curvature k.
+    """
+
+    name = "fibre_law"
     stage = "body"
-    bodies = ("layered",)
-    cause = "strain stiffening of the elastomer, notches that close, or cables that stiffen the body as it bends"
-    remedy = "measure force against deflection of the tip up to large bends"
+    bodies = ("rod",)
+    cause = "a material whose stiffness changes with stretch, notches that close, or fibres that take up load"
+    remedy = "pull and press a sample of the material along its axis, and compare the two slopes"
     parameters = (
         ParameterSpec(
-            "bending_stiffening",
+            "fibre_law",
             "-",
-            -0.2,
-            20.0,
+            -2.0,
+            2.0,
             0.0,
-            normal(0.2),
-            "relative growth of the bending moment where the body bends by one radian",
+            normal(0.5),
+            "c of the fibre energy E/2 (x^2 - c x^3): -1 St. Venant-Kirchhoff, 2/3 rubber, positive softer in tension",
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
-        """Add the cubic moment to every layer."""
-        return _bending(material, stiffening=values["bending_stiffening"])
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
+        """Give every section the law."""
+        return _bending(material, fibre=values["fibre_law"])
 
 
 class PlaneAnisotropy:
@@ -162,7 +167,7 @@ class PlaneAnisotropy:
 
     name = "plane_anisotropy"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
     cause = "a section that is not round: casting seams, cable channels, embedded tubes"
     remedy = "measure the deflection under a weight at the tip in several directions about the axis"
     parameters = (
@@ -186,7 +191,7 @@ class PlaneAnisotropy:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Change the bending stiffness of every layer."""
         return _bending(material, anisotropy=values["plane_anisotropy"], cross_plane=values["cross_plane_stiffness"])
 
@@ -196,7 +201,7 @@ class BendTwistCoupling:
 
     name = "bend_twist_coupling"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
     cause = "cables or fibres that run helically, or a section without mirror planes"
     remedy = "watch for twist of the tip when one cable is pulled; check the routing of the cables"
     parameters = tuple(
@@ -212,7 +217,7 @@ class BendTwistCoupling:
         for axis in "xy"
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Couple twist and bending of every layer."""
         return _bending(material, twist_x=values["bend_twist_x"], twist_y=values["bend_twist_y"])
 
@@ -222,7 +227,8 @@ class Softening:
 
     name = "softening"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
+    motions = ("dynamic",)
     cause = "warming of the body or its drives, or softening of the elastomer with use (Mullins)"
     remedy = "warm up before recording, repeat the same commands at the end, and log the temperature"
     parameters = (
@@ -231,7 +237,7 @@ class Softening:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Let every modulus drift."""
         return material._replace(effects=material.effects._replace(softening_rate=values["softening_rate"]))
 
@@ -241,7 +247,7 @@ class CoulombFriction:
 
     name = "coulomb_friction"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
     cause = "cables that rub in their guides, sheaths or seals with a force that does not depend on tension"
     remedy = "pull a slack cable through the body with a spring scale; lubricate or line the guides"
     parameters = (
@@ -250,7 +256,7 @@ class CoulombFriction:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Give every guide the friction force."""
         return material._replace(effects=material.effects._replace(coulomb_friction=values["coulomb_friction"]))
 
@@ -260,7 +266,7 @@ class CapstanFriction:
 
     name = "capstan_friction"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
     cause = "friction of cables pressed against their guides where the body bends"
     remedy = "measure the tension at both ends of a cable over a known bend; lubricate or line the guides"
     parameters = (
@@ -275,7 +281,7 @@ class CapstanFriction:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Give every guide the coefficient of friction."""
         return material._replace(effects=material.effects._replace(capstan_friction=values["capstan_friction"]))
 
@@ -285,7 +291,7 @@ class CableCompliance:
 
     name = "cable_compliance"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
     cause = "stretch of the cables, of their anchorage and of the transmission under load"
     remedy = "hang a known weight on each cable and measure its stretch; use stiffer cable"
     parameters = (
@@ -294,7 +300,7 @@ class CableCompliance:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Put the compliance in series with every cable."""
         return material._replace(effects=material.effects._replace(cable_compliance=values["cable_compliance"]))
 
@@ -304,7 +310,8 @@ class QuadraticDrag:
 
     name = "quadratic_drag"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
+    motions = ("dynamic",)
     cause = "resistance of the surrounding air or water"
     remedy = "compare slow and fast sweeps of the same path"
     parameters = (
@@ -319,7 +326,7 @@ class QuadraticDrag:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Let every section be dragged."""
         return material._replace(effects=material.effects._replace(drag=values["drag_density"]))
 
@@ -329,7 +336,7 @@ class WallContact:
 
     name = "wall_contact"
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
     cause = "the body touches its mount, a table, a cable bundle or itself"
     remedy = "look where the trajectory ends on one side; clear the workspace or measure where the surface is"
     parameters = (
@@ -364,7 +371,7 @@ class WallContact:
         ),
     )
 
-    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Put the wall there."""
         wall = Wall(values["wall_stiffness"], values["wall_distance"], values["wall_azimuth"])
         return material._replace(effects=material.effects._replace(wall=wall))

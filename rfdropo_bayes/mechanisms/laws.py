@@ -192,10 +192,10 @@ class SignalLaw(Law):
 
 
 class BodyLaw(SignalLaw):
-    """Acts on a layered body; one that follows the motion in whole rollouts only."""
+    """Acts on a rod; one that follows the motion in whole rollouts only."""
 
     stage = "body"
-    bodies = ("layered",)
+    bodies = ("rod",)
 
     @property
     def follows_motion(self) -> bool:

@@ -151,7 +151,7 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     if engine is not None and robot is not None and engine.carries_loads:
         places = len(engine.load_stations)
         gravity = (float(robot.gravity[0]), float(robot.gravity[1]), float(robot.gravity[2]))
-        ports += _of_body(places, gravity)
+        ports += [port for port in _of_body(places, gravity) if not (engine.at_rest and port.kind == "damping")]
     else:
         body = BLACK_BOX if engine is None else f"a body of {BODIES[1]}, or one before a cube,"
         left_out["forces, stiffness, damping, base tilt"] = f"{body} takes no signals"

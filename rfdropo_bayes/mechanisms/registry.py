@@ -32,11 +32,11 @@ from rfdropo_bayes.mechanisms.actuation import (
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
     BaseTilt,
-    BendingStiffening,
     BendTwistCoupling,
     CableCompliance,
     CapstanFriction,
     CoulombFriction,
+    FibreLaw,
     Payload,
     PlaneAnisotropy,
     QuadraticDrag,
@@ -81,7 +81,7 @@ REGISTRY: dict[str, type] = {
         CapstanFriction,
         CableCompliance,
         ViscoelasticBranch,
-        BendingStiffening,
+        FibreLaw,
         PlaneAnisotropy,
         BendTwistCoupling,
         Softening,

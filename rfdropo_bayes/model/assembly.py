@@ -13,12 +13,14 @@ from rfdropo_bayes.bayes.channels import (
     Markers,
     MotorAngle,
     ObjectPose,
+    Orientation,
     Series,
     Tension,
     WeighedParts,
 )
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
+from rfdropo_bayes.bayes.channels.orientation import FRAME_TURNS, ORIENTATION_NOISE
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
 from rfdropo_bayes.bayes.noise import (
     NOISE_CORRELATION_TIME,
@@ -46,11 +48,11 @@ from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
-from rfdropo_bayes.simulators.body_engine import Engine, Integrator
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
-from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest, specs_of
+from rfdropo_bayes.simulators.robot_simulator import DAMPING, RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 Entry = TypeVar("Entry")
@@ -62,7 +64,14 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
     "tension": (TENSION_NOISE, TENSION_GAIN),
     "motor_angle": (MOTOR_ANGLE_NOISE,),
     "object_pose": (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME),
+    "orientation": (ORIENTATION_NOISE, *FRAME_TURNS),
 }
+GAINS = (TENSION_GAIN, *FRAME_TURNS)
+"""Parameters of channels that are known unless they have a prior."""
+
+
+REST_CLOCK = 0.05
+"""Step [s] of drives and cameras of a body at rest, which has no time step itself."""
 
 
 def robot_of(spec: ModelSpec) -> Robot:
@@ -76,9 +85,14 @@ def robot_of(spec: ModelSpec) -> Robot:
     return spec.robot
 
 
-def integrator_of(spec: ModelSpec) -> Integrator | None:
-    """How time steps are taken: as [simulator] says, or else the robot; None for a black box."""
-    return None if isinstance(spec.robot, BlackBox) else spec.simulator.integrator or spec.robot.integrator
+def integrator_of(spec: ModelSpec) -> str | None:
+    """How time steps are taken: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
+    black box."""
+    if isinstance(spec.robot, BlackBox):
+        return None
+    if spec.simulator.motion == QUASI_STATIC:
+        return QUASI_STATIC
+    return spec.simulator.integrator or spec.robot.integrator
 
 
 def build_simulator(spec: ModelSpec) -> AnySimulator:
@@ -97,7 +111,9 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
     table, robot = spec.simulator, with_drives(robot_of(spec), spec.drives, spec.groups)
     if table.drives == "direct":
         robot = robot.without_command_timing()
-    time_step, integrator = table.time_step or robot.time_step_s, table.integrator or robot.integrator
+    rests = table.motion == QUASI_STATIC
+    time_step = REST_CLOCK if rests else table.time_step or robot.time_step_s
+    integrator = QUASI_STATIC if rests else table.integrator or robot.integrator
     trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
@@ -106,9 +122,9 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
         engine = Engine(bound, time_step, backend(table, False), integrator=integrator)
         trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step)
     else:
-        discretisation = Discretisation(time_step, table.nodes_across, table.refine)
+        discretisation = Discretisation(time_step, table.refine)
         assembly = assemble(robot, discretisation)
-        settled = robot.initial_state == "equilibrium"
+        settled = rests or robot.initial_state == "equilibrium"
         engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator)
         trunk = TrunkSimulator(robot, engine, assembly, discretisation)
     return _with_mechanisms(trunk.pushing() if table.push else trunk, spec)
@@ -156,7 +172,7 @@ def measurement_specs(noise: str, channels: DataChannels) -> tuple[ParameterSpec
     further = [spec for key, chosen in asdict(channels).items() if chosen for spec in SWITCHED[key]]
     if noise == "white":
         further = [spec for spec in further if spec != OBJECT_CORRELATION_TIME]
-    return (*own, *(s for s in further if noise != REPEATS or s == TENSION_GAIN))
+    return (*own, *(s for s in further if noise != REPEATS or s in GAINS))
 
 
 def measured_parameters() -> set[str]:
@@ -190,6 +206,9 @@ def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *
     specs, chosen = model_specs(spec, simulator), asdict(spec.channels)
     known = [each.name for each in specs]
     further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
+    if spec.simulator.motion == QUASI_STATIC:
+        damping = {name: found for name, found in robot_of(spec).parameters.items() if name in DAMPING}
+        further['set [simulator] motion = "dynamic"'] = specs_of(damping)
     further['let the noise last, [model] noise = "auto"'] = (OBJECT_CORRELATION_TIME,)
     further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
     for mechanism in mechanisms_named(REGISTRY, simulator.robot):
@@ -306,7 +325,7 @@ def model_space(
     check_used(spec.per_recording, spec, simulator, where="[model.per_recording]")
     known, last = {each.name for each in specs}, [each.name for m in later for each in m.parameters]
     added = [each.name for mechanism in simulator.mechanisms if mechanism not in later for each in mechanism.parameters]
-    measured = [s.name for s in specs if s not in simulator.parameters and s != TENSION_GAIN]
+    measured = [s.name for s in specs if s not in simulator.parameters and s not in GAINS]
     every = model_specs(spec, simulator)
     given = {name: entry for name, entry in expand_groups(spec.priors, every).items() if name in known}
     both = sorted(set(fixed) & set(given))
@@ -344,6 +363,8 @@ def gather_channels(
         channels.append(Tension.gather(simulator, trajectories, length, fitted))
     if chosen.motor_angle:
         channels.append(MotorAngle.gather(trajectories, length, fitted))
+    if chosen.orientation:
+        channels.append(Orientation.gather(simulator, trajectories, length, fitted))
     if chosen.object_pose:
         channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=spec.noise != "white"))
     if spec.noise == REPEATS:

@@ -8,13 +8,13 @@ from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.simulators.body_engine import Backend
 
 
-def backend(table: SimulatorTable, layered: bool) -> Backend:
+def backend(table: SimulatorTable, rod: bool) -> Backend:
     """The backend that [simulator] asks for.
 
-    "auto" takes the compiled one for meshes, as JAX takes minutes to compile one, and for layers where JAX has only a
+    "auto" takes the compiled one for meshes, which JAX has not, and for rods where JAX has only a
     CPU.
     """
     compiled = table.engine == "numba"
     if table.engine == "auto":
-        compiled = not layered or jax.default_backend() == "cpu"
+        compiled = not rod or jax.default_backend() == "cpu"
     return Backend("numba", table.precision, table.threads) if compiled else Backend("jax")

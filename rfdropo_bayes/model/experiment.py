@@ -123,6 +123,11 @@ class ModelTable(ExperimentTable):
         default=False,
         description="the recordings' motor angles are data, with a noise motor_angle_noise that is inferred",
     )
+    orientation: bool = Field(
+        default=False,
+        description="the recordings' orientations of sections are data, with a noise orientation_noise that is "
+        "inferred and a turn of the frame, frame_turn_x, _y and _z, that is zero unless it has a prior",
+    )
     object_pose: bool = Field(
         default=False,
         description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and, "
@@ -137,10 +142,16 @@ class ModelTable(ExperimentTable):
 class SimulatorTable(ExperimentTable):
     """[simulator]: body, engine and discretisation; what is left out is the robot's own."""
 
-    body: Literal["layered", "tetrahedra"] = Field(
-        default="layered",
-        description="layers of the robot's section profile, or the mesh under [simulator.tetrahedra]; a body that is "
+    body: Literal["rod", "tetrahedra"] = Field(
+        default="rod",
+        description="a rod with the robot's section profile, or the mesh under [simulator.tetrahedra]; a body that is "
         "not chosen has no effect",
+    )
+    motion: Literal["dynamic", "quasi-static"] = Field(
+        default="dynamic",
+        description='"quasi-static": every row is an equilibrium, found from the one before; it has no damping, and '
+        "time acts on drives and cameras alone. It is enough if the robot moves slower than its body answers, which "
+        "rfdropo check measures",
     )
     push: bool = Field(default=False, description="put the robot's cube and plate before the trunk")
     drives: Literal["robot", "direct"] = Field(
@@ -151,7 +162,7 @@ class SimulatorTable(ExperimentTable):
     tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
     engine: Literal["auto", "jax", "numba"] = Field(
         default="auto",
-        description='"auto" is the compiled one, or JAX where it has a GPU and the body is layered',
+        description='"auto" is the compiled one, or JAX where it has a GPU and the body is a rod',
     )
     precision: Literal["float64", "float32"] = Field(
         default="float64",
@@ -163,9 +174,20 @@ class SimulatorTable(ExperimentTable):
         description='"sdirk2", of second order, takes two solves a step and comes about ten times nearer to the '
         'converged motion than "euler", which takes one, as SOFA does; the robot\'s by default',
     )
-    nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of a layer")
-    refine: int = Field(default=1, ge=1, le=16, description="each layer is cut into so many")
+    refine: int = Field(default=1, ge=1, le=16, description="cut every element of the robot's rod into so many")
     threads: int | None = Field(default=None, ge=1, description="of the compiled engine; one per processor by default")
+
+    @model_validator(mode="after")
+    def _rests(self) -> SimulatorTable:
+        if self.motion != "quasi-static":
+            return self
+        moving = {"time_step": self.time_step is not None, "integrator": self.integrator is not None}
+        moving |= {"push": self.push, 'body = "tetrahedra"': self.body == "tetrahedra"}
+        for key, stated in moving.items():
+            if stated:
+                remedy = 'remove it, or set motion = "dynamic"'
+                raise InputError(f'{key} beside motion = "quasi-static"', where="[simulator]", remedy=remedy)
+        return self
 
     @model_validator(mode="after")
     def _has_mesh(self) -> SimulatorTable:

@@ -45,7 +45,7 @@ def read_tables(path: Path) -> dict[str, Any]:
         raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
     if path.name in WRITTEN_BY_RUNS and any((path.parent / name).is_file() for name in RESULTS_OF_RUNS):
         stated = tables.setdefault("simulator", {})
-        if isinstance(stated, dict):
+        if isinstance(stated, dict) and "motion" not in stated:
             stated.setdefault("integrator", "euler")
     return tables
 

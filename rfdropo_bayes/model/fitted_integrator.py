@@ -9,6 +9,7 @@ from typing import Any
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import read_tables
 from rfdropo_bayes.model.run_folder import CONFIG
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 
 INTEGRATOR = "integrator"
 """Attribute of a posterior: how time steps were taken in its fit."""
@@ -35,8 +36,9 @@ def check_fitted_integrator(fitted: str, integrator: str | None, *, where: str) 
         InputError: it does not.
     """
     if integrator is not None and integrator != fitted:
+        key = "motion" if fitted == QUASI_STATIC else "integrator"
         raise InputError(
-            f"the parameters were fitted with integrator {fitted!r}, and are to be used with {integrator!r}",
+            f"the parameters were fitted with {key} {fitted!r}, and are to be used with {integrator!r}",
             where=where,
-            remedy=f"add --set simulator.integrator={fitted}, or calibrate anew",
+            remedy=f"add --set simulator.{key}={fitted}, or calibrate anew",
         )

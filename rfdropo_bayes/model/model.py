@@ -34,6 +34,7 @@ from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.signatures import with_keywords_of
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
 
@@ -238,7 +239,7 @@ class Model:
             robot = ROBOT_COPY if self.texts() else self.spec.named or self.name
             found = {"robot": robot, **self.settings.tables(), **self.spec.tables()}
         integrator = integrator_of(self.spec)
-        if integrator is not None:
+        if integrator is not None and integrator != QUASI_STATIC:
             found["simulator"] = {**found.get("simulator", {}), "integrator": integrator}
         return found
 

@@ -48,6 +48,7 @@ class DataChannels:
     tension: bool = False
     motor_angle: bool = False
     object_pose: bool = False
+    orientation: bool = False
 
 
 @dataclass(frozen=True)
@@ -225,7 +226,7 @@ def spec_of(
         per_group=table.per_group,
         only_in=table.only_in,
         drives=tuple(table.drives),
-        channels=DataChannels(table.tension, table.motor_angle, table.object_pose),
+        channels=DataChannels(table.tension, table.motor_angle, table.object_pose, table.orientation),
         weighed=tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed),
         adapter=experiment.adapter,
         folder=folder,

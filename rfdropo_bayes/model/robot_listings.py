@@ -21,7 +21,7 @@ def robot_rows() -> list[Row]:
         rows.append(
             {
                 "robot": name,
-                "cables": str(len(robot.cables)),
+                "cables": str(len(robot.actuators)),
                 "commands": f"{len(robot.channel_names)} in {robot.command_unit}",
                 "markers": str(len(robot.markers)),
                 "description": robot.description,

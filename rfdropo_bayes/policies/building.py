@@ -28,7 +28,7 @@ def trunk_simulator(
     integrator: Integrator | None = None,
     folder: Path = Path(),
 ) -> RobotSimulator:
-    """The layered trunk on the compiled engine, as episodes want it.
+    """The rod on the compiled engine, as episodes want it.
 
     Args:
         push: put the robot's cube and plate before it.

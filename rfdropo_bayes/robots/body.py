@@ -1,8 +1,8 @@
-"""Geometry of a slender body along z, and the effective section of each of its layers."""
+"""Geometry of a slender body along z, and the effective section of each of its layers, which are elements of a rod."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -28,13 +28,11 @@ class PointMass(RobotTable):
 
 
 class Body(RobotTable):
-    """A body layered along z, from the clamp (first station) to the tip.
+    """A body of layers along z, from the clamp (first station) to the tip; each is one element of a rod or several.
 
     A layer's section is effective: the profile is what makes the layer's ends move as those of the real body do under
-    unit moments, force and torque, whatever its true shape in between.
-
-    ``poisson_stiffening`` is there because wide vertebrae keep a neck from contracting, and linear tetrahedra lock.
-    With it, the layers themselves do not contract as they stretch.
+    unit moments, force and torque, whatever its true shape in between. Poisson's ratio acts on shear and torsion alone,
+    unless ``poisson_stiffening`` says more: wide vertebrae keep a neck from contracting, and linear tetrahedra lock.
     """
 
     station_m: tuple[float, ...] = Field(
@@ -42,16 +40,20 @@ class Body(RobotTable):
         description="axial coordinates of the S stations; the first is clamped",
     )
     half_width_m: tuple[Pair, ...] = Field(
-        description="half widths in x and y, at each station, of the square that carries the nodes: the outer size of"
-        " the body, which encloses the cable guides",
+        description="half widths in x and y, at each station: the outer size of the body, which encloses the cable "
+        "guides",
     )
-    nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of that square")
     axial_area_m2: tuple[Positive, ...] = Field(description="EA / E of the S - 1 layers")
     bending_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
         description="EI / E of each layer: [integral of x^2, integral of y^2]; the first resists bending in the x-z "
         "plane",
     )
     torsion_constant_m4: tuple[Positive, ...] = Field(description="GJ / G of each layer")
+    elements: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        default=(),
+        description="elements of a rod in each layer; one by default. A layer that cables press together between two "
+        "guides bends more in its middle, which one element does not show",
+    )
     mass_area_m2: tuple[Positive, ...] = Field(description="volume per length of each layer")
     mass_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
         description="rotary inertia per density and length of each layer, ordered like bending_moment_area_m4",
@@ -65,7 +67,7 @@ class Body(RobotTable):
     poisson_stiffening: tuple[tuple[float, float, float], ...] = Field(
         default=(),
         description="how the stiffness of each layer depends on Poisson's ratio: three coefficients per layer, of "
-        "robots.body.poisson_terms; empty for a solid of the profile's sections",
+        "robots.body.poisson_terms; empty if it does not",
     )
     volume_m3: Positive = Field(
         description="volume of the whole body, clamped part included: what the trunk mass is divided by",
@@ -88,6 +90,8 @@ class Body(RobotTable):
         ):
             if len(getattr(self, key)) != layers:
                 raise ValueError(f"{key} has {len(getattr(self, key))} entries for {layers} layers")
+        if self.elements and len(self.elements) != layers:
+            raise ValueError(f"elements has {len(self.elements)} entries for {layers} layers")
         if self.poisson_stiffening:
             if len(self.poisson_stiffening) != layers:
                 raise ValueError(f"poisson_stiffening has {len(self.poisson_stiffening)} entries for {layers} layers")
@@ -104,19 +108,21 @@ class Body(RobotTable):
         """Volume of all layers [m3]; the rest of ``volume_m3`` is held by the clamp."""
         return float(np.sum(np.diff(self.station_m) * np.array(self.mass_area_m2)))
 
-    def arrays(self) -> dict[str, np.ndarray | int | bool]:
-        """The fields of a layered body for the finite-element engine, in SI units."""
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The sections of a rod for the finite-element engine, in SI units."""
         return {
             "station": np.array(self.station_m),
             "half_width": np.array(self.half_width_m),
-            "nodes_across": self.nodes_across,
             "axial_area": np.array(self.axial_area_m2),
             "bending_moment_area": np.array(self.bending_moment_area_m4),
             "torsion_constant": np.array(self.torsion_constant_m4),
             "mass_area": np.array(self.mass_area_m2),
             "mass_moment_area": np.array(self.mass_moment_area_m4),
-            "sectional": bool(self.poisson_stiffening),
         }
+
+    def cuts(self) -> tuple[int, ...]:
+        """Elements of a rod in each layer."""
+        return self.elements or (1,) * (len(self.station_m) - 1)
 
     def stiffness_scale(self, poisson_ratio: Any) -> Any:
         """Factor (S - 1,) on each layer's stiffness at this Poisson ratio (a JAX tracer is welcome)."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
+
+LIMITS = {"displacement": "displacement_limit_m", "tension": "tension_limit_n"}
+UNITS = {"displacement": "m", "tension": "N"}
 
 
 class Cable(RobotTable):
@@ -25,8 +30,20 @@ class Cable(RobotTable):
         description="axial coordinates of the guides in the undeformed body; the cable ends at the last",
     )
     guide_radius_m: tuple[Positive, ...] = Field(description="distance of each guide from the axis")
-    displacement_limit_m: Pair = Field(
-        description="least and greatest displacement, pull > 0; commands beyond are held at the limit",
+    drive: Literal["displacement", "tension"] = Field(
+        default="displacement",
+        description='"displacement": its drive winds in a length; "tension": its drive holds a force, whatever length '
+        "that takes",
+    )
+    displacement_limit_m: Pair | None = Field(
+        default=None,
+        description="least and greatest displacement, pull > 0; commands beyond are held at the limit; of a cable that "
+        "is driven by a displacement",
+    )
+    tension_limit_n: Pair | None = Field(
+        default=None,
+        description="least and greatest tension; commands beyond are held at the limit; of a cable that is driven by a "
+        "tension",
     )
 
     @model_validator(mode="after")
@@ -35,10 +52,27 @@ class Cable(RobotTable):
             raise ValueError(f"{len(self.guide_radius_m)} guide radii for {len(self.guide_z_m)} guides of {self.name}")
         if np.any(np.diff(np.r_[self.anchor_z_m, self.guide_z_m]) <= 0):
             raise ValueError(f"anchor and guides of {self.name} do not follow each other along z")
-        low, high = self.displacement_limit_m
+        for drive, key in LIMITS.items():
+            if (getattr(self, key) is None) != (drive != self.drive):
+                raise ValueError(f"{self.name} is driven by a {self.drive}: it has {LIMITS[self.drive]} alone")
+        low, high = self.limit
         if not low <= 0.0 <= high or low == high:
-            raise ValueError(f"displacement_limit_m of {self.name} does not enclose zero")
+            raise ValueError(f"{LIMITS[self.drive]} of {self.name} does not enclose zero")
+        if self.drive == "tension" and low < 0.0:
+            raise ValueError(f"tension_limit_n of {self.name} lets a cable push")
         return self
+
+    @property
+    def unit(self) -> str:
+        """Of what drives it."""
+        return UNITS[self.drive]
+
+    @property
+    def limit(self) -> Pair:
+        """Least and greatest of what drives it [m or N]."""
+        given = getattr(self, LIMITS[self.drive])
+        assert given is not None
+        return given
 
     def anchor(self) -> Float[np.ndarray, "3"]:
         """Where the cable leaves the base [m]."""
@@ -57,15 +91,15 @@ def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[
 
 
 class Channels(RobotTable):
-    """How commands become cable displacements: ``displacement = radius * gain @ command``."""
+    """How commands become what drives cables and chambers: ``radius * gain @ command``."""
 
     names: tuple[Name, ...] = Field(
         min_length=1,
         description="the command channels, in the order of the columns of gain",
     )
     gain: tuple[tuple[float, ...], ...] = Field(
-        description="one row per cable, one column per channel: displacement = gain @ command, times the radius where"
-        " commands are angles; pull > 0",
+        description="one row per cable, then per chamber, one column per channel: displacement [m], tension [N] or "
+        "pressure [Pa] = gain @ command, times the radius where commands are angles; pull > 0",
     )
     radius_parameter: Name | None = Field(
         default=None,

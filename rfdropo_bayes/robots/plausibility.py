@@ -30,6 +30,8 @@ def implausible(robot: Robot) -> str | None:
     if not SHORTEST <= length <= LONGEST:
         return f"the body is {length:.4g} m long: are lengths in metres?"
     sizes = {"half_width_m of the body": float(half.max())}
+    for chamber in robot.chambers:
+        sizes[f"radius_m of the chamber {chamber.name}"] = chamber.radius_m
     for cable in robot.cables:
         sizes[f"anchor_radius_m of the cable {cable.name}"] = cable.anchor_radius_m
         sizes[f"distance of anchor_z_m of the cable {cable.name} from the body"] = station[0] - cable.anchor_z_m

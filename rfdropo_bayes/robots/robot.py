@@ -15,6 +15,7 @@ from rfdropo_bayes.groups import Patterns, group_of, whole
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
+from rfdropo_bayes.robots.chamber import Chamber
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.outline import RobotOutline, not_given, outlined_tables
@@ -30,18 +31,21 @@ REQUIRED = (
     "trunk_mass",
     "rayleigh_mass",
     "rayleigh_stiffness",
-    "initial_displacement",
     "offset_x",
     "offset_y",
     "offset_z",
 )
 """Parameters every robot has."""
+ZEROS = "initial_displacement"
+"""Parameter of every cable that is driven by a displacement."""
 
 
 class CommandTiming(RobotTable):
     """Timing of commands."""
 
-    unit: Literal["m", "rad"] = Field(description='of the recorded commands: "m" of cable, or "rad" of a motor')
+    unit: Literal["m", "rad", "N", "Pa"] = Field(
+        description='of the commands: "m" of cable, "rad" of a motor, "N" of tension, or "Pa" of pressure',
+    )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
 
@@ -51,6 +55,13 @@ class Marker(RobotTable):
 
     name: Name = Field(description="name, as in the recordings")
     point_m: Vector = Field(description="where it lies in the undeformed body: x, y, z")
+
+
+class OrientedSection(RobotTable):
+    """A section of the body whose orientation is measured."""
+
+    name: Name = Field(description="name, as in the recordings")
+    z_m: float = Field(description="axial coordinate in the undeformed body")
 
 
 OBJECT = ("cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "cube_yaw")
@@ -96,9 +107,11 @@ class Robot(RobotTable):
     )
     command: CommandTiming = Field(description="unit and timing of commands")
     channels: Channels = Field(description="from commands to cable displacements")
-    cables: tuple[Cable, ...] = Field(min_length=1, description="the cables")
+    cables: tuple[Cable, ...] = Field(default=(), description="the cables")
+    chambers: tuple[Chamber, ...] = Field(default=(), description="chambers under pressure")
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
     markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
+    orientations: tuple[OrientedSection, ...] = Field(default=(), description="sections whose orientation is measured")
     push: PushScene | None = Field(default=None, description="object on a plate, if the robot has one")
     motors: tuple[Motor, ...] = Field(
         default=(), description="drives of the channels, in their order; none where the robot is only recorded"
@@ -111,21 +124,31 @@ class Robot(RobotTable):
 
     @model_validator(mode="after")
     def _consistent(self) -> Robot:
-        for kind, names in (("cable", self.cable_names), ("marker", self.marker_names)):
+        named = {"cable": self.cable_names, "marker": self.marker_names, "section": self.section_names}
+        for kind, names in named.items():
             if len(set(names)) != len(names):
                 raise ValueError(f"two of its {kind}s share a name")
-        if len(self.channels.gain) != len(self.cables):
-            raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.cables)} cables")
+        if not self.actuators:
+            raise ValueError("the robot has neither cables nor chambers")
+        if len(self.channels.gain) != len(self.actuators):
+            kinds = "cables and chambers" if self.chambers else "cables"
+            raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.actuators)} {kinds}")
+        for actuator in self.actuators:
+            if actuator.unit != ("m" if self.command.unit == "rad" else self.command.unit):
+                raise ValueError(
+                    f"{actuator.name} is driven in {actuator.unit}, and commands are in {self.command.unit}"
+                )
         if (self.command.unit == "rad") != (self.channels.radius_parameter is not None):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and only for those")
         masses = [mass.parameter for mass in self.body.point_masses]
         radius = [self.channels.radius_parameter] if self.channels.radius_parameter else []
-        used = {*REQUIRED, *masses, *radius}
+        zeros = [ZEROS] if self.initial_displacement_names else []
+        used = {*REQUIRED, *zeros, *masses, *radius}
         for name, parameter in self.parameters.items():
             if name not in used:
                 raise ValueError(f"nothing uses the table [parameters.{name}]; {nearest(name, used)}")
-            if (parameter.each == "cable") != (name == "initial_displacement"):
-                raise ValueError(f'each = "cable" belongs to initial_displacement alone; mend [parameters.{name}]')
+            if (parameter.each == "cable") != (name == ZEROS):
+                raise ValueError(f'each = "cable" belongs to {ZEROS} alone; mend [parameters.{name}]')
         for name in sorted(used):
             if name not in self.parameters:
                 raise ValueError(f"the parameter {name!r} has no table [parameters.{name}]")
@@ -153,6 +176,9 @@ class Robot(RobotTable):
         station = np.array(self.body.station_m)
         half = np.array(self.body.half_width_m)
         points = {f"guide of {cable.name}": cable.guides() for cable in self.cables}
+        for chamber in self.chambers:
+            points[f"end of {chamber.name}"] = np.stack([chamber.line(station, end)[-1] for end in chamber.z_m])
+        points |= {f"section {each.name}": np.array([[0.0, 0.0, each.z_m]]) for each in self.orientations}
         points |= {f"marker {marker.name}": np.array([marker.point_m]) for marker in self.markers}
         for name, place in points.items():
             width = np.stack([np.interp(place[:, 2], station, half[:, axis]) for axis in (0, 1)], axis=1)
@@ -256,8 +282,18 @@ class Robot(RobotTable):
 
     @property
     def cable_names(self) -> tuple[str, ...]:
-        """Names of the cables."""
-        return tuple(cable.name for cable in self.cables)
+        """Names of the cables and the chambers."""
+        return tuple(actuator.name for actuator in self.actuators)
+
+    @property
+    def actuators(self) -> tuple[Cable | Chamber, ...]:
+        """Cables, then chambers."""
+        return (*self.cables, *self.chambers)
+
+    @property
+    def stroke(self) -> float:
+        """Largest command of any channel at nominal parameters, in its unit."""
+        return float(np.max(np.abs(self.command_limits())))
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -269,8 +305,13 @@ class Robot(RobotTable):
         """Names of the markers."""
         return tuple(marker.name for marker in self.markers)
 
-    def layered_arrays(self) -> dict[str, np.ndarray | int | bool]:
-        """The fields of the finite-element engine's layered body: ``LayeredBody(**robot.layered_arrays())``."""
+    @property
+    def section_names(self) -> tuple[str, ...]:
+        """Names of the sections whose orientation is measured."""
+        return tuple(each.name for each in self.orientations)
+
+    def rod_arrays(self) -> dict[str, np.ndarray]:
+        """The sections of the finite-element engine's rod: ``profile_rod(**robot.rod_arrays())``."""
         return self.body.arrays()
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
@@ -285,9 +326,10 @@ class Robot(RobotTable):
         """Guide points of each cable in the undeformed body [m]; cables may have different numbers of them."""
         return [cable.guides() for cable in self.cables]
 
-    def displacement_limits(self) -> Float[np.ndarray, "cable 2"]:
-        """Least and greatest displacement of each cable [m], pull > 0."""
-        return np.array([cable.displacement_limit_m for cable in self.cables])
+    def drive_limits(self) -> Float[np.ndarray, "cable 2"]:
+        """Least and greatest of what drives each cable and chamber: displacement [m], pull > 0, tension [N] or pressure
+        [Pa]."""
+        return np.array([actuator.limit for actuator in self.actuators])
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
         """Least and greatest command of each channel [m or rad] at nominal parameters.
@@ -295,7 +337,7 @@ class Robot(RobotTable):
         A cable may be released as far as it may be pulled, or to its own limit where that is nearer: a policy could
         otherwise pay out slack that takes hundreds of actions to wind up again.
         """
-        limits = self.displacement_limits()
+        limits = self.drive_limits()
         pull, release = limits[:, 1], np.maximum(limits[:, 0], -limits[:, 1])
         matrix = np.asarray(self.channel_matrix(self.nominal()), dtype=float)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -331,7 +373,7 @@ class Robot(RobotTable):
         table: dict[str, Parameter] = {}
         for name, parameter in self.parameters.items():
             if parameter.each == "cable":
-                for cable in self.cable_names:
+                for cable in (each.name for each in self.cables if each.unit == "m"):
                     described = f"{parameter.description} (cable {cable})"
                     table[f"{name}_{cable}"] = changed(
                         parameter, where=f"robot {self.name}", description=described, each=None
@@ -342,8 +384,9 @@ class Robot(RobotTable):
 
     @property
     def initial_displacement_names(self) -> tuple[str, ...]:
-        """Parameters that hold the displacement of each cable at zero command, in the order of the cables."""
-        return tuple(f"initial_displacement_{cable}" for cable in self.cable_names)
+        """Parameters that hold the displacement of each cable at zero command, in the order of the cables that are
+        driven by one."""
+        return tuple(f"{ZEROS}_{cable.name}" for cable in self.cables if cable.unit == "m")
 
     def nominal(self) -> dict[str, float]:
         """Nominal value of every base parameter."""

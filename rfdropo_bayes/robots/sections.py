@@ -150,10 +150,6 @@ class SectionedBody(RobotTable):
     """A body given by shapes, ``[[body.section]]``, in the place of a section profile."""
 
     section: tuple[Section, ...] = Field(min_length=1, description="shapes from the clamp to the tip")
-    nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of the square that carries them")
-    reference_poisson_ratio: float = Field(
-        default=0.45, ge=0.0, le=0.499, description="Poisson ratio that the profile holds for"
-    )
     point_masses: tuple[PointMass, ...] = Field(
         default=(), description="rigid parts on top of the body's own mass, at ends of sections or layers"
     )
@@ -161,8 +157,7 @@ class SectionedBody(RobotTable):
     def body(self) -> Body:
         """The section profile of the shapes; the first section is clamped where it begins, at z = 0.
 
-        Where sections meet, the wider one's radius holds. Disks do not contract with the backbone between them, which
-        `fem.layered` provides for bodies whose stiffness says how it depends on Poisson's ratio; here it does not.
+        Where sections meet, the wider one's radius holds.
         """
         profiles = [section.profile() for section in self.section]
         thickness, area, moment, mass_area, mass_moment = (
@@ -172,31 +167,26 @@ class SectionedBody(RobotTable):
         outer = profiles[0].outer
         for profile in profiles[1:]:
             outer = np.concatenate([outer[:-1], [max(outer[-1], profile.outer[0])], profile.outer[1:]])
-        sectional = any(isinstance(section, Disks) for section in self.section)
         return Body(
             station_m=tuple(np.round(np.concatenate([[0.0], np.cumsum(thickness)]), 12).tolist()),
             half_width_m=tuple((r, r) for r in outer.tolist()),
-            nodes_across=self.nodes_across,
             axial_area_m2=tuple(area.tolist()),
             bending_moment_area_m4=tuple((i, i) for i in moment.tolist()),
             torsion_constant_m4=tuple((2.0 * moment).tolist()),
             mass_area_m2=tuple(mass_area.tolist()),
             mass_moment_area_m4=tuple((i, i) for i in mass_moment.tolist()),
-            reference_poisson_ratio=self.reference_poisson_ratio,
-            poisson_stiffening=((0.0, 0.0, 0.0),) * len(thickness) if sectional else (),
             volume_m3=float(np.sum(thickness * mass_area)),
             point_masses=self.point_masses,
         )
 
 
-def section_profile(sections: Sequence[Cylinder | Cone | Tube | Disks], nodes_across: Literal[2, 3] = 2) -> Body:
+def section_profile(sections: Sequence[Cylinder | Cone | Tube | Disks]) -> Body:
     """The body that shapes make up, one after the other from the clamp to the tip.
 
     Args:
         sections: e.g. ``[Cone(length_m=0.2, layers=10, radius_m=(0.014, 0.009))]``.
-        nodes_across: nodes along a side of a layer.
     """
-    return SectionedBody(section=tuple(sections), nodes_across=nodes_across).body()
+    return SectionedBody(section=tuple(sections)).body()
 
 
 def body_tables(table: Mapping[str, Any], where: str) -> dict[str, Any]:

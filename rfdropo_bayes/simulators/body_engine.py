@@ -1,14 +1,15 @@
-"""What computes the motion of a body, and of a cube that it pushes: any body, in JAX or compiled by Numba.
+"""What computes the motion of a body, and of a cube that it pushes: a rod in JAX or compiled by Numba, a mesh by Numba.
 
-Both give the same numbers. JAX is differentiable and runs on whatever device it finds; Numba fills the lanes and
-threads of a CPU with rollouts, one call out of a traced program for a whole batch, and its derivatives are differences.
+For a rod both give the same numbers. JAX is differentiable and runs on whatever device it finds; Numba fills the lanes
+and threads of a CPU with rollouts, one call out of a traced program for a whole batch, and its derivatives are
+differences. A rod may also be at rest in every row: an equilibrium found from the one before, without time or damping.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple, Protocol
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,18 +28,18 @@ from rfdropo_bayes.fem import (
     prepare,
     simulate,
     state_at_rest,
-    tetrahedral_dynamics,
 )
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, System
-from rfdropo_bayes.fem.integrators import Integrator
-from rfdropo_bayes.fem.native.layered_engine import NativeLayered
+from rfdropo_bayes.fem.integrators import STAGES, Integrator
+from rfdropo_bayes.fem.mesh_points import NodePoints
+from rfdropo_bayes.fem.native.rod_engine import NativeRod
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
+from rfdropo_bayes.fem.tetrahedra import TetrahedralMaterial, TetrahedralSystem
 from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.finite_differences import (
     ACCELERATION,
@@ -52,7 +53,7 @@ from rfdropo_bayes.simulators.finite_differences import (
 from rfdropo_bayes.simulators.port_signals import BodySignals
 
 EFFECT_SIZES = BodyEffects(
-    bending=BendingLaw(0.2, 0.2, 0.1, 0.1, 0.1),
+    bending=BendingLaw(fibre=0.2, anisotropy=0.2, cross_plane=0.1, twist_x=0.1, twist_y=0.1),
     viscoelasticity=Viscoelasticity(0.3, 0.3),
     softening_rate=0.01,
     drag=100.0,
@@ -62,6 +63,8 @@ EFFECT_SIZES = BodyEffects(
     capstan_friction=0.1,
 )
 """Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
+QUASI_STATIC = "quasi-static"
+"""Motion of a body that is at rest in every row."""
 CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
 FRICTION = 0.1
@@ -81,10 +84,10 @@ class EngineBody(Protocol):
         """Body and cables."""
 
     @property
-    def markers(self) -> PointMap:
+    def markers(self) -> PointMap | NodePoints:
         """Recorded points."""
 
-    def _replace(self, *, markers: PointMap = ...) -> Any:
+    def _replace(self, *, markers: PointMap | NodePoints = ...) -> Any:
         """The same with other points."""
 
 
@@ -130,9 +133,10 @@ class Engine:
         body: what moves.
         time_step: of the simulation [s].
         backend: what computes.
-        from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of layers.
+        from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of a rod.
         scene: what the body pushes a cube on; None for a body that touches nothing.
-        integrator: how a time step is taken, see `fem.integrators`.
+        integrator: how a time step is taken, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
+            row, an equilibrium found from the one before.
     """
 
     body: EngineBody
@@ -143,9 +147,14 @@ class Engine:
     integrator: Integrator = "euler"
 
     def __post_init__(self) -> None:
-        if self.from_equilibrium and not self.layered:
-            raise InputError("a body of tetrahedra starts at rest", where="engine", remedy="use a layered body")
         system = self.body.system
+        if not self.is_rod:
+            if self.from_equilibrium or self.at_rest:
+                raise InputError("a body of tetrahedra starts undeformed and moves", where="engine", remedy="use a rod")
+            if self.backend.name == "jax":
+                raise InputError("JAX has no body of tetrahedra", where="engine", remedy='use engine = "numba"')
+        if self.at_rest and self.scene is not None:
+            raise InputError("a body at rest pushes no cube", where="engine", remedy='use motion = "dynamic"')
         if self.integrator != "euler" and not isinstance(system, System) and np.isfinite(system.limits.rate):
             raise InputError(
                 f"integrator {self.integrator!r} with drives that SOFA limits: their limit is one of SOFA's own steps",
@@ -154,18 +163,23 @@ class Engine:
             )
 
     @property
-    def layered(self) -> bool:
-        """Whether the body is made of layers, else of tetrahedra."""
+    def at_rest(self) -> bool:
+        """Whether every row of a motion is an equilibrium."""
+        return self.integrator == QUASI_STATIC
+
+    @property
+    def is_rod(self) -> bool:
+        """Whether the body is a rod, else a mesh of tetrahedra."""
         return isinstance(self.body.system, System)
 
     @property
     def carries_loads(self) -> bool:
         """Whether signals may act on the body."""
-        return self.layered and self.scene is None
+        return self.is_rod and self.scene is None
 
     @cached_property
     def load_stations(self) -> tuple[int, ...]:
-        """Stations of a layered body that forces may act on, from the base to the tip, see `LOAD_PLACES`."""
+        """Stations of a rod that forces may act on, from the base to the tip, see `LOAD_PLACES`."""
         system = self.body.system
         if not isinstance(system, System):
             return ()
@@ -178,8 +192,8 @@ class Engine:
     def lanes(self) -> int:
         """How many rollouts it likes to be given at once."""
         if self.backend.name == "jax":
-            return 64 if self.layered else 16
-        return 512 if self.layered else 64
+            return 64
+        return 512 if self.is_rod else 64
 
     def describe(self) -> dict[str, object]:
         """Name, precision, device and, where it is not implicit Euler, integrator, for the record."""
@@ -188,7 +202,7 @@ class Engine:
             return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform, **steps}
         return {"engine": "numba", "precision": self.backend.precision, "device": "cpu", **steps}
 
-    def recording(self, points: PointMap) -> Engine:
+    def recording(self, points: PointMap | NodePoints) -> Engine:
         """The same engine in double precision, recording these points of the body in place of the markers."""
         body, backend = self.body._replace(markers=points), self.backend._replace(precision="float64")
         return replace(self, body=body, backend=backend)
@@ -202,20 +216,21 @@ class Engine:
         cube: CubeInputs | None = None,
         loads: BodySignals | None = None,
     ) -> Motion:
-        """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning.
+        """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning. At rest a
+        step is an equilibrium.
 
         Derivatives of the compiled backend are differences along each tangent.
 
         Raises:
-            InputError: a cube without a scene, or a scene without a cube; loads on another body than layers alone.
+            InputError: a cube without a scene, or a scene without a cube; loads on another body than a rod alone.
         """
         if (cube is None) != (self.scene is None):
             raise InputError("a cube without a scene, or a scene without a cube", where="engine")
         if loads is not None and not self.carries_loads:
             raise InputError(
-                "signals on the body act on layers without a cube only",
+                "signals on the body act on a rod without a cube only",
                 where="engine",
-                remedy='set body = "layered" under [simulator], and leave the cube out',
+                remedy='set body = "rod" under [simulator], and leave the cube out',
             )
         inputs = Inputs(material, start, displacement, cube, loads)
         if self.backend.name == "jax":
@@ -230,37 +245,30 @@ class Engine:
     def initial(
         self, material: Material, start: Float[Array, " cable"], loads: BodySignals | None = None
     ) -> tuple[Prepared, State, Float[Array, ""]]:
-        """A layered body in the reference engine before its first step, and the relative force out of balance."""
+        """A rod in JAX before its first step, and the relative force out of balance."""
         system: Any = self.body.system
         prepared, state, residual = prepare(system, material), state_at_rest(system), jnp.zeros(())
         if self.from_equilibrium:
-            under, force = prepared, jnp.zeros((len(state.position), 3))
+            under, force = prepared, jnp.zeros((len(state.position), 6))
             acting = self.section_loads(loads)
             if acting is not None:
                 under, force = loaded(system, prepared, acting, 0)
             state, found = find_equilibrium(system, under, start, force)
             residual = found.residual
-        if self.integrator != "euler":
+        if len(STAGES[self.integrator]) > 1:
             state = state._replace(commanded=jnp.asarray(start))
         return prepared, state, residual
 
     def _reference(self, inputs: Inputs, steps: Int[Array, ""] | None) -> Motion:
         markers, rows = self.body.markers, inputs.displacement[:, None, :]
-        cube, imbalance = inputs.cube, jnp.zeros(())
+        cube, system, material = inputs.cube, cast("System", self.body.system), cast("Material", inputs.material)
         around: dict[str, Any] = {} if cube is None else {"scene": self.scene, "cube": cube.cube}
-        place = None if cube is None else cube.start
-        system: Any = self.body.system
-        material: Any = inputs.material
-        if self.layered:
-            prepared, state, imbalance = self.initial(material, inputs.start, inputs.loads)
-            acting = self.section_loads(inputs.loads)
-            run: Any = partial(simulate, system, prepared, loads=acting)
-        else:
-            state = tetrahedral_dynamics.state_at_rest(system)  # type: ignore[assignment]
-            run = partial(tetrahedral_dynamics.simulate, system, material)
-        state = state._replace(cube=place)
-        rollout = run(state, rows, self.time_step, markers, horizon=steps, integrator=self.integrator, **around)
-        first = point_positions(markers, state.position)
+        prepared, state, imbalance = self.initial(material, inputs.start, inputs.loads)
+        acting = self.section_loads(inputs.loads)
+        state = state._replace(cube=None if cube is None else cube.start)
+        options = {"horizon": steps, "integrator": self.integrator, "loads": acting, **around}
+        rollout = simulate(system, prepared, state, rows, self.time_step, markers, **options)
+        first = point_positions(markers, state.position, state.orientation)
         pose = None
         if cube is not None:
             begin = jnp.concatenate([cube.start.position, cube.start.orientation])
@@ -280,7 +288,7 @@ class Engine:
         system, backend = self.body.system, self.backend
         options: dict[str, Any] = {"threads": backend.threads, "scene": self.scene, "integrator": self.integrator}
         if isinstance(system, System):
-            return NativeLayered(system, self.body.markers, self.time_step, precision=backend.precision, **options)
+            return NativeRod(system, self.body.markers, self.time_step, precision=backend.precision, **options)
         kind = np.dtype(backend.precision).type
         return TetrahedralEngine(system.body, system.cables, system.limits, self.body.markers, dtype=kind, **options)
 
@@ -297,7 +305,7 @@ class Engine:
 
         flag = jax.ShapeDtypeStruct((), jnp.bool_)
         pose = None if self.scene is None else numbers(rows, 7)
-        markers = len(self.body.markers.node)
+        markers = len(self.body.markers.weight)
         shapes = Motion(numbers(rows, markers, 3), numbers(rows, cables), flag, numbers(), flag, pose)
         return one_callback(self._rolled, shapes, inputs, limit)
 
@@ -307,7 +315,8 @@ class Engine:
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
             options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": self.section_loads(inputs.loads)}
-            return self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
+            found = self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
+            return found._replace(solves=None)
         commands = inputs.displacement[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 

@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import point_positions
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
-from rfdropo_bayes.fem.layered import PointMap, joined
-from rfdropo_bayes.fem.native.layered_session import LayeredSession
+from rfdropo_bayes.fem.equilibrium import quasi_static_step
+from rfdropo_bayes.fem.native.rod_session import RodSession
 from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.fem.rod import joined
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import loaded
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine, cube_arrays
@@ -59,10 +60,10 @@ def body_lanes(engine: Engine, count: int) -> BodyLanes:
     """Bodies for so many lanes.
 
     Raises:
-        InputError: an engine whose body is not made of layers.
+        InputError: an engine whose body is no rod.
     """
-    if not engine.layered:
-        raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a layered body")
+    if not engine.is_rod:
+        raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a rod")
     kind = ReferenceLanes if engine.backend.name == "jax" else CompiledLanes
     return kind(engine, count) if engine.scene is None else LanesBeforeCube(kind, engine, engine.scene, count)
 
@@ -77,9 +78,10 @@ class LanesBeforeCube:
     def __init__(
         self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushGeometry, count: int
     ) -> None:
-        markers, spheres = engine.body.markers, scene.spheres
-        self._shown, self._count = len(markers.node), count
-        body: Any = engine.body._replace(markers=joined([markers, PointMap(spheres.node, spheres.centre)]))
+        markers: Any = engine.body.markers
+        spheres: Any = scene.spheres
+        self._shown, self._count = len(markers.weight), count
+        body: Any = engine.body._replace(markers=joined([markers, spheres.centre]))
         self._bodies = kind(replace(engine, body=body), count)
         self.save, self.restore = self._bodies.save, self._bodies.restore
 
@@ -109,8 +111,8 @@ class CompiledLanes:
     """Bodies in the compiled engine: see `BodyLanes`."""
 
     def __init__(self, engine: Engine, count: int) -> None:
-        self._session, self._from_equilibrium = LayeredSession(engine.native, count), engine.from_equilibrium
-        self._acting = engine.section_loads
+        self._session, self._from_equilibrium = RodSession(engine.native, count), engine.from_equilibrium
+        self._acting, self._at_rest = engine.section_loads, engine.at_rest
         self.save, self.restore = self._session.save, self._session.restore
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
@@ -121,7 +123,16 @@ class CompiledLanes:
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
+        if self._at_rest:
+            displacement, loads = _ends(displacement, loads)
         return _last(self._session.advance(displacement, loads=self._acting(loads)), begun=1)
+
+
+def _ends(
+    displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None
+) -> tuple[Float[np.ndarray, "lane 1 cable"], BodySignals | None]:
+    """The last step alone, as a body at rest takes it."""
+    return displacement[:, -1:], jax.tree.map(lambda part: part[:, -1:], loads)
 
 
 def _last(found: Motion, begun: int = 0) -> Motion:
@@ -163,6 +174,8 @@ class ReferenceLanes:
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
+        if self._engine.at_rest:
+            displacement, loads = _ends(displacement, loads)
         self._lanes, peak = self._moved(self._lanes, jnp.asarray(displacement), loads)
         return self._shown(peak)
 
@@ -179,7 +192,8 @@ class ReferenceLanes:
     def _shown(self, peak: Float[Array, "lane cable"]) -> Motion:
         assert self._lanes is not None
         lanes, markers = self._lanes, self._engine.body.markers
-        position = jax.vmap(lambda nodes: point_positions(markers, nodes))(lanes.state.position)
+        place = lanes.state.position, lanes.state.orientation
+        position = jax.vmap(lambda *stations: point_positions(markers, *stations))(*place)
         cube, pose = lanes.state.cube, None
         if cube is not None:
             pose = np.concatenate([cube.position, cube.orientation], axis=1)
@@ -212,8 +226,11 @@ class ReferenceLanes:
                 under, force = before.prepared, cast("Array | float", 0.0)
                 if acting is not None:
                     under, force = loaded(system, under, acting, given[1])
-                around = force, engine.scene, before.cube
-                state, info = step(system, under, before.state, given[0], time_step, *around, engine.integrator)
+                if engine.at_rest:
+                    state, info = quasi_static_step(system, under, before.state, given[0], force)
+                else:
+                    around = force, engine.scene, before.cube
+                    state, info = step(system, under, before.state, given[0], time_step, *around, engine.integrator)
                 codes = before.diverged | info.diverged, before.converged & info.converged
                 return before._replace(state=state, diverged=codes[0], converged=codes[1]), state.tension
 

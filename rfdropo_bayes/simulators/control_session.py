@@ -244,7 +244,7 @@ class Session:
             why = mechanism.whole_only if isinstance(mechanism, SignallingMechanism) else "it is not written by steps"
             carries = getattr(getattr(self.simulator, "engine", None), "carries_loads", False)
             if isinstance(mechanism, PushingMechanism) and not carries:
-                why = "it acts on layers without a cube only"
+                why = "it acts on a rod without a cube only"
             if why:
                 raise InputError(
                     f"{mechanism.name} does not step: {why}",

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, mesh_spheres, push_scene
+from rfdropo_bayes.fem.pushing import PushGeometry, mesh_spheres, push_scene, rod_spheres
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
+from rfdropo_bayes.fem.rod import Rod
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 from rfdropo_bayes.robots import PushScene, Robot
 from rfdropo_bayes.simulators.body_engine import CubeInputs
@@ -36,15 +36,15 @@ def plate_normal(robot: Robot) -> Float[np.ndarray, "3"]:
     return -robot.gravity / np.linalg.norm(robot.gravity)
 
 
-def scene_of(robot: Robot, body: LayeredBody | TetrahedralBody) -> PushGeometry:
+def scene_of(robot: Robot, body: Rod | TetrahedralBody) -> PushGeometry:
     """Cube and plate of a robot, before its body; its section profile without notches is the body's outline.
 
     Raises:
         InputError: the robot has no cube.
     """
     table = push_table(robot)
-    if isinstance(body, LayeredBody):
-        spheres = layered_spheres(body)
+    if isinstance(body, Rod):
+        spheres = rod_spheres(body)
     else:
         half = np.asarray(robot.body.half_width_m, float).mean(axis=1)
         spheres = mesh_spheres(body.rest, np.asarray(robot.body.station_m, float), half)

@@ -23,8 +23,9 @@ from rfdropo_bayes.simulators.port_signals import BodySignals
 Values = Mapping[str, Float[Array, ""]]
 
 STAGES = ("actuation", "body", "contact", "sensing")
-BODIES = ("layered", "tetrahedra")
+BODIES = ("rod", "tetrahedra")
 ENGINES = ("jax", "numba")
+MOTIONS = ("dynamic", "quasi-static")
 BLACK_BOX = "black box"
 """In the place of body and engine: a program whose inside nobody reaches."""
 
@@ -40,8 +41,8 @@ class Mechanism(Protocol):
         cause: one line on the physical cause.
         remedy: one line on what a lab would do about it.
 
-    Two more may be left out, where a mechanism runs everywhere: ``bodies`` and ``engines``, those of `BODIES` and
-    `ENGINES` on which it runs.
+    Three more may be left out, where a mechanism runs everywhere: ``bodies``, ``engines`` and ``motions``, those of
+    `BODIES`, `ENGINES` and `MOTIONS` on which it runs.
     """
 
     name: str
@@ -72,7 +73,7 @@ class BodyMechanism(Mechanism, Protocol):
     """Acts on the body's material, masses and gravity."""
 
     def embody(self, values: Values, material: Any, body: Any) -> Any:
-        """Return the material (`fem.Material`) of the extended body (`fem.LayeredBody`), given that of the base."""
+        """Return the material (`fem.Material`) of the extended body (`fem.Rod`), given that of the base."""
 
 
 @runtime_checkable
@@ -124,7 +125,7 @@ class CommandedSensingMechanism(Mechanism, Protocol):
 
 @runtime_checkable
 class PushingMechanism(Mechanism, Protocol):
-    """Acts on a layered body from step to step, by time, by what is commanded, and by how the body moves."""
+    """Acts on a rod from step to step, by time, by what is commanded, and by how the body moves."""
 
     @property
     def follows_motion(self) -> bool:
@@ -255,14 +256,21 @@ def engines_of(mechanism: Mechanism | type) -> tuple[str, ...]:
     return tuple(getattr(mechanism, "engines", ENGINES))
 
 
-def obstacle(mechanism: Mechanism, body: str, engine: str) -> str | None:
-    """Why a mechanism does not run on a body or on an engine; None where it runs."""
+def motions_of(mechanism: Mechanism | type) -> tuple[str, ...]:
+    """Kinds of motion that a mechanism runs on."""
+    return tuple(getattr(mechanism, "motions", MOTIONS))
+
+
+def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0]) -> str | None:
+    """Why a mechanism does not run on a body, on an engine or in a motion; None where it runs."""
     if body == BLACK_BOX:
         return None if mechanism.stage in ("actuation", "sensing") else f"it acts on the {mechanism.stage}, inside"
     if body not in bodies_of(mechanism):
         return f"it acts on {' and '.join(bodies_of(mechanism))} bodies only"
     if engine not in engines_of(mechanism):
         return f"it runs on the engine {' or '.join(engines_of(mechanism))} only"
+    if motion not in motions_of(mechanism):
+        return f"it acts on a body in motion, and motion is {motion}"
     return None
 
 

@@ -16,26 +16,26 @@ from jaxtyping import Array, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import LayeredBody
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.cable_drive import DriveLimits
-from rfdropo_bayes.fem.layered import PointMap, joined
+from rfdropo_bayes.fem.mesh_points import NodePoints, joined
+from rfdropo_bayes.fem.rod import Rod, profile_rod
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
+    TetrahedralMaterial,
+    TetrahedralSystem,
     locate,
     lumped_masses,
     mean_points,
     route_cables,
     tetrahedral_body,
 )
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem, tetrahedral_system
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import TetrahedralMesh
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.simulators.trunk import refined_body
 
 SAME_HEIGHT = 1e-5
 """[m] A marker so near the height of guides is their mean, where markers are means of guides."""
@@ -77,7 +77,7 @@ class MeshAssembly(NamedTuple):
     """A robot with a mesh for its body as the finite-element engines see it."""
 
     system: TetrahedralSystem
-    markers: PointMap
+    markers: NodePoints
     node_share: Float[np.ndarray, " nodes"]  # of the trunk's mass
     layer: Int[np.ndarray, " elements"]  # layer of the robot's section profile that an element lies in
     station_share: Float[np.ndarray, "nodes stations"]  # of a mass at a station of the robot, on each node
@@ -93,22 +93,25 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
         raise InputError(
             f"robot {robot.name!r} starts in equilibrium, a body of tetrahedra at rest",
             where="[simulator] body",
-            remedy='use body = "layered", or a robot with initial_state = "rest"',
+            remedy='use body = "rod", or a robot with initial_state = "rest"',
         )
+    if robot.command_unit in ("N", "Pa"):
+        words = f"robot {robot.name!r} is driven by forces, a body of tetrahedra by displacements of cables"
+        raise InputError(words, where="[simulator] body", remedy='use body = "rod"')
     _check_cables(robot, table)
     body = tetrahedral_body(mesh.position, mesh.element, mesh.position[:, 2] <= table.clamp_height, table.frames)
     guides = robot.guides()
     cables = route_cables(body, robot.anchors(), guides)
     limits = DriveLimits(np.full(len(guides), np.inf))
     if table.drives == "sofa":
-        limits = DriveLimits(robot.displacement_limits()[:, 1], table.drive_rate or np.inf)
+        limits = DriveLimits(robot.drive_limits()[:, 1], table.drive_rate or np.inf)
     share = np.asarray(lumped_masses(body, 1.0 / body.volume.sum()))
     if table.masses == "equal":
         share = np.full(body.nodes, 1.0 / body.nodes)
     station = np.asarray(robot.body.station_m)
     layer = np.searchsorted(station, body.rest[body.element, 2].mean(axis=1), side="right") - 1
     return MeshAssembly(
-        tetrahedral_system(body, cables, limits),
+        TetrahedralSystem(body, cables, limits),
         _markers(robot, body, dict(zip(robot.cable_names, guides, strict=True)), table.marker_cables),
         share,
         np.clip(layer, 0, len(station) - 2),
@@ -128,12 +131,12 @@ def _check_cables(robot: Robot, table: TetrahedraTable) -> None:
 
 def _markers(
     robot: Robot, body: TetrahedralBody, guides: dict[str, np.ndarray], marker_cables: tuple[str, ...]
-) -> PointMap:
+) -> NodePoints:
     maps = {name: locate(body, guides[name]) for name in marker_cables}
     rows = []
     for name, point in zip(robot.marker_names, robot.marker_points(), strict=True):
         near = {cable: np.abs(guides[cable][:, 2] - point[2]) < SAME_HEIGHT for cable in marker_cables}
-        found = [PointMap(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
+        found = [NodePoints(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
         if len(found) not in (0, len(marker_cables)):
             raise InputError(
                 f"marker {name!r} is at the height of a guide of some cables but not of all",
@@ -212,7 +215,9 @@ class MeshTrunkSimulator(RobotSimulator):
                 where="balance",
                 remedy='use integrator = "euler" under [simulator], with shorter steps',
             )
-        motion = self.motion_of_nodes(inputs, cube)
+        nodes = self.assembly.system.body.nodes
+        every = NodePoints(np.arange(nodes)[:, None], np.ones((nodes, 1)))
+        motion = self.engine.recording(every).motion(*inputs, cube=cube)
         return tetrahedral_balance(self.assembly.system, inputs[0], motion.position, motion.tension, self.time_step)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:
@@ -223,14 +228,14 @@ class MeshTrunkSimulator(RobotSimulator):
         return command @ jnp.asarray(self.robot.channel_matrix(values)).T + self.pretension(values)
 
     @cached_property
-    def _layers(self) -> LayeredBody:
-        return refined_body(self.robot.layered_arrays(), 1, 2)
+    def _layers(self) -> Rod:
+        return profile_rod(**self.robot.rod_arrays())
 
     def material(self, values: Values) -> TetrahedralMaterial:
         """See `RobotSimulator`."""
         layers = self._layers
         masses = jnp.asarray(self.robot.point_masses(values))
-        material = self.embodied(values, layers, jnp.ones(len(layers.station) - 1), masses)
+        material = self.embodied(values, layers, jnp.ones(layers.elements), masses)
         assembly = self.assembly
         trunk_mass = material.density * self.robot.body.volume_m3
         return TetrahedralMaterial(

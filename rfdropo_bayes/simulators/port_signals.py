@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 
 class BodySignals(NamedTuple):
-    """What acts on a layered body from step to step, see `fem.section_loads`; forces at the engine's stations."""
+    """What acts on a rod from step to step, see `fem.section_loads`; forces at the engine's stations."""
 
     force: Float[Array, "*batch row place 3"]  # [N]
     stiffness: Float[Array, "*batch row"]  # logarithm of a factor

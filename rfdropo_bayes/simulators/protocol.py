@@ -48,6 +48,8 @@ class Observation(NamedTuple):
         status: a `Result` value.
         motor_angle: where the drives stand: the command after delay, lag and whatever else happens inside the drives,
             before the transmission to the cables, in the unit of the commands [rad or m]; None if it is not told.
+        orientation: of the robot's `orientations`, unit quaternions (x, y, z, w) from the base's axes to the section's;
+            None if it is not told.
         peak: of a session, the largest tension of each cable at the time steps of the last control period [N]; None if
             it is not told. In 64 pushes of models/policies/push it was up to 3.3 times what the periods' ends show.
     """
@@ -58,6 +60,7 @@ class Observation(NamedTuple):
     status: Int[Array, ""]
     motor_angle: Float[Array, "time channel"] | None = None
     peak: Float[Array, " cable"] | None = None
+    orientation: Float[Array, "time section 4"] | None = None
 
 
 @runtime_checkable

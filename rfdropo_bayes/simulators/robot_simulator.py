@@ -14,12 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import LayeredBody, Material
+from rfdropo_bayes.fem import Material, Rod
 from rfdropo_bayes.fem.balance import Balance
-from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot, Travel
-from rfdropo_bayes.simulators.body_engine import Backend, CubeInputs, Engine
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
@@ -32,6 +31,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     Values,
     check_mechanisms,
     code_of,
+    motions_of,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.port_signals import BodySignals
@@ -40,13 +40,11 @@ from rfdropo_bayes.simulators.protocol import Observation, Result
 PASSES = 2
 """Rollouts after which laws that follow the motion are given the motion that they make: with two, a pull and a
 softening are within 5 % of what they do after eight."""
+DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
+"""Parameters that a body at rest does not have."""
+DYNAMIC = 'set motion = "dynamic" under [simulator]'
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
-
-
-def every_node(count: int) -> PointMap:
-    """All nodes of a body as recorded points."""
-    return PointMap(np.arange(count)[:, None], np.ones((count, 1)))
 
 
 def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "*batch"]:
@@ -55,6 +53,32 @@ def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "
     cases = motion.diverged, motion.imbalance > EQUILIBRIUM_TOLERANCE, ~motion.converged
     codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, unsolved
     return arrays.select(cases, [int(code) for code in codes], int(Result.OK))
+
+
+def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time section 4"]:
+    """Unit quaternions (x, y, z, w) of sections, given three points of each: on its axis, and along its x and y."""
+    corner = points.reshape(len(points), -1, 3, 3)
+    along, beside = corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0]
+    x = along / jnp.linalg.norm(along, axis=-1, keepdims=True)
+    beside = beside - jnp.sum(beside * x, axis=-1, keepdims=True) * x
+    y = beside / jnp.linalg.norm(beside, axis=-1, keepdims=True)
+    z = jnp.cross(x, y)
+    # Four ways to write the quaternion, each good where its own component is large.
+    a, e, i = x[..., 0], y[..., 1], z[..., 2]
+    p, q, r = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
+    u, v, w = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]
+    ways = jnp.stack(
+        [
+            jnp.stack([1.0 + a - e - i, u, v, p], axis=-1),
+            jnp.stack([u, 1.0 - a + e - i, w, q], axis=-1),
+            jnp.stack([v, w, 1.0 - a - e + i, r], axis=-1),
+            jnp.stack([p, q, r, 1.0 + a + e + i], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = jnp.argmax(jnp.stack([a - e - i, e - a - i, i - a - e, a + e + i], axis=-1), axis=-1)
+    found = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
+    return found / jnp.linalg.norm(found, axis=-1, keepdims=True)
 
 
 class RobotSimulator(ExtendedSimulator):
@@ -94,6 +118,21 @@ class RobotSimulator(ExtendedSimulator):
         }
 
     @property
+    def shown(self) -> int:
+        """Points of the engine that are markers; those after them tell orientations of sections."""
+        return len(self.robot.markers)
+
+    @property
+    def section_names(self) -> tuple[str, ...]:
+        """Sections of the robot whose orientation is told."""
+        return self.robot.section_names
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether every observation shows an equilibrium, found from the one before: no time step, no damping."""
+        return self.engine.at_rest
+
+    @property
     def discretised(self) -> dict[str, object]:
         """How the body is cut, for the record."""
         raise NotImplementedError
@@ -109,11 +148,6 @@ class RobotSimulator(ExtendedSimulator):
     def balance_of(self, inputs: tuple[Any, Array, Array], cube: CubeInputs | None) -> Balance:
         """Forces and energies after every step, of the rollout of these `inputs`."""
         raise NotImplementedError
-
-    def motion_of_nodes(self, inputs: tuple[Any, Array, Array], cube: CubeInputs | None) -> Motion:
-        """The rollout of these `inputs` in double precision, with all nodes of the body recorded."""
-        engine = self.engine.recording(every_node(self.assembly.system.body.nodes))
-        return engine.motion(*inputs, cube=cube)
 
     @property
     def pushes(self) -> bool:
@@ -183,21 +217,46 @@ class RobotSimulator(ExtendedSimulator):
         """
         values = self.complete(parameters)
         steps = self.steps_seen(values, commands, self.time_step, steps)
-        cube, inputs = self.body_inputs(values)[1], self.inputs(values, commands)
         loads = self.loads(values, commands)
         following = [m for m in self.mechanisms if isinstance(m, PushingMechanism) and m.follows_motion]
         for _ in range(PASSES if following else 0):
-            path = self.engine.motion(*inputs, steps, cube, loads).position[:, -1]
+            path = self._path(self._motion(values, commands, steps, loads), commands)
             loads = self.loads(values, commands, path)
-        motion = self.engine.motion(*inputs, steps, cube, loads)
-        return self.observation(values, commands, motion, self.unsolved)
+        return self.observation(values, commands, self._motion(values, commands, steps, loads), self.unsolved)
 
     def path(self, parameters: Values, commands: Commands) -> Float[Array, "row 3"]:
         """Where the last marker is before the first step and at the end of each [m], in the frame of the base, without
         laws that follow the motion."""
         values = self.complete(parameters)
-        cube, loads = self.body_inputs(values)[1], self.loads(values, commands)
-        return self.engine.motion(*self.inputs(values, commands), None, cube, loads).position[:, -1]
+        return self._path(self._motion(values, commands, None, self.loads(values, commands)), commands)
+
+    def _motion(
+        self, values: Values, commands: Commands, steps: Int[Array, ""] | None, loads: BodySignals | None
+    ) -> Motion:
+        """The motion of the body: a row before the first step and at the end of each; of a body at rest before the
+        first observation and at each."""
+        cube, (material, start, displacement) = self.body_inputs(values)[1], self.inputs(values, commands)
+        if self.at_rest:
+            displacement = sample(jnp.concatenate([start[None], displacement]), commands)
+            if loads is not None:
+                loads = jax.tree.map(lambda part: jnp.concatenate([part[:1], sample(part, commands)]), loads)
+            if steps is not None:
+                steps = jnp.sum(commands.sample_step + (commands.sample_fraction > 0) <= steps)
+        return self.engine.motion(material, start, displacement, steps, cube, loads)
+
+    def _path(self, motion: Motion, commands: Commands) -> Float[Array, "row 3"]:
+        """Where the last marker is before the first step and at the end of each [m]; between observations of a body at
+        rest on the way from one to the next."""
+        tip = motion.position[:, self.shown - 1]
+        if not self.at_rest:
+            return tip
+        at = jnp.concatenate([jnp.zeros(1), commands.sample_step + commands.sample_fraction])
+        rows = jnp.arange(len(commands.step) + 1.0)
+        return jnp.stack([jnp.interp(rows, at, tip[:, axis]) for axis in range(3)], axis=1)
+
+    def _seen(self, series: Float[Array, "row ..."], commands: Commands) -> Float[Array, "time ..."]:
+        """The rows of a motion that are observed."""
+        return series[1:] if self.at_rest else sample(series, commands)
 
     def loads(
         self, values: Values, commands: Commands, path: Float[Array, "row 3"] | None = None
@@ -211,16 +270,16 @@ class RobotSimulator(ExtendedSimulator):
             path: of the last marker in the frame of the base [m], for laws that follow it; they do nothing without.
 
         Raises:
-            InputError: mechanisms that do, on another body than layers without a cube.
+            InputError: mechanisms that do, on another body than a rod without a cube.
         """
         pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
         found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
         if pushing:
             if not self.engine.carries_loads:
                 raise InputError(
-                    f"{pushing[0].name} acts on layers without a cube only",
+                    f"{pushing[0].name} acts on a rod without a cube only",
                     where="[[model.laws]]",
-                    remedy='set body = "layered" under [simulator], and leave the cube out',
+                    remedy='set body = "rod" under [simulator], and leave the cube out',
                 )
             initial, command = self.actuated(values, commands, self.time_step)
             levels = jnp.concatenate([initial[None], command])
@@ -239,6 +298,8 @@ class RobotSimulator(ExtendedSimulator):
                 integrator than implicit Euler.
         """
         values = self.complete(parameters)
+        if self.at_rest:
+            raise InputError("forces and energies are those of a motion", where="balance", remedy=DYNAMIC)
         if self.loads(values, commands) is not None:
             raise InputError(
                 "forces and energies are not available where laws act on the body",
@@ -251,32 +312,35 @@ class RobotSimulator(ExtendedSimulator):
     def embodied(
         self,
         values: Values,
-        body: LayeredBody,
-        stiffness_scale: Float[Array, " layers"],
+        body: Rod,
+        stiffness_scale: Float[Array, " elements"],
         point_mass: Float[Array, " stations"],
     ) -> Material:
-        """Material of a layered body, body mechanisms included.
+        """Material of a rod, body mechanisms included.
 
         Raises:
-            InputError: a mechanism that acts on layered bodies only, where the engine's is not one.
+            InputError: a mechanism that acts on rods or on motion only, where the body is none or at rest.
         """
         material = Material(
             young_modulus=values["young_modulus"],
             poisson_ratio=values["poisson_ratio"],
             density=jnp.asarray(self.robot.density(values["trunk_mass"])),
-            rayleigh_mass=values["rayleigh_mass"],
-            rayleigh_stiffness=values["rayleigh_stiffness"],
+            rayleigh_mass=values.get("rayleigh_mass", jnp.zeros(())),
+            rayleigh_stiffness=values.get("rayleigh_stiffness", jnp.zeros(())),
             gravity=jnp.asarray(self.robot.gravity),
             stiffness_scale=stiffness_scale,
             point_mass=point_mass,
         )
         for mechanism in self.mechanisms:
+            if self.at_rest and QUASI_STATIC not in motions_of(mechanism):
+                words = f"the mechanism {mechanism.name!r} acts on a body in motion"
+                raise InputError(words, where="[model] mechanisms", remedy=f"remove it, or {DYNAMIC}")
             if isinstance(mechanism, BodyMechanism):
                 material = mechanism.embody(values, material, body)
-                if material.effects.present and not self.engine.layered:
+                if material.effects.present and not self.engine.is_rod:
                     raise InputError(
-                        f"the mechanism {mechanism.name!r} acts on layered bodies only", where="[model] mechanisms",
-                        remedy='remove it, or set body = "layered" under [simulator]',
+                        f"the mechanism {mechanism.name!r} acts on rods only", where="[model] mechanisms",
+                        remedy='remove it, or set body = "rod" under [simulator]',
                     )  # fmt: skip
         return material
 
@@ -292,19 +356,24 @@ class RobotSimulator(ExtendedSimulator):
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
-        true, at = sample(motion.position, commands), observed_at(commands, self.time_step)
+        points, at, shown = self._seen(motion.position, commands), observed_at(commands, self.time_step), self.shown
+        true = points[:, :shown]
         position = self.measured(values, true, at, self.meanwhile(values, commands))
         pose = None
         if motion.pose is not None:
             pose = sample(motion.pose, commands)
             pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
         angle = self.driven(values, commands, self.time_step)
-        return Observation(position, sample(motion.tension, commands), pose, status_of(motion, unsolved), angle)
+        tension = self._seen(motion.tension, commands)
+        turn = None if points.shape[1] == shown else orientations(points[:, shown:])
+        return Observation(position, tension, pose, status_of(motion, unsolved), angle, orientation=turn)
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of the robot, those of the mechanisms, then those of the cube."""
+        """Parameters of the robot, those of the mechanisms, then those of the cube; of a body at rest without
+        damping."""
         base = specs_of(self.robot.parameter_table())
+        base = tuple(spec for spec in base if not (self.at_rest and spec.name in DAMPING))
         extended = base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
         return extended + (specs_of(push_table(self.robot).parameters) if self.pushes else ())
 
@@ -319,33 +388,41 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.command.unit
 
     def pretension(self, values: Values) -> Float[Array, " cable"]:
-        """Cable displacements at zero command [m]."""
-        return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
+        """What drives each cable and chamber at zero command [m, N or Pa]."""
+        names = self.robot.initial_displacement_names
+        if not names:
+            return jnp.zeros(len(self.robot.actuators))
+        return jnp.stack([values[name] for name in names])
+
+    def exerted(self, values: Values, level: Float[Array, "*row actuator"]) -> Float[Array, "*row cable"]:
+        """What the engine's cables are given, displacements [m] or tensions [N], at levels of the drives."""
+        return level + self.pretension(values)
 
     def wound(
         self, values: Values, commands: Commands, time_step: float
     ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
-        """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
+        """What the engine's cables are given before the first step and at the end of every step, by drives with end
+        stops."""
         initial, command = self.actuated(values, commands, time_step)
         start = self.unwound(values, initial)
         levels = jax.lax.scan(lambda drives, sent: self.wind(values, drives, sent), start, command)[1]
-        return start.level + self.pretension(values), levels
+        return self.exerted(values, start.level), levels
 
     def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
         """The drives before the first step, where this command [m or rad] has reached them."""
-        limits = self.robot.displacement_limits()
+        limits = self.robot.drive_limits()
         level = self.robot.channel_matrix(values) @ initial
         return Wound(jnp.clip(level, limits[:, 0], limits[:, 1]), jnp.asarray(initial, float))
 
     def wind(
         self, values: Values, drives: Wound, sent: Float[Array, " channel"]
     ) -> tuple[Wound, Float[Array, " cable"]]:
-        """The drives at the end of a step, and the cables' displacements [m], given the command that reached them."""
-        limits = jnp.asarray(self.robot.displacement_limits())
+        """The drives at the end of a step, and what the engine's cables are given, by the command that reached them."""
+        limits = jnp.asarray(self.robot.drive_limits())
         move = jnp.asarray(self.robot.channel_matrix(values)) @ (sent - drives.sent)
         # A drive at its limit ignores further pulls, and answers the first release at once.
         level = jnp.clip(drives.level + move, limits[:, 0], limits[:, 1])
-        return Wound(level, sent), level + self.pretension(values)
+        return Wound(level, sent), self.exerted(values, level)
 
     @property
     def integrator(self) -> str | None:
@@ -364,15 +441,19 @@ class RobotSimulator(ExtendedSimulator):
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
         """See `ExtendedSimulator.lane_start`."""
         material, cube = self.body_inputs(values)
-        return LaneStart(material, drives.level + self.pretension(values), cube)
+        return LaneStart(material, self.exerted(values, drives.level), cube)
 
     def begin_lanes(self, count: int) -> BodyLanes:
         """See `ExtendedSimulator.begin_lanes`.
 
         Raises:
-            InputError: a body that is not made of layers.
+            InputError: a body that is no rod.
         """
-        return body_lanes(self.engine, count)
+        body: Any = self.engine.body
+        markers = type(body.markers)(*(part[: self.shown] for part in body.markers))
+        shows_all = len(body.markers[0]) == self.shown
+        engine = self.engine if shows_all else replace(self.engine, body=body._replace(markers=markers))
+        return body_lanes(engine, count)
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
         """Markers of the undeformed robot [m]."""

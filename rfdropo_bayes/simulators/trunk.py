@@ -1,17 +1,17 @@
-"""A cable-driven trunk: commands, through actuation, body and sensing, to marker positions and tensions."""
+"""A cable-driven rod: commands, through actuation, body and sensing, to marker positions and tensions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
-from rfdropo_bayes.fem.balance import Balance, layered_balance
+from rfdropo_bayes.fem import Material, PointMap, System, attach, cable_layout, profile_rod, refined
+from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.stage_balance import stepped_balance
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
@@ -23,10 +23,9 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 @dataclass(frozen=True)
 class Discretisation:
-    """How finely the body and time are cut: nodes across a section, sub-layers per layer, and the time step [s]."""
+    """How finely the body and time are cut: time step [s], and by how many times the elements of the robot's body."""
 
     time_step: float
-    nodes_across: int = 2
     refine: int = 1
 
 
@@ -39,36 +38,28 @@ class Assembly(NamedTuple):
 
 
 def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
-    """Cut the robot's body into layers and attach cables and markers to it."""
-    arrays = dict(robot.layered_arrays())
-    body = refined_body(arrays, discretisation.refine, discretisation.nodes_across)
+    """Cut the robot's body into elements and attach cables and markers to it."""
+    cuts = discretisation.refine * np.array(robot.body.cuts())
+    body = refined(profile_rod(**robot.rod_arrays()), cuts)
     system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
-    station_of = np.arange(len(np.asarray(arrays["station"]))) * discretisation.refine
-    return Assembly(system, attach(body, robot.marker_points()), station_of)
+    station_of = np.append(0, np.cumsum(cuts))
+    return Assembly(system, attach(body, np.concatenate([robot.marker_points(), section_points(robot)])), station_of)
 
 
-def refined_body(arrays: Mapping[str, np.ndarray | int | bool], refine: int, nodes_across: int) -> LayeredBody:
-    """The body with every layer cut into ``refine`` equal layers of the same section."""
-    station, half_width = np.asarray(arrays["station"]), np.asarray(arrays["half_width"])
-    at = np.arange((len(station) - 1) * refine + 1) / refine
-    rows = np.arange(len(station))
-    sections = {
-        name: np.repeat(np.asarray(value), refine, axis=0)
-        for name, value in arrays.items()
-        if name not in ("station", "half_width", "nodes_across", "sectional")
-    }
-    return profile_body(
-        station=np.interp(at, rows, station),
-        half_width=np.stack([np.interp(at, rows, half_width[:, i]) for i in range(2)], axis=1),
-        nodes_across=nodes_across,
-        sectional=bool(arrays["sectional"]),
-        **sections,
-    )
+ARM = 0.01
+"""[m] Points that tell a section's orientation lie so far from the axis."""
+
+
+def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
+    """Three points of each section whose orientation is measured: on the axis, and along its x and y."""
+    corners = ARM * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    middles = np.array([[0.0, 0.0, each.z_m] for each in robot.orientations]).reshape(-1, 1, 3)
+    return (middles + corners).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
 class TrunkSimulator(RobotSimulator):
-    """A layered trunk with mechanisms, behind the `Simulator` protocol.
+    """A rod with mechanisms, behind the `Simulator` protocol.
 
     Attributes:
         discretisation: how finely the body and time are cut; for the others see `RobotSimulator`.
@@ -88,8 +79,7 @@ class TrunkSimulator(RobotSimulator):
     @property
     def discretised(self) -> dict[str, object]:
         """See `RobotSimulator`."""
-        layers = len(self.assembly.system.body.station) - 1
-        return {"nodes_across": self.discretisation.nodes_across, "layers": layers}
+        return {"body": "rod", "elements": self.assembly.system.body.elements}
 
     def session(self, lanes: int, period: float) -> Session:
         """So many trunks that are commanded one control period [s] at a time; see `Session`."""
@@ -102,9 +92,6 @@ class TrunkSimulator(RobotSimulator):
     def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
         """See `RobotSimulator`; the energies are those of the body."""
         system, engine = self.assembly.system, self.engine
-        if engine.integrator == "euler":
-            motion, prepared = self.motion_of_nodes(inputs, cube), prepare(system, inputs[0])
-            return layered_balance(system, prepared, motion.position, motion.tension, self.time_step)
         material, start, displacement = inputs
         prepared, state, _ = engine.initial(material, start)
         around = () if cube is None else (engine.scene, cube.cube)
@@ -116,5 +103,6 @@ class TrunkSimulator(RobotSimulator):
         """See `RobotSimulator`."""
         body = self.assembly.system.body
         masses = jnp.zeros(len(body.station)).at[self.assembly.station_of].set(self.robot.point_masses(values))
-        scale = jnp.repeat(jnp.asarray(self.robot.stiffness_scale(values["poisson_ratio"])), self.discretisation.refine)
+        cuts = np.diff(self.assembly.station_of)
+        scale = jnp.asarray(self.robot.stiffness_scale(values["poisson_ratio"]))[np.repeat(np.arange(len(cuts)), cuts)]
         return self.embodied(values, body, scale, masses)

@@ -54,7 +54,6 @@ MESH = Setting(
     made=BODY,
     priors={
         "young_modulus": {"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5},
-        "poisson_ratio": {"distribution": "Uniform", "low": 0.4, "high": 0.499},
         "trunk_mass": {"distribution": "LogNormal", "median": 0.42, "sigma": 0.5},
         "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.1, "sigma": 0.7},
     },

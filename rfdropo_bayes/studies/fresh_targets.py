@@ -36,7 +36,6 @@ RECORDINGS = tuple(f"recording_{k + 1}" for k in range(6))
 AUDITED = 4  # recordings that an audit fits; it measures the gain in the others
 NOISE = 5e-4  # m, of motion capture
 ENGINE_ARM, MODEL_ARM = "arm.xml", "arm.toml"
-UNSWOLLEN = {"poisson_ratio": (0.1, 0.499)}
 INNER = (0.2, 0.8)  # shares of the ranges between which truths are drawn
 
 
@@ -74,7 +73,6 @@ SCENES = {
         50_000,
         {
             "young_modulus": (1e6, 4e6),
-            "poisson_ratio": (0.4, 0.499),
             "trunk_mass": (0.04, 0.18),
             "rayleigh_stiffness": (0.01, 0.15),
         },
@@ -92,7 +90,6 @@ SCENES = {
         100_000,
         {
             "young_modulus": (3e6, 7e6),
-            "poisson_ratio": (0.4, 0.499),
             "trunk_mass": (0.2, 0.6),
             "rayleigh_stiffness": (0.01, 0.15),
         },
@@ -111,7 +108,7 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
         kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", two laws
             that the library lacks, each of as many cables as the scene says, as large as usual to twice as large; or
             "mujoco", an arm that MuJoCo moves with two effects of its own, as large. Only the arm that reaches can be
-            made in MuJoCo, and its rigid sections do not swell, so that the models' Poisson's ratio has a wider prior.
+            made in MuJoCo.
         seed: of all that is drawn: the same seed makes the same target.
         out: folder to write to.
         scene: a name of `SCENES`.
@@ -131,7 +128,7 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
     )
     if kind == "mujoco":
         truth, robot = _in_mujoco(chosen, model, out)
-        chosen = replace(chosen, robot=robot, ranges={**chosen.ranges, **UNSWOLLEN})
+        chosen = replace(chosen, robot=robot)
     training = {**chosen.task, "noise": NOISE}
     every = training | {"anneal": True, "evaluate_every": chosen.evaluated}
     training.pop("task")

@@ -69,7 +69,6 @@ class Setting:
     priors: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {
             "young_modulus": {"distribution": "LogNormal", "median": 2e6, "sigma": 0.5},
-            "poisson_ratio": {"distribution": "Uniform", "low": 0.4, "high": 0.499},
             "trunk_mass": {"distribution": "LogNormal", "median": 0.09, "sigma": 0.5},
             "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.05, "sigma": 0.7},
         }

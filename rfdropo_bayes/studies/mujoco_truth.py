@@ -1,9 +1,9 @@
 """A robot made anew in MuJoCo, a truth that this package's engine did not make: springs and links, tendons for cables.
 
 Links are rigid. Between their middles lie joints that stretch along the axis, shear and bend in two planes and twist,
-with the section's stiffness over a link's length. A rigid section does not swell where the arm is compressed, as if
-Poisson's ratio were zero. Cables are tendons through the guides' places, each drawn in by a stiff servo that can only
-pull. What is hidden is hidden by means of that engine: masses, gravity, dry friction, tendons, gains, sites.
+with the section's stiffness over a link's length. Cables are tendons through the guides' places, each drawn in by a
+stiff servo that can only pull. What is hidden is hidden by means of that engine: masses, gravity, dry friction,
+tendons, gains, sites.
 """
 
 from __future__ import annotations

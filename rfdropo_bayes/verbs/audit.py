@@ -318,7 +318,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
     for name in names:
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
         body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
-        why = obstacle(mechanism, body, engine)
+        why = obstacle(mechanism, body, engine, spec.simulator.motion)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:
@@ -380,10 +380,11 @@ def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
 
 
 def _finer(spec: ModelSpec, robot: Robot) -> ModelSpec:
-    """The model with half the time step, and twice the layers of a body of layers; a mesh stays as it is."""
-    table = spec.simulator
-    finer: dict[str, Any] = {"time_step": (table.time_step or robot.time_step_s) / FINER}
-    if table.body == "layered":
+    """The model with half the time step, and twice the elements of a rod; a mesh stays as it is."""
+    table, finer = spec.simulator, dict[str, Any]()
+    if table.motion == "dynamic":
+        finer["time_step"] = (table.time_step or robot.time_step_s) / FINER
+    if table.body == "rod":
         finer["refine"] = min(FINER * table.refine, 16)
     elif table.tetrahedra is not None and table.tetrahedra.drive_rate is not None:  # which is per step
         rate = table.tetrahedra.drive_rate / FINER
@@ -453,11 +454,12 @@ def extended_tables(
     for step in answer.adopted:
         if step.name == DISCRETISATION:
             assert answer.problem.finer is not None
-            if simulator.get("body", "layered") == "layered":
+            if simulator.get("body", "rod") == "rod":
                 simulator["refine"] = FINER * int(simulator.get("refine", 1))
             elif "drive_rate" in simulator["tetrahedra"]:
                 simulator["tetrahedra"]["drive_rate"] /= FINER
-            simulator["time_step"] = answer.problem.finer[0].simulator.description["time_step_s"]
+            if simulator.get("motion", "dynamic") == "dynamic":
+                simulator["time_step"] = answer.problem.finer[0].simulator.description["time_step_s"]
             continue
         candidate = answer.problem.candidate(step.name)
         assert candidate is not None

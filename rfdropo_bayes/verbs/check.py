@@ -37,6 +37,7 @@ from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
@@ -153,8 +154,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
 
 
 def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What the nominal model shows: errors of time step and mesh, and motions in another direction."""
-    say_step(f"simulating {runs[0].name} with a finer time step and a finer mesh")
+    """What the nominal model shows: errors of time step, elements and motion, and motions in another direction."""
+    say_step(f"simulating {runs[0].name} with a finer time step, more elements, and the other kind of motion")
     spec = spec_of(experiment, folder)
     found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
@@ -234,6 +235,7 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
             ("cable tensions", trajectory.tension),
             ("motor angles", trajectory.motor_angle),
             ("poses of an object", trajectory.object_pose),
+            ("orientations", trajectory.orientation),
         )
         if values is not None
     ]
@@ -333,26 +335,31 @@ def _say_unasked(found: Check, trajectory: Trajectory, robot: Robot) -> None:
         )
 
 
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
+"""Factor and unit in which what drives a cable or a chamber is shown."""
+
+
 def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:
-    """Cables that are asked for more than they are allowed, or for more than a body has."""
+    """Cables and chambers that are asked for more than they are allowed, or for more than a body has."""
     low, high = asked.min(axis=0), asked.max(axis=0)
-    least, most = np.array(robot.displacement_limits()).T
+    least, most = np.array(robot.drive_limits()).T
     beyond = np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
     if not len(beyond):
         return
+    factor, unit = SHOWN[robot.actuators[0].unit]
     words = ", ".join(
-        f"{robot.cable_names[k]} {MILLIMETRES * low[k]:.3g} to {MILLIMETRES * high[k]:.3g} mm "
-        f"(limits {MILLIMETRES * least[k]:.3g} to {MILLIMETRES * most[k]:.3g})"
+        f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
+        f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
         for k in beyond
     )
     length = robot.body.station_m[-1] - robot.body.station_m[0]
-    if high.max() > length:
+    if unit == "mm" and high.max() > length:
         found.doubts.append(
             f"{name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: {words}: look at "
             "command_unit, at counts_per_turn, and at spool_radius and gain of the robot file"
         )
         return
-    found.notes.append(f"{name}: cables are held at their displacement_limit_m where commands ask for more: {words}")
+    found.notes.append(f"{name}: drives are held at the limits of the robot file where commands ask for more: {words}")
 
 
 def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
@@ -403,8 +410,11 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
     simulator = None if spec is None else _try(found, partial(build_simulator, spec))
     if spec is None or simulator is None or not fitted:
         return
-    step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
-    found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
+    if simulator.integrator == QUASI_STATIC:
+        found.lines.append(("motion", "quasi-static: every row is an equilibrium, without time step and damping"))
+    else:
+        step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
+        found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
     model = _try(found, lambda: build_model(spec, simulator, fitted))
     if model is not None:
         for index, parameter in enumerate(model.space.parameters):
@@ -418,6 +428,7 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         "tension": any(t.tension is not None for t in fitted),
         "motor_angle": any(t.motor_angle is not None for t in fitted),
         "object_pose": any(t.object_pose is not None for t in fitted),
+        "orientation": any(t.orientation is not None for t in fitted),
     }
     for key, there in recorded.items():
         if there and not asdict(spec.channels)[key]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from rfdropo_bayes.data import lerobot, load_recordings, motive_csv, rosbag
+from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.named_columns import COUNTS
 from rfdropo_bayes.errors import InputError
@@ -18,6 +18,7 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, robot_text
 from rfdropo_bayes.verbs.column_names import Guess, guess_columns, lost_positions
 from rfdropo_bayes.verbs.placement import frame_lines
+from rfdropo_bayes.verbs.slow_motion import slow_motion
 
 PRIORS = (
     ("young_modulus", "how stiff"),
@@ -124,21 +125,35 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
 
-    def write(data: list[str]) -> Experiment:
-        experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
+    def write(data: list[str], slow: str | None = None) -> Experiment:
+        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(outline, guess, rests=slow is not None)]
+        experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
     if guess is None:
         write(_random_commands(outline))
         return robot, experiment
     tables = partial(data_tables, folder, outline.markers, recordings, commands, guess, outline.gravity)
-    frame = _frame(write(tables()), made, folder)
-    if frame:
-        write(tables(frame=frame))
+    plain = write(tables())
+    first = _first_recording(plain, folder)
+    if first is not None:
+        frame, slow = _frame(plain, made, first), slow_motion(made, first)
+        if frame or slow:
+            write(tables(frame=frame), slow)
     return robot, experiment
 
 
-def _frame(experiment: Experiment, robot: Robot, folder: Path) -> list[str]:
+def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
+    """The first recording to fit; None if it cannot be read, which check says, and the user runs it next."""
+    if experiment.data is None:
+        return None
+    try:
+        return load_recordings(experiment.data, folder)[0]
+    except InputError:
+        return None
+
+
+def _frame(experiment: Experiment, robot: Robot, first: Trajectory) -> list[str]:
     """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
 
     Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
@@ -146,10 +161,6 @@ def _frame(experiment: Experiment, robot: Robot, folder: Path) -> list[str]:
     if experiment.data is None or experiment.data.columns is None:
         return []
     columns = experiment.data.columns
-    try:
-        first = load_recordings(experiment.data, folder)[0]
-    except InputError:  # what is wrong with it is said by check, which the user runs next
-        return []
     found = frame_lines(robot, first, columns)
     turned = found and found[0] != f"axes = {quoted(columns.axes)}"
     return [] if turned and experiment.data.format == motive_csv.FORMAT else found
@@ -282,8 +293,23 @@ def _random_commands(outline: RobotOutline) -> list[str]:
     ]
 
 
-def _model(outline: RobotOutline, guess: Guess | None) -> list[str]:
-    wanted = [(name, why) for name, why in PRIORS if name != "spool_radius" or outline.command_unit == "rad"]
+def _simulator(slow: str | None) -> list[str]:
+    """The table [simulator] for rows that are slow, given why."""
+    if slow is None:
+        return []
+    return [
+        "[simulator]",
+        f"# ASSUMED: {slow}. rfdropo check compares",
+        '# both motions on these commands. "dynamic" has damping, time steps, and a mass that its motion shows.',
+        'motion = "quasi-static"  # every row is an equilibrium',
+        "",
+    ]
+
+
+def _model(outline: RobotOutline, guess: Guess | None, *, rests: bool) -> list[str]:
+    absent = {"spool_radius"} if outline.command_unit != "rad" else set()
+    absent |= {"rayleigh_stiffness"} if rests else set()
+    wanted = [(name, why) for name, why in PRIORS if name not in absent]
     uses = []
     if guess is not None and guess.tensions:
         uses.append("tension = true          # forces are data: they fix the scale of stiffness and mass")

@@ -56,7 +56,7 @@ def measure_direction(spec: ModelSpec, recordings: Sequence[Trajectory]) -> Dire
     Raises:
         InputError: commands that do not fit, or a rollout that did not end well.
     """
-    longest = longest_of(spec.simulator.body == "layered")
+    longest = longest_of(spec.simulator.body == "rod")
     return direction_of(_paths(spec, recording, longest) for recording in recordings[:MOST])
 
 

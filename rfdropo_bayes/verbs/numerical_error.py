@@ -1,9 +1,9 @@
-"""How far the time step and the mesh of an experiment move its markers, measured on its own commands."""
+"""How far time step, elements and kind of motion of an experiment move its markers, measured on its own commands."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,26 +12,50 @@ from jaxtyping import Float
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Trajectory, shared_markers
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.integrators import STAGES
 from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
 from rfdropo_bayes.model.model_spec import ModelSpec
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
+from rfdropo_bayes.simulators.mechanisms import motions_of
 from rfdropo_bayes.simulators.protocol import Result
 
-FINER, MORE_LAYERS = 4, 2
-"""The time step is divided by this, and every layer cut into so many more."""
+FINER, MORE_ELEMENTS = 4, 2
+"""The time step is divided by this, and every element cut into so many more."""
+LIMIT = MORE_ELEMENTS**2 / (MORE_ELEMENTS**2 - 1)
+"""Distance from the limit of ever more elements over that from so many more: the rod is of second order."""
 LONGEST, LONGEST_MESH = 20.0, 2.0
-"""[s] that are simulated of a recording, of layers and of tetrahedra, each of whose steps takes 100 times as long."""
+"""[s] that are simulated of a recording, of a rod and of tetrahedra, each of whose steps takes 100 times as long."""
+SOLVES = 4.0
+"""Linear solves that a row of a quasi-static motion takes on average, at most."""
+ENOUGH = 0.01
+"""Share of the markers' way by which a quasi-static motion may differ from a dynamic one and still be enough."""
+
+
+class RestError(NamedTuple):
+    """A quasi-static motion beside a dynamic one."""
+
+    distance: float  # root mean square, of the markers [mm]
+    way: float  # of the markers about their mean [mm]
+    cheaper: float  # solves of the dynamic motion over those of the quasi-static one
+
+    @property
+    def enough(self) -> bool:
+        """Whether the quasi-static motion is enough."""
+        return self.distance <= ENOUGH * self.way
 
 
 class NumericalError(NamedTuple):
-    """Root mean square distance of the markers [mm] from those of a finer simulation."""
+    """Root mean square distance of the markers [mm] from those of other simulations."""
 
     seconds: float  # that were simulated
-    time_step: float  # against a quarter of the step
-    mesh: float | None  # against twice the layers; None for a mesh of tetrahedra
+    time_step: float | None  # a quarter of the step; None for a motion without steps
+    elements: float | None  # twice the elements; None for a mesh of tetrahedra
+    way: float  # of the markers about their mean
+    rest: RestError | None = None  # the other kind of motion; None for a body that has one only
 
 
 def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> NumericalError:
-    """What a quarter of the time step, and twice the layers, change at the markers of a recording.
+    """What a quarter of the time step, twice the elements, and the other kind of motion change at the markers.
 
     Values are nominal or fixed. An error that falls with the step as implicit Euler's does is a third larger than this
     difference, one of second order a fifteenth.
@@ -39,28 +63,41 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
     Raises:
         InputError: a black box, commands that do not fit, or a rollout that did not end well.
     """
-    simulator = build_robot_simulator(spec)
-    layered = simulator.engine.layered
-    longest = longest_of(layered)
-    fine = spec.simulator.model_copy(update={"time_step": simulator.time_step / FINER})
-    here, finer = (
-        nominal_markers(spec, recording, longest),
-        nominal_markers(replace(spec, simulator=fine), recording, longest),
-    )
-    mesh = None
-    if layered:
-        more = spec.simulator.model_copy(update={"refine": MORE_LAYERS * spec.simulator.refine})
-        mesh = _distance(here, nominal_markers(replace(spec, simulator=more), recording, longest))
-    return NumericalError(min(longest, float(recording.time[-1])), _distance(here, finer), mesh)
+    simulator, table = build_robot_simulator(spec), spec.simulator
+    longest = longest_of(simulator.engine.is_rod)
+
+    def moved(**changes: Any) -> Float[np.ndarray, "time marker 3"]:
+        return nominal_markers(replace(spec, simulator=table.model_copy(update=changes)), recording, longest)
+
+    here, finer, elements, rest = moved(), None, None, None
+    if not simulator.at_rest:
+        finer = _distance(here, moved(time_step=simulator.time_step / FINER))
+    if simulator.engine.is_rod:
+        elements = _distance(here, moved(refine=MORE_ELEMENTS * table.refine))
+    if simulator.engine.carries_loads and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms):
+        other = {"motion": "dynamic"} if simulator.at_rest else {"motion": QUASI_STATIC, **dict.fromkeys(MOVING)}
+        rows, steps = len(here), min(longest, float(recording.time[-1])) / simulator.time_step
+        cheaper = steps * len(STAGES[simulator.engine.integrator]) / (SOLVES * rows)
+        rest = RestError(_distance(here, moved(**other)), _way(here), cheaper)
+    return NumericalError(min(longest, float(recording.time[-1])), finer, elements, _way(here), rest)
 
 
-def longest_of(layered: bool) -> float:
+MOVING = ("time_step", "integrator")
+"""Keys of [simulator] that a quasi-static motion does not have."""
+
+
+def longest_of(rod: bool) -> float:
     """Seconds that are simulated of a recording: fewer of a mesh of tetrahedra."""
-    return LONGEST if layered else LONGEST_MESH
+    return LONGEST if rod else LONGEST_MESH
 
 
 def _distance(one: Float[np.ndarray, "time marker 3"], other: Float[np.ndarray, "time marker 3"]) -> float:
     return float(1e3 * np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))))
+
+
+def _way(position: Float[np.ndarray, "time marker 3"]) -> float:
+    """Root mean square distance of the last marker from its mean [mm]."""
+    return _distance(position[:, -1:], position[:, -1:].mean(axis=0))
 
 
 def nominal_markers(spec: ModelSpec, recording: Trajectory, longest: float) -> Float[np.ndarray, "time marker 3"]:
@@ -89,14 +126,32 @@ def numerical_error_lines(spec: ModelSpec, recording: Trajectory) -> list[tuple[
     simulator = build_robot_simulator(spec)
     integrator, step = simulator.engine.integrator, 1e3 * simulator.time_step
     over = f"at the markers over the first {found.seconds:.3g} s of {recording.name}, root mean square"
-    lines = [
-        ("numerics", f"a quarter of the time step ({step:.4g} ms, {integrator}): {found.time_step:.2g} mm {over}"),
-    ]
-    if found.mesh is None:
-        lines.append(("", "the mesh of tetrahedra is as given: what a finer one would change is not measured"))
+    said = []
+    if found.time_step is not None:
+        said.append(f"a quarter of the time step ({step:.4g} ms, {integrator}): {found.time_step:.2g} mm {over}")
+    if found.elements is None:
+        said.append("the mesh of tetrahedra is as given: what a finer one would change is not measured")
     else:
         cut = "" if table.refine == 1 else f" (refine = {table.refine})"
-        lines.append(("", f"twice the layers{cut}: {found.mesh:.2g} mm"))
+        limit = LIMIT * found.elements
+        share = f", {100.0 * limit / found.way:.2g} % of the way" if found.way > 0.0 else ""
+        said.append(
+            f"twice the elements{cut}: {found.elements:.2g} mm{'' if said else f' {over}'}; their limit is about "
+            f"{limit:.2g} mm away{share}"
+        )
+    if found.rest is not None:
+        said.append(rest_words(found.rest, rests=simulator.at_rest))
     if spec.stated is not None and spec.stated.standard_deviation > 0.0:
-        lines.append(("", f"the noise that [noise] states: {1e3 * spec.stated.standard_deviation:.2g} mm a coordinate"))
-    return lines
+        said.append(f"the noise that [noise] states: {1e3 * spec.stated.standard_deviation:.2g} mm a coordinate")
+    return [("numerics" if k == 0 else "", words) for k, words in enumerate(said)]
+
+
+def rest_words(found: RestError, *, rests: bool) -> str:
+    """Which kind of motion is enough; ``rests``: the experiment's is quasi-static."""
+    share = f"{found.distance:.2g} mm, {100.0 * found.distance / max(found.way, 1e-12):.2g} % of the way"
+    if not found.enough:
+        wrong = 'set motion = "dynamic"' if rests else 'motion = "dynamic" is right'
+        return f"the robot moves as fast as its body answers: a quasi-static motion differs by {share}; {wrong}"
+    cost = f"is {found.cheaper:.2g} times cheaper and" if found.cheaper > 1.0 else "is not cheaper, and"
+    words = f"the robot moves slower than its body answers: a quasi-static motion {cost} differs by {share}"
+    return words if rests or found.cheaper <= 1.0 else f'{words}; motion = "quasi-static" is enough'

@@ -1,4 +1,4 @@
-"""A layered body that pushes cubes, on the compiled engine: the numbers of the reference engine, and of each lane."""
+"""A rod that pushes cubes, on the compiled engine: the numbers of the reference engine, and of each lane."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import pytest
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall
-from rfdropo_bayes.fem.native.layered_engine import NativeLayered
-from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, push_scene
+from rfdropo_bayes.fem.native.rod_engine import NativeRod
+from rfdropo_bayes.fem.pushing import PushGeometry, rod_spheres, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 
-BATCH, STEPS, TIME_STEP, LENGTH, LAYERS, SIDE, PLATE = 11, 60, 0.01, 0.12, 6, 0.03, -0.055
+BATCH, STEPS, TIME_STEP, LENGTH, ELEMENTS, SIDE, PLATE = 11, 60, 0.01, 0.12, 6, 0.03, -0.055
 AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]
 
 
 @functools.cache
 def bar() -> tuple[fem.System, fem.PointMap, PushGeometry]:
     """A soft bar with three cables above a plate."""
-    body = fem.uniform_body(LENGTH, 0.01, 0.01, LAYERS)
+    body = fem.uniform_rod(LENGTH, 0.01, 0.01, ELEMENTS)
     angle = np.pi / 2 * np.arange(3) + 0.1
     circle = 0.008 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     guides = [place + np.array([0.0, 0.0, 1.0]) * body.station[1::2, None] for place in circle]
     system = fem.System(body, fem.cable_layout(body, circle - [0.0, 0.0, 0.01], guides))
     up = np.array([0.0, 1.0, 0.0])
-    scene = push_scene(layered_spheres(body), plate_normal=up, plate_height=PLATE, contact_distance=0.005)
+    scene = push_scene(rod_spheres(body), plate_normal=up, plate_height=PLATE, contact_distance=0.005)
     return system, fem.attach(body, np.array([[0.0, 0.0, LENGTH], [0.003, 0.002, 0.06]])), scene
 
 
@@ -44,8 +44,8 @@ def case() -> tuple[fem.Material, np.ndarray, np.ndarray, np.ndarray]:
         rayleigh_mass=np.full(BATCH, 0.1),
         rayleigh_stiffness=random.uniform(0.01, 0.05, BATCH),
         gravity=np.tile([0.0, -9.81, 0.0], (BATCH, 1)),
-        stiffness_scale=np.ones((BATCH, LAYERS)),
-        point_mass=np.zeros((BATCH, LAYERS + 1)),
+        stiffness_scale=np.ones((BATCH, ELEMENTS)),
+        point_mass=np.zeros((BATCH, ELEMENTS + 1)),
     )
     pull = np.linspace(0.0, 6e-3, STEPS)[:, None] * np.array([0.0, 0.0, 1.0])
     displacement = np.cumsum(3e-4 * random.normal(size=(BATCH, STEPS, 3)), axis=1) + pull
@@ -64,9 +64,9 @@ def case() -> tuple[fem.Material, np.ndarray, np.ndarray, np.ndarray]:
     return material, displacement, np.concatenate([centre, turn, np.zeros((BATCH, 6))], axis=1), values
 
 
-def engine(precision: str = "float64", threads: int = 1) -> NativeLayered:
+def engine(precision: str = "float64", threads: int = 1) -> NativeRod:
     system, points, scene = bar()
-    return NativeLayered(system, points, TIME_STEP, precision=precision, threads=threads, scene=scene)
+    return NativeRod(system, points, TIME_STEP, precision=precision, threads=threads, scene=scene)
 
 
 def reference():
@@ -93,7 +93,7 @@ def test_agrees_with_the_reference():
     wanted = reference()(material, jnp.asarray(displacement), jnp.asarray(state), jnp.asarray(values))
     slid = np.linalg.norm(wanted.pose[:, -1, :3] - wanted.pose[:, 0, :3], axis=1)
     assert np.sum(slid > 5e-4) >= 3
-    plain = NativeLayered(system, points, TIME_STEP, threads=1).rollout(material, displacement)
+    plain = NativeRod(system, points, TIME_STEP, threads=1).rollout(material, displacement)
     lifted = np.abs(plain.position[:, 1:] - wanted.position).max(axis=(1, 2, 3))
     assert np.all(wanted.converged)
     assert np.sum(lifted > 2e-3) >= 5
@@ -112,7 +112,7 @@ def test_batch_and_threads_do_not_matter():
     problems leaves: SETTLED of the largest velocity, below 1 m/s, times the time step is 1e-13 m."""
     material, displacement, state, values = case()
     whole = engine().rollout(material, displacement, cube=(state, values))
-    plain = NativeLayered(*bar()[:2], TIME_STEP, threads=1).rollout(material, displacement)
+    plain = NativeRod(*bar()[:2], TIME_STEP, threads=1).rollout(material, displacement)
     np.testing.assert_allclose(whole.position[0], plain.position[0], rtol=0.0, atol=1e-12)
     order = np.random.default_rng(1).permutation(BATCH)
     shuffled = jax.tree.map(lambda value: value[order] if np.ndim(value) else value, material)

@@ -101,7 +101,7 @@ def test_trunk_has_the_volume_of_the_mesh(name):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_arrays_fit_the_finite_element_body(name):
-    arrays = Robot.load(name).layered_arrays()
+    arrays = Robot.load(name).rod_arrays()
     layers = len(arrays["station"]) - 1
     assert np.all(np.diff(arrays["station"]) > 0)
     assert arrays["station"][0] == 0.0
@@ -110,9 +110,7 @@ def test_arrays_fit_the_finite_element_body(name):
         assert arrays[field].shape == (layers,)
     for field in ("bending_moment_area", "mass_moment_area"):
         assert arrays[field].shape == (layers, 2)
-    assert all(
-        np.all(np.asarray(value) > 0) for field, value in arrays.items() if field not in ("station", "sectional")
-    )
+    assert all(np.all(value > 0) for field, value in arrays.items() if field != "station")
 
 
 @pytest.mark.parametrize("name", TRUNKS)
@@ -154,7 +152,7 @@ def test_trunk_sofa_is_the_scene_of_the_paper():
     assert nominal["rayleigh_mass"] == nominal["rayleigh_stiffness"] == 0.1
     assert robot.initial_state == "rest"
     assert robot.gravity.tolist() == [0.0, -9.81, 0.0]
-    assert robot.displacement_limits()[:, 1].tolist() == [0.07] * 4 + [0.04] * 4
+    assert robot.drive_limits()[:, 1].tolist() == [0.07] * 4 + [0.04] * 4
     assert [len(guides) for guides in robot.guides()] == [20] * 4 + [9] * 4
     assert robot.push.parameters["cube_side"].nominal == 0.035
     assert robot.push.parameters["cube_mass"].nominal == 0.05

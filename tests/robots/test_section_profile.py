@@ -1,4 +1,4 @@
-"""The section profiles in the robot files follow from the solid, and the layered body answers as the solid does."""
+"""The section profiles in the robot files follow from the solid, and the rod answers as the solid does."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_chain_of_beams_is_a_cantilever():
         "mass_area": side**2 * ones,
     }
     young, density = 1e9, 1000.0
-    response = section_profile.layered_response(station, profile, 0.3, young, density)
+    response = section_profile.rod_response(station, profile, 0.3, young, density)
     here = station[-2]
     weight, rigidity = density * side**2 * 9.81, young * side**4 / 12
     sag = weight * here**2 * (6 * 4.0 - 4 * 2.0 * here + here**2) / (24 * rigidity)
@@ -75,7 +75,7 @@ def test_trunk_sofa_answers_as_sofas_mesh_does(mesh):
         if name in profile:
             np.testing.assert_allclose(profile[name], values, rtol=2e-3)
     wanted = section_profile.solid_response(solid, station, *MATERIAL)
-    found = section_profile.layered_response(station, profile, RATIO, *MATERIAL)
+    found = section_profile.rod_response(station, profile, RATIO, *MATERIAL)
     assert wanted.frequency_hz[0] == pytest.approx(0.81, abs=0.01)
     assert found.sag_m == pytest.approx(wanted.sag_m, rel=0.05)
     np.testing.assert_allclose(found.frequency_hz, wanted.frequency_hz, rtol=0.05)

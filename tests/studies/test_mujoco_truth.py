@@ -41,13 +41,10 @@ def apart(arm, blank, **parameters):
 
 
 def test_two_engines_that_know_nothing_of_each_other_agree(arm, blank):
-    """Rigid links and springs against a layered body of finite elements, under the same cables, gravity and damping;
-    where the sections of one swell and those of the other do not, they agree less."""
-    away, way = apart(arm, blank, poisson_ratio=0.1)
-    swollen, _ = apart(arm, blank, poisson_ratio=0.45)
+    """Rigid links and springs against a rod of finite elements, under the same cables, gravity and damping."""
+    away, way = apart(arm, blank)
     assert way > 0.01
     assert away < 0.01 * way
-    assert away < 0.7 * swollen
 
 
 def test_a_payload_hangs_where_ours_does(arm, blank):

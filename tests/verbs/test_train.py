@@ -195,7 +195,7 @@ def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None
 
 def test_an_experiment_without_training_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match=r"no table \[training\]"):
-        rb.train(rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_layered.toml"), tmp_path)
+        rb.train(rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_rod.toml"), tmp_path)
 
 
 def test_an_experiment_without_training_is_evaluated_as_the_policy_was_trained(tmp_path) -> None:
@@ -203,7 +203,7 @@ def test_an_experiment_without_training_is_evaluated_as_the_policy_was_trained(t
     trained = tmp_path / "trained"
     trained.mkdir()
     shutil.copy(COMMITTED / "policy.onnx", trained)
-    model = rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_layered.toml")
+    model = rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_rod.toml")
     with pytest.raises(InputError, match=r"no table \[training\]"):
         rb.evaluate(model, [trained], tmp_path / "test", episodes=2)
     (trained / "config.toml").write_text('[training]\ntask = "TrunkReach-v0"\nperiod = 0.1\nsource = "nowhere"\n')

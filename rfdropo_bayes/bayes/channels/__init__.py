@@ -4,6 +4,7 @@ from rfdropo_bayes.bayes.channels.channel import Channel, FeatureChannel, Seen, 
 from rfdropo_bayes.bayes.channels.markers import Markers
 from rfdropo_bayes.bayes.channels.motor_angle import MotorAngle
 from rfdropo_bayes.bayes.channels.object_pose import ObjectPose
+from rfdropo_bayes.bayes.channels.orientation import Orientation
 from rfdropo_bayes.bayes.channels.tension import Tension
 from rfdropo_bayes.bayes.channels.weighed import Weighed, WeighedParts
 
@@ -13,6 +14,7 @@ __all__ = [
     "Markers",
     "MotorAngle",
     "ObjectPose",
+    "Orientation",
     "Seen",
     "Series",
     "Tension",

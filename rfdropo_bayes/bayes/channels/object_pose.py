@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
+from rfdropo_bayes.bayes.channels.quaternions import inverse, product, turn_between
 from rfdropo_bayes.bayes.noise import Autoregression, Noise, Timeline, draw_noise, timeline, whiten
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.data import Trajectory
@@ -168,7 +169,7 @@ class ObjectPose(Series):
     ) -> Float[Any, "recording time 6"]:
         """See `Series.deviation`: way of the centre [m], and the turn [rad]."""
         measured, about = jnp.asarray(measured), jnp.asarray(about)
-        turned = _turn_between(_turn_since_start(about[..., 3:]), _turn_since_start(measured[..., 3:]))
+        turned = turn_between(_turn_since_start(about[..., 3:]), _turn_since_start(measured[..., 3:]))
         errors = jnp.concatenate([measured[..., :3] - about[..., :3], turned], axis=-1)
         # A masked row must not reach the next one, nor make a NaN of a derivative.
         return jnp.where(self.line.valid, errors, 0.0)
@@ -220,7 +221,7 @@ class ObjectPose(Series):
         readings = jnp.asarray(readings)
         turn = _turn_since_start(readings[..., 3:])
         none = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), turn.shape)
-        return jnp.concatenate([readings[..., :3], LEVER * _turn_between(none, turn)], axis=-1)
+        return jnp.concatenate([readings[..., :3], LEVER * turn_between(none, turn)], axis=-1)
 
     def draw_features(
         self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
@@ -252,7 +253,7 @@ def draw_object_error(
     error = _error(key, time, values, known)
     half = 0.5 * jnp.linalg.norm(error[:, 1], axis=1, keepdims=True)
     turn = jnp.concatenate([0.5 * jnp.sinc(half / jnp.pi) * error[:, 1], jnp.cos(half)], axis=1)
-    return jnp.concatenate([pose[:, :3] + error[:, 0], _product(turn, pose[:, 3:])], axis=1)
+    return jnp.concatenate([pose[:, :3] + error[:, 0], product(turn, pose[:, 3:])], axis=1)
 
 
 def _error(
@@ -273,24 +274,4 @@ def _error(
 
 
 def _turn_since_start(q: Float[Any, "recording time 4"]) -> Float[Any, "recording time 4"]:
-    return _product(q, _inverse(q[:, :1]))
-
-
-def _turn_between(
-    first: Float[Any, "recording time 4"], second: Float[Any, "recording time 4"]
-) -> Float[Any, "recording time 3"]:
-    """Twice the vector of the quaternion from one turn to another: of a small one the rotation vector [rad], and of a
-    large one without a singularity."""
-    between = _product(second, _inverse(first))
-    return 2.0 * jnp.where(between[..., 3:] < 0.0, -1.0, 1.0) * between[..., :3]
-
-
-def _inverse(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
-    return q * jnp.array([-1.0, -1.0, -1.0, 1.0])
-
-
-def _product(a: Float[Array, "... 4"], b: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
-    """Quaternion product (x, y, z, w): first b, then a."""
-    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + jnp.cross(a[..., :3], b[..., :3])
-    scalar = a[..., 3] * b[..., 3] - jnp.sum(a[..., :3] * b[..., :3], axis=-1)
-    return jnp.concatenate([vector, scalar[..., None]], axis=-1)
+    return product(q, inverse(q[:, :1]))

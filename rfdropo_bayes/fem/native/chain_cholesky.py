@@ -1,15 +1,24 @@
 """Cholesky factorisation of bordered block-tridiagonal matrices, many side by side in SIMD lanes.
 
-The stations of a layered body are eliminated one after the other from the tip to the base. Three arrays hold, for every
-station, the pivot block, the coupling to the next station and the border: rows below the matrix, one for each right-
-hand side. All are cut into 3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block with ``size`` columns
-are panel p, element (3 p + r, c) at ``(p * size + c) * 3 + r``. One kernel, panel times transposed panel, does nearly
-all of the work. The factorisation turns a border row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
+The stations of a rod, each of two tiles, are eliminated one after the other from the tip to the base. Three arrays
+hold, for every station, the pivot block, the coupling to the next station and the border: rows below the matrix, one
+for each right-hand side. All are cut into 3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block are
+panel p, element (3 p + r, c) at ``(p * SIZE + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all
+of the work. The factorisation turns a border row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
+
+A border row is zero beyond the station that its cable reaches. Rows come in the order of their reach, so that the
+panels which are not zero at a station are its first ``active`` ones.
 """
 
 from __future__ import annotations
 
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, load3, square_root, store
+
+TILES = 2
+"""Tiles of a block: translation and rotation."""
+SIZE = 3 * TILES
+PANEL = 3 * SIZE
+BLOCK = TILES * PANEL
 
 
 @inlined
@@ -66,122 +75,91 @@ def _factor_tile(target, row, block, pivot_row, length, token):
 
 
 @kernel
-def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, token):
+def eliminate(pivot, coupling, border, condensed, station, last, panels, active, token):
     """Factorise one station and carry it over to the next, ``station - 1``, and to the condensed matrix.
 
-    ``tiles`` is the block size in tiles, ``panels`` the height of the border. ``last`` says that no station follows.
+    ``panels`` is the height of the border, of which the first ``active`` are not zero here. ``last`` says that no
+    station follows.
     """
-    size = 3 * tiles
-    panel = 3 * size
-    block, frame = tiles * panel, panels * panel
-    p, b = station * block, station * frame
-    for k in range(tiles):
-        _pivot_tile(pivot, p + k * panel, 3 * k, token)
-        for i in range(k + 1, tiles):
-            _factor_tile(pivot, p + i * panel, pivot, p + k * panel, 3 * k, token)
+    p, b = station * BLOCK, station * panels * PANEL
+    for k in range(TILES):
+        _pivot_tile(pivot, p + k * PANEL, 3 * k, token)
+        for i in range(k + 1, TILES):
+            _factor_tile(pivot, p + i * PANEL, pivot, p + k * PANEL, 3 * k, token)
         if not last:
-            for i in range(tiles):
-                _factor_tile(coupling, p + i * panel, pivot, p + k * panel, 3 * k, token)
-        for i in range(panels):
-            _factor_tile(border, b + i * panel, pivot, p + k * panel, 3 * k, token)
-    for i in range(panels):
+            for i in range(TILES):
+                _factor_tile(coupling, p + i * PANEL, pivot, p + k * PANEL, 3 * k, token)
+        for i in range(active):
+            _factor_tile(border, b + i * PANEL, pivot, p + k * PANEL, 3 * k, token)
+    for i in range(active):
         for j in range(i + 1):
-            subtract_product(condensed, 9 * (i * panels + j), border, b + i * panel, border, b + j * panel, size, token)
+            subtract_product(condensed, 9 * (i * panels + j), border, b + i * PANEL, border, b + j * PANEL, SIZE, token)
     if last:
         return
-    for i in range(tiles):
+    for i in range(TILES):
         for j in range(i + 1):
-            t = p - block + i * panel + 9 * j
-            subtract_product(pivot, t, coupling, p + i * panel, coupling, p + j * panel, size, token)
-    for i in range(panels):
-        for j in range(tiles):
-            t = b - frame + i * panel + 9 * j
-            subtract_product(border, t, border, b + i * panel, coupling, p + j * panel, size, token)
+            t = p - BLOCK + i * PANEL + 9 * j
+            subtract_product(pivot, t, coupling, p + i * PANEL, coupling, p + j * PANEL, SIZE, token)
+    for i in range(active):
+        for j in range(TILES):
+            t = b - panels * PANEL + i * PANEL + 9 * j
+            subtract_product(border, t, border, b + i * PANEL, coupling, p + j * PANEL, SIZE, token)
 
 
 @kernel
-def extend_border(pivot, coupling, extra, first, top, tiles, panels, token):
+def extend_border(pivot, coupling, extra, first, top, panels, token):
     """Turn further border rows b', zero above the station ``top``, into (L^-1 b)' after all stations are eliminated."""
-    size = 3 * tiles
-    panel = 3 * size
     for station in range(top, first - 1, -1):
-        p, b = station * tiles * panel, station * panels * panel
+        p, b = station * BLOCK, station * panels * PANEL
         for i in range(panels):
-            for k in range(tiles):
-                _factor_tile(extra, b + i * panel, pivot, p + k * panel, 3 * k, token)
+            for k in range(TILES):
+                _factor_tile(extra, b + i * PANEL, pivot, p + k * PANEL, 3 * k, token)
             if station > first:
-                for j in range(tiles):
-                    t = b - panels * panel + i * panel + 9 * j
-                    subtract_product(extra, t, extra, b + i * panel, coupling, p + j * panel, size, token)
+                for j in range(TILES):
+                    t = b - panels * PANEL + i * PANEL + 9 * j
+                    subtract_product(extra, t, extra, b + i * PANEL, coupling, p + j * PANEL, SIZE, token)
 
 
 @kernel
-def condense_rows(target, rows, panels, others, other_panels, symmetric, first, top, size, token):
+def condense_rows(target, rows, panels, others, other_panels, symmetric, first, top, token):
     """``target`` = minus the products of border rows and others, in tiles, or the lower half of these; both are zero
     above the station ``top``."""
-    zero, panel = fill(0.0, target, token), 3 * size
+    zero = fill(0.0, target, token)
     for i in range(panels):
         for j in range(i + 1 if symmetric else other_panels):
             t = 9 * (i * other_panels + j)
             for k in range(9):
                 store(target, t + k, zero)
             for station in range(first, top + 1):
-                a, b = (station * panels + i) * panel, (station * other_panels + j) * panel
-                subtract_product(target, t, rows, a, others, b, size, token)
+                a, b = (station * panels + i) * PANEL, (station * other_panels + j) * PANEL
+                subtract_product(target, t, rows, a, others, b, SIZE, token)
 
 
 @kernel
-def combine_border(border, weight, values, first, stations, size, panels, token):
-    """``values`` = sum_i weight_i L^-1 b_i over the border rows b_i, after all stations >= ``first`` are eliminated."""
+def combine_border(border, weight, values, first, stations, panels, active, token):
+    """``values`` = sum_i weight_i L^-1 b_i over the border rows b_i, after all stations >= ``first`` are eliminated.
+
+    ``active``: panels that are not zero, of every station.
+    """
     for station in range(first, stations):
-        for k in range(size):
+        for k in range(SIZE):
             value = fill(0.0, border, token)
-            for i in range(panels):
-                t = ((station * panels + i) * size + k) * 3
+            for i in range(active[station]):
+                t = ((station * panels + i) * SIZE + k) * 3
                 value = fma(load(weight, 3 * i, token), load(border, t, token), value)
                 value = fma(load(weight, 3 * i + 1, token), load(border, t + 1, token), value)
                 value = fma(load(weight, 3 * i + 2, token), load(border, t + 2, token), value)
-            store(values, station * size + k, value)
+            store(values, station * SIZE + k, value)
 
 
 @kernel
-def _subtract_rows(block, t, values, source, target, tiles, size, token):
-    """Subtract three columns of a block, from tile row ``t`` on, times three values from the values below."""
-    x, y, z = load3(values, source, token)
-    for i in range(tiles):
-        for r in range(3):
-            k, row = t + 3 * i * size + r, target + 3 * i + r
-            value = fnma(load(block, k, token), x, load(values, row, token))
-            value = fnma(load(block, k + 3, token), y, value)
-            store(values, row, fnma(load(block, k + 6, token), z, value))
-
-
-@kernel
-def substitute_forward(pivot, coupling, values, first, stations, tiles, token):
-    """Solve L x = y in place."""
-    size = 3 * tiles
-    for station in range(stations - 1, first - 1, -1):
-        s, p = station * size, station * size * size
-        for k in range(tiles):
-            row, t = s + 3 * k, p + 3 * (k * size + 3 * k)
-            x = load(values, row, token) * load(pivot, t, token)
-            y = fnma(load(pivot, t + 1, token), x, load(values, row + 1, token)) * load(pivot, t + 4, token)
-            z = fnma(load(pivot, t + 2, token), x, load(values, row + 2, token))
-            z = fnma(load(pivot, t + 5, token), y, z) * load(pivot, t + 8, token)
-            store(values, row, x, y, z)
-            _subtract_rows(pivot, t + 3 * size, values, row, row + 3, tiles - k - 1, size, token)
-            if station > first:
-                _subtract_rows(coupling, p + 9 * k, values, row, s - size, tiles, size, token)
-
-
-@kernel
-def _subtract_columns(block, t, values, source, target, tiles, size, token):
+def _subtract_columns(block, t, values, source, target, tiles, token):
     """Subtract the transpose of three columns of a block, from tile row ``t`` on, times the values below from three
     values."""
     x, y, z = load3(values, target, token)
     for i in range(tiles):
         for r in range(3):
-            k, value = t + 3 * i * size + r, load(values, source + 3 * i + r, token)
+            k, value = t + i * PANEL + r, load(values, source + 3 * i + r, token)
             x = fnma(load(block, k, token), value, x)
             y = fnma(load(block, k + 3, token), value, y)
             z = fnma(load(block, k + 6, token), value, z)
@@ -189,17 +167,16 @@ def _subtract_columns(block, t, values, source, target, tiles, size, token):
 
 
 @kernel
-def substitute_back(pivot, coupling, values, first, stations, tiles, token):
+def substitute_back(pivot, coupling, values, first, stations, token):
     """Solve L' x = y in place."""
-    size = 3 * tiles
     for station in range(first, stations):
-        s, p = station * size, station * size * size
-        for k in range(tiles - 1, -1, -1):
-            row, t = s + 3 * k, p + 3 * (k * size + 3 * k)
+        s, p = station * SIZE, station * BLOCK
+        for k in range(TILES - 1, -1, -1):
+            row, t = s + 3 * k, p + k * PANEL + 9 * k
             if station > first:
-                x, y, z = _subtract_columns(coupling, p + 9 * k, values, s - size, row, tiles, size, token)
+                x, y, z = _subtract_columns(coupling, p + 9 * k, values, s - SIZE, row, TILES, token)
                 store(values, row, x, y, z)
-            x, y, z = _subtract_columns(pivot, t + 3 * size, values, row + 3, row, tiles - k - 1, size, token)
+            x, y, z = _subtract_columns(pivot, t + PANEL, values, row + 3, row, TILES - k - 1, token)
             z = z * load(pivot, t + 8, token)
             y = fnma(load(pivot, t + 5, token), z, y) * load(pivot, t + 4, token)
             x = fnma(load(pivot, t + 2, token), z, fnma(load(pivot, t + 1, token), y, x)) * load(pivot, t, token)

@@ -11,7 +11,6 @@ import math
 from rfdropo_bayes.fem.constraints import APART
 from rfdropo_bayes.fem.integrators import REBOUND
 from rfdropo_bayes.fem.native.contact_records import CORNERS
-from rfdropo_bayes.fem.native.fields import weighted
 from rfdropo_bayes.fem.native.simd import (
     any_greater,
     fill,
@@ -25,6 +24,8 @@ from rfdropo_bayes.fem.native.simd import (
     store,
     where_greater,
 )
+from rfdropo_bayes.fem.native.sphere_maps import centre_of, centre_velocity, place_offset, row_entry
+from rfdropo_bayes.fem.native.vectors import dot
 
 ALARM = 0.005
 """[m] Surfaces nearer than this, and as much more as they move in two steps, are looked at for contacts."""
@@ -114,10 +115,9 @@ def _within(gap, reach, token):
 def _place_spheres(scene, touch, position, velocity, time_step, token):
     """The spheres' centres, and how far they may reach."""
     for sphere in range(scene.spheres):
-        first, last = scene.first[sphere], scene.within[sphere]
-        x, y, z = weighted(scene.place, scene.centre, first, last, position, token)
+        x, y, z = centre_of(scene, scene.arm, touch, sphere, position, token)
         store(touch.middle, 3 * sphere, x, y, z)
-        u, v, w = weighted(scene.place, scene.centre, first, last, velocity, token)
+        u, v, w = centre_velocity(scene, scene.arm, touch, sphere, velocity, token)
         store(touch.reach, sphere, 2.0 * time_step * _length(u, v, w) + ALARM)
 
 
@@ -179,25 +179,6 @@ def _box_distance(touch, x, y, z, token):
 
 
 @kernel
-def _place_offset(scene, touch, slot, sphere, position, token):
-    """Where the sphere touches, from its centre in the body at rest: -radius F^-1 n with the deformation gradient F."""
-    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
-    a, b, c, d, e, f, g, h, i = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for k in range(scene.first[sphere], scene.first[sphere + 1]):
-        x, y, z = load3(position, scene.place[k], token)
-        u, v, w = scene.gradient[3 * k], scene.gradient[3 * k + 1], scene.gradient[3 * k + 2]
-        a, b, c = fma(x, u, a), fma(x, v, b), fma(x, w, c)
-        d, e, f = fma(y, u, d), fma(y, v, e), fma(y, w, f)
-        g, h, i = fma(z, u, g), fma(z, v, h), fma(z, w, i)
-    ca, cb, cc = fnma(f, h, e * i), fnma(d, i, f * g), fnma(e, g, d * h)
-    scale = (-scene.radius[sphere] * one) / _dot(a, b, c, ca, cb, cc)
-    x, y, z = load3(touch.frame, 9 * slot, token)
-    store(touch.offset, 3 * slot, scale * _dot(ca, fnma(b, i, c * h), fnma(c, e, b * f), x, y, z))
-    store(touch.offset, 3 * slot + 1, scale * _dot(cb, fnma(c, g, a * i), fnma(a, f, c * d), x, y, z))
-    store(touch.offset, 3 * slot + 2, scale * _dot(cc, fnma(a, h, b * g), fnma(b, d, a * e), x, y, z))
-
-
-@kernel
 def _list_pushing(scene, touch, position, slot, reach, token):
     """The spheres that are near the cube in any lane; returns the next free slot."""
     (cx, cy, cz), outer = load3(touch.cube, 0, token), HALF_DIAGONAL * load(touch.values, 1, token)
@@ -213,7 +194,7 @@ def _list_pushing(scene, touch, position, slot, reach, token):
             # The contact lies on the cube, below the sphere's centre.
             x, y, z = fnma(distance, nx, x), fnma(distance, ny, y), fnma(distance, nz, z)
             _list(touch, slot, CORNERS + sphere, _within(gap, near, token), x, y, z, nx, ny, nz, token)
-            _place_offset(scene, touch, slot, sphere, position, token)
+            place_offset(scene, scene.arm, touch, slot, sphere, position, token)
             slot += 1
     return slot
 
@@ -229,7 +210,7 @@ def _list_lying(scene, touch, position, slot, token):
         if any_greater(near, gap):
             pair, gap = CORNERS + scene.spheres + sphere, _within(gap, near, token)
             _list(touch, slot, pair, gap, zero, zero, zero, nx, ny, nz, token)
-            _place_offset(scene, touch, slot, sphere, position, token)
+            place_offset(scene, scene.arm, touch, slot, sphere, position, token)
             slot += 1
     return slot
 
@@ -238,15 +219,6 @@ def _list_lying(scene, touch, position, slot, token):
 def sphere_of(scene, pair):
     """The sphere of a pair that has one."""
     return (pair - CORNERS) % scene.spheres
-
-
-@kernel
-def weights(scene, touch, slot, k, token):
-    """Weights of a sphere's entry in the normal row of a candidate and in its tangents."""
-    centre, one = scene.centre[k], fill(1.0, touch.cube, token)
-    x, y, z = load3(touch.offset, 3 * slot, token)
-    around = fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2]))
-    return centre * one, around + centre
 
 
 @kernel
@@ -269,19 +241,16 @@ def kind_of(touch, slot):
 def trunk_velocity(scene, touch, slot, kind, field, token):
     """What a velocity field of the body adds to a candidate's relative velocity."""
     zero = fill(0.0, touch.cube, token)
-    u, v, w, x, y, z = zero, zero, zero, zero, zero, zero
+    u, v, w = zero, zero, zero
     if kind == 0:
-        return zero, zero, zero
+        return u, v, w
     sphere = sphere_of(scene, touch.pair[slot])
     for k in range(scene.first[sphere], scene.first[sphere + 1]):
-        centre, around = weights(scene, touch, slot, k, token)
-        a, b, c = load3(field, scene.place[k], token)
-        u, v, w = fma(a, centre, u), fma(b, centre, v), fma(c, centre, w)
-        x, y, z = fma(a, around, x), fma(b, around, y), fma(c, around, z)
-    nx, ny, nz = load3(touch.frame, 9 * slot, token)
-    sx, sy, sz = load3(touch.frame, 9 * slot + 3, token)
-    tx, ty, tz = load3(touch.frame, 9 * slot + 6, token)
-    return _dot(nx, ny, nz, u, v, w), _dot(sx, sy, sz, x, y, z), _dot(tx, ty, tz, x, y, z)
+        value = load3(field, scene.place[k], token)
+        u = u + dot(row_entry(scene, scene.arm, touch, slot, k, 0, token), value)
+        v = v + dot(row_entry(scene, scene.arm, touch, slot, k, 1, token), value)
+        w = w + dot(row_entry(scene, scene.arm, touch, slot, k, 2, token), value)
+    return u, v, w
 
 
 @kernel

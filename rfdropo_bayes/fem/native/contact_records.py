@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.native.rod_tables import SIZE, entries_of
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.pushing import PushGeometry
 
@@ -20,16 +21,18 @@ MISSED = {"float64": 1e-9, "float32": 1e-5}
 
 
 class ContactScene(NamedTuple):
-    """What can touch; sphere s is bound to the rows ``place[k]`` of a field, k in ``first[s]:first[s + 1]``.
+    """What can touch; sphere s is bound to the rows ``place[k]`` of a body's velocities, k in ``first[s]:first[s + 1]``;
+    see ``sphere_maps``.
 
-    Its centre is bound to those before ``within[s]`` only.
+    The centre of a mesh's sphere is bound to those before ``within[s]`` only.
     """
 
     first: Int[np.ndarray, " spheres_1"]
     within: Int[np.ndarray, " spheres"]
     place: Int[np.ndarray, " entries"]
     centre: Float[np.ndarray, " entries"]
-    gradient: Float[np.ndarray, "entries 3"]
+    gradient: Float[np.ndarray, "entries 3"] | None  # of a mesh
+    arm: Float[np.ndarray, "entries 3"] | None  # of a rod, in the section's frame [m]
     radius: Float[np.ndarray, " spheres"]  # [m]
     up: Float[np.ndarray, "3"]  # unit vector out of the plate
     height: float  # of the plate along it [m]
@@ -71,7 +74,8 @@ class ContactRecords(NamedTuple):
     gap: Float[np.ndarray, "pairs lanes"]  # of a candidate: distance less the contact distance [m]
     frame: Float[np.ndarray, "pairs9 lanes"]  # rows: normal, two tangents
     arm: Float[np.ndarray, "pairs3 lanes"]  # from the cube's centre to the contact [m]
-    offset: Float[np.ndarray, "pairs3 lanes"]  # from the sphere's centre to its surface, in the body at rest [m]
+    offset: Float[np.ndarray, "pairs3 lanes"]  # from the sphere's centre to its surface [m], see ``sphere_maps``
+    lever: Float[np.ndarray, "entries3 lanes"]  # arms of a rod's spheres in space [m]
     chosen: Float[np.ndarray, "pairs lanes"]  # 1 for a lane's contacts
     on_cube: Float[np.ndarray, "pairs18 lanes"]  # of a contact: relative velocity by the cube's twist
     pair: Int[np.ndarray, " pairs"]  # that a candidate is
@@ -84,13 +88,13 @@ def pairs_of(spheres: int) -> int:
     return CORNERS + 2 * spheres
 
 
-def touch_storage(spheres: int, lanes: int, dtype: type) -> ContactRecords:
+def touch_storage(scene: ContactScene, lanes: int, dtype: type) -> ContactRecords:
     """Zeroed, aligned storage of one lane block."""
-    pairs = pairs_of(spheres)
+    spheres, pairs = scene.spheres, pairs_of(scene.spheres)
     sizes = {
         "cube": CUBE_STATE, "values": CUBE_VALUES, "memory": 3 * pairs, "turn": 9, "twist": 6, "after": 6, "carried": 6,
         "middle": 3 * spheres, "reach": spheres, "rate": 3 * pairs, "gap": pairs, "frame": 9 * pairs,
-        "arm": 3 * pairs, "offset": 3 * pairs,
+        "arm": 3 * pairs, "offset": 3 * pairs, "lever": 3 * len(scene.place),
         "chosen": pairs, "on_cube": 18 * pairs,
     }  # fmt: skip
     arrays = {name: aligned_zeros((size, lanes), dtype) for name, size in sizes.items()}
@@ -98,24 +102,22 @@ def touch_storage(spheres: int, lanes: int, dtype: type) -> ContactRecords:
     return ContactRecords(**arrays, pair=numbers[0], contact=numbers[1], count=numbers[2])
 
 
-def scene_tables(
-    scene: PushGeometry, shape: Float[np.ndarray, "nodes nodes"], number: Int[np.ndarray, " nodes"], dtype: type
-) -> ContactScene:
-    """Tables of a scene.
+def rod_scene(scene: PushGeometry, dtype: type) -> ContactScene:
+    """Tables of a scene whose spheres are bound to the sections of a rod."""
+    first, station, weight, arm = entries_of(scene.spheres.centre)
+    place = np.stack([SIZE * station, SIZE * station + 3], axis=1).ravel()
+    return _scene(scene, 2 * first, 2 * first[1:], place, np.repeat(weight, 2), None, np.repeat(arm, 2, axis=0), dtype)
 
-    Args:
-        shape: values of the modes of a section at its nodes; 1 for a body without sections.
-        number: of every node in the engine's order.
-    """
-    spheres, section = scene.spheres, len(shape)
+
+def mesh_scene(scene: PushGeometry, number: Int[np.ndarray, " nodes"], dtype: type) -> ContactScene:
+    """Tables of a scene whose spheres are bound to the nodes of a mesh; ``number``: of every node in the engine's
+    order."""
+    spheres = scene.spheres
     weight = np.concatenate([spheres.centre[..., None], spheres.gradient], axis=2)
     first, within, place, values = [0], [], [], []
     for nodes, weights in zip(number[spheres.node], weight, strict=True):
-        total: dict[int, np.ndarray] = {}
-        for node, share in zip(nodes, weights, strict=True):
-            station, member = divmod(int(node), section)
-            total[station] = total.get(station, np.zeros((section, 4))) + shape[member][:, None] * share
-        entries = [(station * section + k, row) for station in sorted(total) for k, row in enumerate(total[station])]
+        order = np.argsort(nodes, kind="stable")
+        entries = list(zip(nodes[order], weights[order], strict=True))
         central = [(k, row) for k, row in entries if abs(row[0]) > NOTHING]
         others = [(k, row) for k, row in entries if abs(row[0]) <= NOTHING < np.abs(row).max()]
         place.extend(3 * k for k, _ in central + others)
@@ -123,17 +125,36 @@ def scene_tables(
         within.append(first[-1] + len(central))
         first.append(len(place))
     table = np.array(values, dtype=dtype).reshape(-1, 4)
+    return _scene(
+        scene, np.array(first), np.array(within), np.array(place), table[:, 0], table[:, 1:], None, dtype
+    )  # fmt: skip
+
+
+def _scene(
+    scene: PushGeometry,
+    first: np.ndarray,
+    within: np.ndarray,
+    place: np.ndarray,
+    centre: np.ndarray,
+    gradient: np.ndarray | None,
+    arm: np.ndarray | None,
+    dtype: type,
+) -> ContactScene:
+    def floats(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else np.ascontiguousarray(values, dtype=dtype)
+
     return ContactScene(
-        first=np.array(first, dtype=np.int64),
-        within=np.array(within, dtype=np.int64),
-        place=np.array(place, dtype=np.int64),
-        centre=np.ascontiguousarray(table[:, 0]),
-        gradient=np.ascontiguousarray(table[:, 1:]),
-        radius=np.asarray(spheres.radius, dtype=dtype),
+        first=first.astype(np.int64),
+        within=within.astype(np.int64),
+        place=place.astype(np.int64),
+        centre=np.ascontiguousarray(centre, dtype=dtype),
+        gradient=floats(gradient),
+        arm=floats(arm),
+        radius=np.asarray(scene.spheres.radius, dtype=dtype),
         up=np.asarray(scene.plate_normal, dtype=dtype),
         height=float(scene.plate_height),
         distance=float(scene.contact_distance),
-        spheres=len(spheres.radius),
+        spheres=len(scene.spheres.radius),
     )
 
 

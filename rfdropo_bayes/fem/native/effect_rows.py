@@ -1,4 +1,4 @@
-"""Effects of the body as the rows of numbers that the kernels of ``layered_effects`` read."""
+"""Effects of the body as the rows of numbers that the kernels of ``rod_effects`` read."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from rfdropo_bayes.fem.bending_law import relative_curvature, section_areas
 from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.integrators import Stage
-from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.native import layered_effects as at
+from rfdropo_bayes.fem.native import rod_effects as at
+from rfdropo_bayes.fem.native.rod_tables import section_areas
+from rfdropo_bayes.fem.rod import Rod
 from rfdropo_bayes.fem.section_loads import SectionLoads
 
 
@@ -30,9 +30,11 @@ def _decay(time: float, rate: float) -> float:
 def effect_rows(
     effects: BodyEffects, count: int, stages: Sequence[Stage], time_step: float
 ) -> Float[np.ndarray, "batch rows"]:
-    """Numbers of the effects beside the bending law, null where there are none."""
+    """Numbers of the effects beside the bending of sections, null where there are none."""
     rows, length = np.zeros((count, at.EFFECTS)), stages[0].length * time_step
     rows[:, at.DECAY : at.LATER_DECAY + 1] = 1.0
+    if effects.bending is not None:
+        rows[:, at.FIBRE] = effects.bending.fibre
     if effects.viscoelasticity is not None:
         fraction, time = (np.asarray(value, float) for value in effects.viscoelasticity)
         rows[:, at.SHARE] = length / (time + length)
@@ -57,26 +59,26 @@ def effect_rows(
 
 def law_rows(
     effects: BodyEffects,
-    body: LayeredBody,
+    body: Rod,
     young_modulus: Float[np.ndarray, " batch"],
     shear_modulus: Float[np.ndarray, " batch"],
-    layer_scale: Float[np.ndarray, "batch layers"],
-) -> Float[np.ndarray, "batch layer_rows"]:
-    """The bending law of every layer; see ``fem.bending_law.moments``."""
+    scale: Float[np.ndarray, "batch elements"],
+) -> Float[np.ndarray, "batch element_rows"]:
+    """What the bending law adds to the stiffness of every element over its length; see ``fem.bending_law``."""
     law = effects.bending
-    rows = np.zeros((*layer_scale.shape, at.LAW))
+    rows = np.zeros((*scale.shape, at.LAW))
     if law is None:
         return rows.reshape(len(rows), -1)
     modulus = np.stack([young_modulus, young_modulus, shear_modulus], axis=1)
-    stiffness = layer_scale[:, :, None] * section_areas(body) * modulus[:, None, :]
-    root = np.sqrt(stiffness)
-    stiffening, anisotropy, cross, twist_x, twist_y = (np.broadcast_to(value, len(rows))[:, None] for value in law)
+    root = np.sqrt(scale[:, :, None] * section_areas(body)[:, 2:] * modulus[:, None, :])
+    anisotropy, cross, twist_x, twist_y = (
+        np.broadcast_to(value, len(rows))[:, None]
+        for value in (law.anisotropy, law.cross_plane, law.twist_x, law.twist_y)
+    )
     about_x, about_y = (_each(math.expm1, sign * anisotropy[:, 0], len(rows))[:, None] for sign in (-0.5, 0.5))
     entries = ((0, 0, about_x), (0, 1, cross), (0, 2, twist_x), (1, 1, about_y), (1, 2, twist_y))
     for k, (i, j, value) in enumerate(entries):
         rows[:, :, k] = value * root[:, :, i] * root[:, :, j]
-    rows[:, :, 6:8] = stiffness[:, :, :2]
-    rows[:, :, 8] = stiffening * relative_curvature(body) / (root[:, :, 0] * root[:, :, 1])
     return rows.reshape(len(rows), -1)
 
 

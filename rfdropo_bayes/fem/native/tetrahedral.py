@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.corotational import POLAR_ITERATIONS
+from rfdropo_bayes.fem.tetrahedra import POLAR_ITERATIONS
 from rfdropo_bayes.fem.native.simd import (
     fill,
     fma,

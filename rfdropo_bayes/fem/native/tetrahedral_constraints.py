@@ -17,7 +17,6 @@ from rfdropo_bayes.fem.native.contact_geometry import (
     list_contacts,
     sphere_of,
     trunk_velocity,
-    weights,
 )
 from rfdropo_bayes.fem.native.cube_motion import (
     add_cube,
@@ -28,7 +27,9 @@ from rfdropo_bayes.fem.native.cube_motion import (
     take_cube_stage,
 )
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store, where_greater
+from rfdropo_bayes.fem.native.sphere_maps import row_entry
+from rfdropo_bayes.fem.native.vectors import add_to, added, scaled
 
 
 @kernel
@@ -50,15 +51,10 @@ def _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, fre
             if node >= free:
                 continue
             reached[node] = 1
-            centre, around = weights(scene, touch, slot, k, token)
             t = 9 * (panels * node + c - touch.count[3])
             for r in range(3):
-                share = centre if r == 0 else around
-                for j in range(3):
-                    value = fma(
-                        share, load(touch.frame, 9 * slot + 3 * r + j, token), load(rows.border, t + 3 * r + j, token)
-                    )
-                    store(rows.border, t + 3 * r + j, value)
+                entry = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                add_to(rows.border, t + 3 * r, entry, token)
 
 
 @kernel
@@ -175,14 +171,10 @@ def add_forces(pattern, scene, touch, work, p, cables, contacts, free, token):
             node = scene.place[k] // 3
             if node >= free:
                 continue
-            centre, around = weights(scene, touch, slot, k, token)
             t = 9 * (pattern.first[node + 1] - pattern.border)
-            for j in range(3):
-                value = load(work.lower, t + j, token)
-                for r in range(3):
-                    impulse = load(p.impulse, cables + 3 * c + r, token) * (centre if r == 0 else around)
-                    value = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), value)
-                store(work.lower, t + j, value)
+            for r in range(3):
+                push = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                add_to(work.lower, t, scaled(push, load(p.impulse, cables + 3 * c + r, token)), token)
 
 
 @kernel
@@ -196,13 +188,12 @@ def _add_impacts(scene, touch, work, p, cables, contacts, free, token):
             row = scene.place[k]
             if row >= 3 * free:
                 continue
-            centre, around = weights(scene, touch, slot, k, token)
+            total = load3(work.sudden, row, token)
+            for r in range(3):
+                push = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                total = added(push, load(p.before, cables + 3 * c + r, token), total)
             for j in range(3):
-                value = load(work.sudden, row + j, token)
-                for r in range(3):
-                    impulse = load(p.before, cables + 3 * c + r, token) * (centre if r == 0 else around)
-                    value = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), value)
-                store(work.sudden, row + j, where_greater(taken, zero, value, zero))
+                store(work.sudden, row + j, where_greater(taken, zero, total[j], zero))
 
 
 @kernel

@@ -11,10 +11,9 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cable_drive import DriveLimits
-from rfdropo_bayes.fem.cables import CableLayout, routes
-from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
+from rfdropo_bayes.fem.dynamics import LOST
 from rfdropo_bayes.fem.integrators import Integrator, timed_stages
-from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.mesh_points import NodeCables, NodePoints, routes
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, ConstraintProblem, problem_storage
@@ -22,18 +21,18 @@ from rfdropo_bayes.fem.native.contact_records import (
     ContactRecords,
     PushOutput,
     cube_rows,
+    mesh_scene,
     pairs_of,
-    scene_tables,
     touch_storage,
 )
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
-from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
-from rfdropo_bayes.fem.native.layered_engine import in_blocks
+from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
+from rfdropo_bayes.fem.tetrahedra import POISSON_LIMIT, TetrahedralBody
 from rfdropo_bayes.runtime import available_processors
 
 
@@ -50,9 +49,9 @@ class TetrahedralEngine:
     def __init__(
         self,
         body: TetrahedralBody,
-        cables: CableLayout,
+        cables: NodeCables,
         limits: DriveLimits,
-        points: PointMap,
+        points: NodePoints,
         *,
         dtype: type = np.float64,
         threads: int | None = None,
@@ -74,7 +73,7 @@ class TetrahedralEngine:
         self._cables = _cables(cables, limits, body, self._number, self.dtype)
         self._nodes = np.ascontiguousarray(self._number[points.node], dtype=np.int32)
         self._weights = np.ascontiguousarray(points.weight, dtype=self.dtype)
-        self._scene = None if scene is None else scene_tables(scene, np.ones((1, 1)), self._number, self.dtype.type)
+        self._scene = None if scene is None else mesh_scene(scene, self._number, self.dtype.type)
 
     def rollouts(
         self,
@@ -89,7 +88,7 @@ class TetrahedralEngine:
 
         ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
         (nodes) [kg], ``rayleigh_mass`` [1/s], ``rayleigh_stiffness`` [s], ``gravity`` (3) [m/s2], and optionally
-        ``stiffness_scale`` (elements). ``cube`` as in ``NativeLayered.rollout``.
+        ``stiffness_scale`` (elements). ``cube`` as in ``NativeRod.rollout``.
 
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
@@ -147,7 +146,7 @@ class TetrahedralEngine:
             spheres = self._scene.spheres
         pairs = pairs_of(spheres) if spheres else 0
         return (
-            touch_storage(spheres, self.lanes, kind) if spheres else None,
+            touch_storage(self._scene, self.lanes, kind) if self._scene is not None else None,
             row_storage(3 * free, 2 * spheres, self._pattern.border, self.lanes, kind),
             problem_storage(cables, pairs, self.lanes, kind),
             np.zeros(free, dtype=np.int64),
@@ -249,7 +248,7 @@ def _mesh(
 
 
 def _cables(
-    layout: CableLayout, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
+    layout: NodeCables, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
 ) -> kernels.Cables:
     first, node, weight = [0], [], []
     legs = [np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes(layout, body.rest)]

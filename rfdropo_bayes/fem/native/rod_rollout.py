@@ -1,4 +1,4 @@
-"""Rollouts of a layered body: one lane block from its parameters to the recorded motion, or on from where it stands."""
+"""Rollouts of a rod: one lane block from its parameters to the recorded motion, or on from where it stands."""
 
 from __future__ import annotations
 
@@ -9,31 +9,36 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from rfdropo_bayes.fem.integrators import EULER, Stage
+from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL
 from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.kernel_cache import named_by
-from rfdropo_bayes.fem.native.layered_assembly import follow_branch, layer_frame
-from rfdropo_bayes.fem.native.layered_constraints import constrained_stage
-from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED
-from rfdropo_bayes.fem.native.layered_records import Factors, LayeredSamples, LayeredWork
-from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
-from rfdropo_bayes.fem.native.layered_step import set_factors, solve_statics
-from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
+from rfdropo_bayes.fem.native.rod_assembly import measure_element
+from rfdropo_bayes.fem.native.rod_constraints import constrained_stage
+from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED, follow_branch
+from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
+from rfdropo_bayes.fem.native.rod_statics import come_to_rest, keep_found, measure_imbalance, put_at_rest
+from rfdropo_bayes.fem.native.rod_step import predict_stations, set_factors
+from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
-from rfdropo_bayes.fem.native.slip_rows import start_slip
+from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
+
+
+ROW_ITERATIONS = 30
+"""Of a row of a quasi-static motion, at most."""
 
 
 class Batch(NamedTuple):
     """Parameters and commands of a batch in the precision of the kernels, one row a rollout; commands may be one
     row for all."""
 
-    moduli: Float[np.ndarray, "batch 3"]
+    moduli: Float[np.ndarray, "batch 2"]
     density: Float[np.ndarray, "batch 1"]
     damping: Float[np.ndarray, "batch 2"]
     gravity: Float[np.ndarray, "batch 3"]
-    layer_scale: Float[np.ndarray, "batch layers"]
+    scale: Float[np.ndarray, "batch elements"]
     point_mass: Float[np.ndarray, "batch stations"]
-    law: Float[np.ndarray, "batch layer_rows"]
+    law: Float[np.ndarray, "batch element_rows"]
     effects: Float[np.ndarray, "batch rows"]
     present: Int[np.ndarray, " flags"]
     start: Float[np.ndarray, "rows cables"]  # displacements before the first step, those of the initial equilibrium
@@ -47,18 +52,21 @@ class Batch(NamedTuple):
     loads_pitch: int
 
 
-class LayeredOutput(NamedTuple):
+class RodOutput(NamedTuple):
     """What a batch returns; recorded row 0 is the initial state."""
 
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
-    converged: UInt8[np.ndarray, " batch"]  # 0 where the impulses of a step were not found
+    converged: UInt8[
+        np.ndarray, " batch"
+    ]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
     imbalance: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium
+    solves: Float[np.ndarray, " batch"]  # of the equilibria of all rows
     records: int
 
 
-class LayeredSchedule(NamedTuple):
+class RodSchedule(NamedTuple):
     """How a rollout runs."""
 
     time_step: float
@@ -68,84 +76,70 @@ class LayeredSchedule(NamedTuple):
     settled: float  # relative change of the velocities that ends the iterations of a step
     softness: float  # of the cables, relative to W
     missed: float  # [m/s] velocity at which surfaces may meet that were not taken to
-    refinements: int  # of every stage's linear solution
+    at_start: float  # largest increment over the body's length, and turn [rad], of the initial equilibrium
+    at_rest: float  # and of a row at rest
     count: int = 1  # stages of a step
     stages: tuple[Stage, Stage] = (EULER, EULER)  # in seconds; the first ``count`` of them
-    resumed: int = 0  # 1 goes on from the state in ``LayeredWork`` instead of starting anew
+    still: int = 0  # 1 for a quasi-static motion: a step is a row at rest
+    resumed: int = 0  # 1 goes on from the state in ``RodWork`` instead of starting anew
 
 
-def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[LayeredSamples, Factors, LayeredWork]:
+def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Factors, RodWork]:
     """Zeroed, aligned storage of one lane block."""
-    modes, stations, cables = tables.modes, tables.stations, tables.cables
-    size, panels, layers = 3 * modes, border_panels(cables), stations - 1
+    stations, cables, panels = tables.stations, tables.cables, tables.panels
+    elements, guides = stations - 1, len(tables.guide_first) - 1
 
     def rows(**sizes: int) -> dict[str, np.ndarray]:
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
-    values, section = stations * size, 2 * size
-    web = 2 * modes // 3 + 1  # panels of the modes of a layer and of a lever
+    values = stations * SIZE
     samples = rows(
-        moduli=3, density=1, layer_scale=layers, point_mass=stations, stiffness=layers * tables.entries,
-        station_mass=tables.station_mass.size, layer_mass=tables.layer_mass.size, gravity=3, damping=2,
-        law=LAW * layers, effects=EFFECTS,
+        moduli=2, density=1, scale=elements, point_mass=stations, section=SECTION * elements, gravity=3, damping=2,
+        law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
     work = rows(
-        position=values, velocity=values, pivot=values * size, coupling=values * size, border=3 * panels * values,
-        condensed=9 * panels * panels, solution=values, field=values, correction=values, weight=3 * panels,
-        axes=9 * layers, dyads=54, local=section, reaction=section, pull=3 * (len(tables.guide_first) - 1),
-        slack=cables, tension=cables, commanded=cables, points=3 * tables.points, before=values, sudden=values,
-        beyond=3 * layers, held=layers, string=2 * layers * cables, ways=3 * web * cables,
-        pulled=3 * web * cables, web=9 * web**2, branch=layers * section, slope=6 * layers,
-        around=3 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
-        firmness=1, loss=1, pushed=3 * stations, given=max(3 * stations, 3),
+        turn=4 * stations, frame=FRAME * stations, velocity=values, pivot=BLOCK * stations, coupling=BLOCK * stations,
+        border=PANEL * panels * stations, condensed=9 * panels**2, solution=values, field=values, weight=3 * panels,
+        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
+        commanded=cables, unsolved=1, accepted=1, lost=1, failed=1, points=3 * tables.points, before=values,
+        sudden=values, way=values, change=values, went=values, older=values, earlier=values, moving=1, solves=1, imbalance=1, softness=1, firmness=1, loss=1,
+        pushed=3 * stations, given=3 * stations, branch=values,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
-    return LayeredSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, LayeredWork(**work)
+    return RodSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, RodWork(**work)
 
 
 @kernel
 def _prepare(tables, samples, token):
-    """Stiffness and mass of a block's rollouts."""
-    for layer in range(tables.stations - 1):
-        scale = load(samples.layer_scale, layer, token)
-        lame, shear = scale * load(samples.moduli, 0, token), scale * load(samples.moduli, 1, token)
-        condensed = scale * load(samples.moduli, 2, token)
-        for e in range(layer * tables.entries, (layer + 1) * tables.entries):
-            value = shear * tables.stiffness[3 * e + 1]
-            value = fma(lame, fill(tables.stiffness[3 * e], lame, token), value)
-            store(samples.stiffness, e, fma(condensed, fill(tables.stiffness[3 * e + 2], lame, token), value))
-    density = load(samples.density, 0, token)
-    for station in range(tables.stations):
-        lumped = load(samples.point_mass, station, token)
-        for p in range(tables.pairs):
-            value = density * tables.station_mass[station * tables.pairs + p]
-            value = fma(lumped, fill(tables.lumped[p], lumped, token), value)
-            store(samples.station_mass, station * tables.pairs + p, value)
-    for p in range((tables.stations - 1) * tables.coupled):
-        store(samples.layer_mass, p, density * tables.layer_mass[p])
+    """Stiffness of the sections of a block's rollouts."""
+    young, shear = load(samples.moduli, 0, token), load(samples.moduli, 1, token)
+    for element in range(tables.stations - 1):
+        scale, e = load(samples.scale, element, token), SECTION * element
+        for i in range(SECTION):
+            modulus = scale * (shear if i == 0 or i == SECTION - 1 else young)
+            store(samples.section, e + i, modulus * tables.area[e + i])
 
 
 @kernel
 def start_rollouts(tables, batch, samples, work, first, token):
     """Parameters of a block's rollouts; at rest, without tension."""
-    count, values = batch.count, 3 * tables.modes * tables.stations
-    fill_lanes(batch.moduli, 3, 0, 3, first, count, samples.moduli, token)
+    count, values, nothing = batch.count, SIZE * tables.stations, fill(0.0, work.frame, token)
+    fill_lanes(batch.moduli, 2, 0, 2, first, count, samples.moduli, token)
     fill_lanes(batch.density, 1, 0, 1, first, count, samples.density, token)
     fill_lanes(batch.damping, 2, 0, 2, first, count, samples.damping, token)
     fill_lanes(batch.gravity, 3, 0, 3, first, count, samples.gravity, token)
-    layers = tables.stations - 1
-    fill_lanes(batch.layer_scale, layers, 0, layers, first, count, samples.layer_scale, token)
-    fill_lanes(batch.point_mass, layers + 1, 0, layers + 1, first, count, samples.point_mass, token)
-    fill_lanes(batch.law, LAW * layers, 0, LAW * layers, first, count, samples.law, token)
+    elements = tables.stations - 1
+    fill_lanes(batch.scale, elements, 0, elements, first, count, samples.scale, token)
+    fill_lanes(batch.point_mass, elements + 1, 0, elements + 1, first, count, samples.point_mass, token)
+    fill_lanes(batch.law, LAW * elements, 0, LAW * elements, first, count, samples.law, token)
     fill_lanes(batch.effects, EFFECTS, 0, EFFECTS, first, count, samples.effects, token)
     for flag in range(FLAGS):
         samples.present[flag] = batch.present[flag]
     _prepare(tables, samples, token)
-    for row in range(values):
-        store(work.position, row, fill(tables.rest[row], work.position, token))
+    put_at_rest(tables, nothing, work, token)
     clear(work.tension, 0, tables.cables, token)
     clear(work.velocity, 0, values, token)
-    clear(work.branch, 0, 6 * tables.modes * layers, token)
+    clear(work.branch, 0, values, token)
     clear(work.solution, 0, values, token)
     clear(work.lost, 0, 1, token)
     clear(work.failed, 0, 1, token)
@@ -185,10 +179,10 @@ def _relax_branches(tables, samples, factors, work, token):
 
 @kernel
 def _follow_branches(tables, factors, work, token):
-    """Let the dashpots of all layers follow the strain."""
-    for layer in range(tables.stations - 1):
-        layer_frame(tables, layer, work, token)
-        follow_branch(tables, factors, layer, work, token)
+    """Let the dashpots of all elements follow the strain."""
+    for element in range(tables.stations - 1):
+        measure_element(tables, element, work, token)
+        follow_branch(factors, element, work, token)
 
 
 @kernel
@@ -217,9 +211,7 @@ def begin_stage(tables, batch, samples, factors, work, touch, schedule, step, nu
     if samples.present[BRANCH]:
         _follow_branches(tables, factors, work, token)
     if stage.predicted:
-        for row in range(3 * tables.modes * tables.stations):
-            ahead = fma(load(work.velocity, row, token), stage.elapsed, load(work.position, row, token))
-            store(work.position, row, ahead)
+        predict_stations(tables, stage.elapsed, work, token)
         if touch is not None:
             predict_cubes(touch, stage.elapsed, token)
 
@@ -229,7 +221,7 @@ def record_body(tables, work, output, row, first, count, token):
     """Write points and tensions of the lanes that belong to the batch."""
     points, cables, lanes = tables.points, tables.cables, len(token)
     for p in range(points):
-        x, y, z = point(tables.point_first, tables.point_place, tables.point_weight, p, work.position, token)
+        x, y, z = point(tables.point_first, tables.point_place, tables.point_weight, p, work.frame, token)
         store(work.points, 3 * p, x, y, z)
     for lane in range(min(lanes, count - first)):
         at = (first + lane) * output.records + row
@@ -246,23 +238,36 @@ def finish_rollouts(work, output, first, count, token):
         output.diverged[first + lane] = 1 if work.lost[lane] > 0.0 else 0
         output.converged[first + lane] = 0 if work.failed[lane] > 0.0 else 1
         output.imbalance[first + lane] = work.imbalance[lane]
+        output.solves[first + lane] = work.solves[lane]
 
 
 @kernel
-def settle(tables, batch, samples, factors, work, p, schedule, first, token):
+def settle(tables, runs, batch, samples, factors, work, friction, rows, p, schedule, first, token):
     """Parameters and initial state of a block's rollouts: as given, or in equilibrium; none where they go on."""
-    if schedule.resumed:
-        return
     start_rollouts(tables, batch, samples, work, first, token)
     take_loads(batch, samples, work, 0, first, token)
     fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
     if schedule.static_iterations > 0:
-        start_settling(tables, samples, factors, work, token)
-        for _ in range(schedule.static_iterations):
-            solve_statics(tables, samples, factors, work, p, schedule, token)
-            take_increment(tables, work, token)
-        finish_settling(tables, samples, factors, work, token)
+        most, bound = schedule.static_iterations, schedule.at_start
+        come_to_rest(tables, runs, samples, factors, work, friction, rows, p, 0, most, bound, schedule, token)
+        measure_imbalance(tables, samples, factors, work, token)
+        keep_found(tables, work, True, token)
     _relax_branches(tables, samples, factors, work, token)
+    if runs is not None:
+        start_slip(tables, runs, friction, work, token)
+
+
+@kernel
+def take_row(tables, runs, batch, samples, factors, work, friction, rows, p, schedule, step, first, token):
+    """One row of a quasi-static motion: the equilibrium at its commands, found from the one before."""
+    slips = 0
+    if runs is not None:
+        slips = kinds_present(samples)[0] * runs.count
+    take_loads(batch, samples, work, step + 1, first, token)
+    _take_commands(tables, batch, work, step, 1.0, first, token)
+    most, bound = ROW_ITERATIONS, schedule.at_rest
+    come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token)
+    keep_found(tables, work, False, token)
 
 
 @kernel
@@ -295,15 +300,19 @@ def compile_rollout(sources: str) -> Callable:
         slips = None if runs is None else addresses(friction)
         around = None if scene is None else addresses(scene)
         meeting = None if scene is None else addresses(touch)
-        settle(body, given, material, factor, state, p, schedule, first, token)
-        if runs is not None and not schedule.resumed:
-            start_slip(body, rubbing, slips, state, token)
+        if not schedule.resumed:
+            settle(body, rubbing, given, material, factor, state, slips, extra, p, schedule, first, token)
         if scene is not None and not schedule.resumed:
             start_cubes(around, addresses(cubes), given.count, meeting, first, token)
         shown = None if scene is None else addresses(poses)
+        clear(state.solves, 0, 1, token)
         step = 0
         while begin_step(body, given, state, meeting, schedule, record, shown, step, first, token):
-            for number in range(schedule.count):
+            if schedule.still:
+                take_row(
+                    body, rubbing, given, material, factor, state, slips, extra, p, schedule, step, first, token
+                )  # fmt: skip
+            for number in range(0 if schedule.still else schedule.count):
                 begin_stage(body, given, material, factor, state, meeting, schedule, step, number, first, token)
                 constrained_stage(
                     body, rubbing, around, material, factor, state, slips, meeting, extra, p, schedule, number, token

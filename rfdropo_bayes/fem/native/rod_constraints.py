@@ -1,4 +1,4 @@
-"""A stage of a layered body in SIMD lanes with everything that holds it: cables, slip at their guides, and contacts.
+"""A stage of a rod in SIMD lanes with everything that holds it: cables, slip at their guides, and contacts.
 
 Slip and contacts are further border rows of the factor that the step has already. What is None is not there.
 """
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
+from rfdropo_bayes.fem.native.chain_cholesky import PANEL, condense_rows, extend_border
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.contact_geometry import (
     add_missed,
@@ -18,7 +18,6 @@ from rfdropo_bayes.fem.native.contact_geometry import (
     find_candidates,
     list_contacts,
     sphere_of,
-    weights,
 )
 from rfdropo_bayes.fem.native.cube_motion import (
     add_cube,
@@ -29,9 +28,8 @@ from rfdropo_bayes.fem.native.cube_motion import (
     take_cube_stage,
 )
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.layered_step import (
+from rfdropo_bayes.fem.native.rod_step import (
     condense_increment,
-    refine_increment,
     set_factors,
     start_problem,
     substitute_increment,
@@ -40,8 +38,18 @@ from rfdropo_bayes.fem.native.layered_step import (
     weigh_border,
     weigh_rows,
 )
+from rfdropo_bayes.fem.native.rod_tables import SIZE
 from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, fma, kernel, load, store, where_greater
-from rfdropo_bayes.fem.native.slip_rows import add_friction, gather_slip, kinds_present, remember_slip, sum_losses
+from rfdropo_bayes.fem.native.slip_rows import (
+    gather_slip,
+    kinds_present,
+    remember_slip,
+    start_sliding,
+    sum_losses,
+    weigh_guides,
+)
+from rfdropo_bayes.fem.native.sphere_maps import row_entry
+from rfdropo_bayes.fem.native.vectors import added
 
 
 class Rows(NamedTuple):
@@ -60,40 +68,37 @@ def row_storage(station_values: int, panels: int, others: int, lanes: int, dtype
 
 
 @kernel
-def _contact_panel(scene, touch, slot, border, panel, panels, size, token):
+def _contact_panel(scene, touch, slot, border, panel, panels, token):
     """Border rows of a contact of the trunk."""
     sphere = sphere_of(scene, touch.pair[slot])
     for k in range(scene.first[sphere], scene.first[sphere + 1]):
-        centre, around = weights(scene, touch, slot, k, token)
-        row = scene.place[k]
-        t = ((row // size * panels + panel) * size + row % size) * 3
-        for i in range(3):
-            for r in range(3):
-                share = centre if r == 0 else around
-                value = load(touch.frame, 9 * slot + 3 * r + i, token)
-                store(border, t + 3 * i + r, fma(share, value, load(border, t + 3 * i + r, token)))
+        place = scene.place[k]
+        t = ((place // SIZE * panels + panel) * SIZE + place % SIZE) * 3
+        for r in range(3):
+            entry = row_entry(scene, scene.arm, touch, slot, k, r, token)
+            for i in range(3):
+                store(border, t + 3 * i + r, load(border, t + 3 * i + r, token) + entry[i])
 
 
 @kernel
-def _top_station(scene, touch, contacts, size):
+def _top_station(scene, touch, contacts):
     """The topmost station that a contact reaches."""
     top = 0
     for c in range(touch.count[3], contacts):
         sphere = sphere_of(scene, touch.pair[touch.contact[c]])
-        top = max(top, scene.place[scene.first[sphere + 1] - 1] // size)
+        top = max(top, scene.place[scene.first[sphere + 1] - 1] // SIZE)
     return top
 
 
 @kernel
-def _gather_contacts(tables, scene, touch, rows, p, lines, contacts, first, panels, token):
+def _gather_contacts(scene, touch, rows, p, lines, contacts, first, panels, token):
     """Border rows of the contacts from panel ``first`` on, and what the body's velocity adds to the problem."""
-    size = 3 * tables.modes
     for c in range(contacts):
         slot, i = touch.contact[c], lines + 3 * c
         for r in range(3):
             store(p.free, i + r, load(touch.rate, 3 * slot + r, token))
         if c >= touch.count[3]:
-            _contact_panel(scene, touch, slot, rows.border, first + c - touch.count[3], panels, size, token)
+            _contact_panel(scene, touch, slot, rows.border, first + c - touch.count[3], panels, token)
 
 
 @kernel
@@ -108,11 +113,11 @@ def _row_of(i, slips, corners, lines, cables):
 @kernel
 def _condense(tables, rows, work, p, n, panels, slips, corners, top, token):
     """Add the extra rows to the problem: their products with each other, the cables and the right-hand side."""
-    held, size, cables, others = tables.held, 3 * tables.modes, tables.cables, (tables.cables + 3) // 3
+    held, cables, others = tables.held, tables.cables, tables.panels
     lines = cables + slips
-    extend_border(work.pivot, work.coupling, rows.border, held, top, tables.modes, panels, token)
-    condense_rows(rows.own, rows.border, panels, rows.border, panels, True, held, top, size, token)
-    condense_rows(rows.across, rows.border, panels, work.border, others, False, held, top, size, token)
+    extend_border(work.pivot, work.coupling, rows.border, held, top, panels, token)
+    condense_rows(rows.own, rows.border, panels, rows.border, panels, True, held, top, token)
+    condense_rows(rows.across, rows.border, panels, work.border, others, False, held, top, token)
     for i in range(3 * panels):
         row = _row_of(i, slips, corners, lines, cables)
         if row < 0:
@@ -120,7 +125,8 @@ def _condense(tables, rows, work, p, n, panels, slips, corners, top, token):
         t = 9 * (i // 3 * others) + i % 3
         store(p.free, row, load(p.free, row, token) - load(rows.across, t, token))
         for c in range(cables):
-            value = load(rows.across, t + 9 * ((c + 1) // 3) + 3 * ((c + 1) % 3), token)
+            beside = tables.row[c]
+            value = load(rows.across, t + 9 * (beside // 3) + 3 * (beside % 3), token)
             store(p.matrix, row * n + c, value)
             store(p.matrix, c * n + row, value)
         for j in range(i + 1):
@@ -132,26 +138,26 @@ def _condense(tables, rows, work, p, n, panels, slips, corners, top, token):
 
 
 @kernel
-def _hold(
+def hold(
     tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, length, schedule, token
 ):  # fmt: skip
-    """Impulses of all constraints, and the solution of the stage with them."""
-    cables, size = tables.cables, 3 * tables.modes
+    """Impulses of all constraints, and the solution of the stage with them; friction goes on from ``trial``."""
+    cables = tables.cables
     lines, slip_panels, corners, top = cables + slips, (slips + 2) // 3, 0, 0
     n, rate = lines + 3 * contacts, 1.0 / length
     clear(p.matrix, 0, n * n, token)
     start_problem(tables, factors, work, p, n, rate, token)
     if scene is not None:
-        corners, top = touch.count[3], _top_station(scene, touch, contacts, size)
+        corners, top = touch.count[3], _top_station(scene, touch, contacts)
     panels = slip_panels + contacts - corners
     if runs is not None:
         top = tables.stations - 1
     if runs is not None or scene is not None:
-        clear(rows.border, 0, 3 * (top + 1) * panels * size if panels > 0 else 0, token)
-        if runs is not None:
+        clear(rows.border, 0, (top + 1) * panels * PANEL if panels > 0 else 0, token)
+        if runs is not None and slips > 0:
             gather_slip(tables, runs, samples, factors, friction, rows.border, panels, p, work, length, token)
         if scene is not None:
-            _gather_contacts(tables, scene, touch, rows, p, lines, contacts, slip_panels, panels, token)
+            _gather_contacts(scene, touch, rows, p, lines, contacts, slip_panels, panels, token)
         if panels > 0:
             _condense(tables, rows, work, p, n, panels, slips, corners, top, token)
         if scene is not None:
@@ -159,7 +165,7 @@ def _hold(
             add_cube(touch, p, lines, contacts, length, wide, narrow, token)
     soften(p, cables, slips, contacts, length, schedule.softness, token)
     solve_problem(p, cables, slips, contacts, schedule.settled, schedule.stages[0].predicted, token)
-    weigh_border(cables, work, p, token)
+    weigh_border(tables, work, p, token)
     weigh_rows(tables, work, token)
     if panels > 0:
         _add_rows(tables, rows, work, p, panels, slips, corners, top, token)
@@ -169,34 +175,34 @@ def _hold(
 @kernel
 def _add_rows(tables, rows, work, p, panels, slips, corners, top, token):
     """Add the impulses of the extra rows to what the back substitution starts from."""
-    size, cables = 3 * tables.modes, tables.cables
+    cables = tables.cables
     for station in range(tables.held, top + 1):
-        for c in range(size):
-            value = load(work.solution, station * size + c, token)
+        for c in range(SIZE):
+            value = load(work.solution, station * SIZE + c, token)
             for i in range(3 * panels):
                 row = _row_of(i, slips, corners, cables + slips, cables)
                 if row >= 0:
-                    t = ((station * panels + i // 3) * size + c) * 3 + i % 3
+                    t = ((station * panels + i // 3) * SIZE + c) * 3 + i % 3
                     value = fma(load(p.impulse, row, token), load(rows.border, t, token), value)
-            store(work.solution, station * size + c, value)
+            store(work.solution, station * SIZE + c, value)
 
 
 @kernel
 def _add_forces(scene, touch, impulses, lines, contacts, accepted, field, token):
     """Add the contacts' impulses to a field, in the lanes that are accepted."""
+    zero = fill(0.0, field, token)
     for c in range(touch.count[3], contacts):
         slot, i = touch.contact[c], lines + 3 * c
         sphere = sphere_of(scene, touch.pair[slot])
         for k in range(scene.first[sphere], scene.first[sphere + 1]):
-            centre, around = weights(scene, touch, slot, k, token)
+            push = zero, zero, zero
+            for r in range(3):
+                entry = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                push = added(entry, load(impulses, i + r, token), push)
             for j in range(3):
-                push = fill(0.0, field, token)
-                for r in range(3):
-                    impulse = load(impulses, i + r, token) * (centre if r == 0 else around)
-                    push = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), push)
                 row = scene.place[k] + j
                 old = load(field, row, token)
-                store(field, row, where_greater(accepted, fill(0.0, field, token), old + push, old))
+                store(field, row, where_greater(accepted, zero, old + push[j], old))
 
 
 @kernel
@@ -205,7 +211,7 @@ def _carry_contacts(tables, scene, touch, work, p, lines, contacts, later, token
     find_impacts(touch, p, lines, contacts, token)
     carry_cube(touch, p, lines, contacts, later, work.accepted, token)
     if later > 0.0:
-        clear(work.sudden, 0, 3 * tables.modes * tables.stations, token)
+        clear(work.sudden, 0, SIZE * tables.stations, token)
         accepted = load(work.accepted, 0, token)
         _add_forces(scene, touch, p.before, lines, contacts, accepted, work.sudden, token)
 
@@ -216,7 +222,7 @@ def constrained_stage(tables, runs, scene, samples, factors, work, friction, tou
     stage, slips, contacts, cables = schedule.stages[number], 0, 0, tables.cables
     length, later = stage.length, schedule.stages[number + 1].carried if number + 1 < schedule.count else 0.0
     if scene is not None:
-        wide = find_candidates(scene, work.position, work.velocity, touch, stage, token)
+        wide = find_candidates(scene, work.frame, work.velocity, touch, stage, token)
         if stage.carried > 0.0:
             set_factors(samples, factors, work, stage, wide, token)
         going, narrow = load(factors.going, 0, token), load(factors.narrow, 0, token)
@@ -224,29 +230,23 @@ def constrained_stage(tables, runs, scene, samples, factors, work, friction, tou
     condense_increment(tables, samples, factors, work, stage, token)
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
+        start_sliding(friction, slips, token)
+        weigh_guides(runs, samples, friction, work.direction, token)
     again = True
     while again:
         again = False
         if scene is not None:
             contacts = list_contacts(touch, token)
-        _hold(
+        hold(
             tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, length, schedule,
             token,
         )  # fmt: skip
         if scene is not None:
             stop_cube(touch, p, cables + slips, contacts, token)
             again = add_missed(scene, touch, work.solution, length, narrow, schedule.missed, token)
-    take_tensions(cables, factors, work, 1.0 / length, token)
+    take_tensions(tables, factors, work, 1.0 / length, token)
     if runs is not None:
         sum_losses(tables, runs, samples, friction, p, token)
-    if schedule.refinements > 0:
-        if runs is not None:
-            add_friction(tables, friction, work.field, token)
-        if scene is not None:
-            one = fill(1.0, work.field, token)
-            _add_forces(scene, touch, p.impulse, cables + slips, contacts, one, work.field, token)
-    for _ in range(schedule.refinements):
-        refine_increment(tables, samples, factors, work, token)
     take_stage(tables, factors, work, stage, token)
     if runs is not None:
         remember_slip(tables, factors, friction, p, work, slips, length, later, token)

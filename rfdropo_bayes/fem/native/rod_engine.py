@@ -1,4 +1,4 @@
-"""The compiled engine for layered bodies: rollouts of a whole batch on CPUs, the same numbers as ``fem.rollouts``.
+"""The compiled engine for rods: rollouts of a whole batch on CPUs, the same numbers as ``fem.rollouts``.
 
 Samples fill the lanes of vector registers, blocks of lanes are spread over threads. Lanes never mix and a block knows
 nothing of the others: a rollout's result does not depend on its batch, on its place in it or on the number of threads.
@@ -6,22 +6,18 @@ nothing of the others: a rollout's result does not depend on its batch, on its p
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import count as counting
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
+from rfdropo_bayes.fem.dynamics import Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.integrators import STAGES, Integrator, timed_stages
-from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, ConstraintProblem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import (
     MISSED,
@@ -30,35 +26,41 @@ from rfdropo_bayes.fem.native.contact_records import (
     PushOutput,
     cube_rows,
     pairs_of,
-    scene_tables,
+    rod_scene,
     touch_storage,
 )
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows, load_rows
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
-from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
-from rfdropo_bayes.fem.native.layered_effects import LOADED
-from rfdropo_bayes.fem.native.layered_records import (
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
+from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
+from rfdropo_bayes.fem.native.rod_effects import LOADED
+from rfdropo_bayes.fem.native.rod_records import (
     KINDS,
     Factors,
     Friction,
-    LayeredSamples,
-    LayeredWork,
+    RodSamples,
+    RodWork,
     friction_storage,
     runs_of,
 )
-from rfdropo_bayes.fem.native.layered_rollout import Batch, LayeredOutput, LayeredSchedule, compile_rollout, storage
-from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
+from rfdropo_bayes.fem.native.rod_rollout import Batch, RodOutput, RodSchedule, compile_rollout, storage
+from rfdropo_bayes.fem.native.rod_tables import SIZE, rod_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
+from rfdropo_bayes.fem.rod import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads
 from rfdropo_bayes.runtime import available_processors
 
 Precision = Literal["float64", "float32"]
-# When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
-# refinements of every step's linear solution.
+AT_REST = {"float64": (1e-9, 1e-6), "float32": (1e-5, 1e-5)}
+"""Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest: at the start,
+and in a row of a quasi-static motion. What is left is a tenth of it at most: iterations converge faster and faster."""
+
+# When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
+# resolves them.
 _NUMERICS = {
-    name: (SETTLED[name], SOFTNESS[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))
+    name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")
 }
 
 
@@ -67,8 +69,8 @@ class Run(NamedTuple):
 
     batch: Batch
     cubes: Cubes | None
-    schedule: LayeredSchedule
-    output: LayeredOutput | None = None
+    schedule: RodSchedule
+    output: RodOutput | None = None
     poses: PushOutput | None = None
 
     @property
@@ -78,7 +80,8 @@ class Run(NamedTuple):
         assert output is not None
         pose = None if self.poses is None else self.poses.pose
         diverged = output.diverged.view(bool) | ~self.commanded
-        return Motion(output.position, output.tension, diverged, output.imbalance, output.converged.view(bool), pose)
+        solved = output.converged.view(bool)
+        return Motion(output.position, output.tension, diverged, output.imbalance, solved, pose, solves=output.solves)
 
     @property
     def commanded(self) -> Bool[np.ndarray, " batch"]:
@@ -94,9 +97,9 @@ class Run(NamedTuple):
 class Records(NamedTuple):
     """What a lane block works on; None where cables do not rub, and where there is no cube."""
 
-    samples: LayeredSamples
+    samples: RodSamples
     factors: Factors
-    work: LayeredWork
+    work: RodWork
     friction: Friction | None
     touch: ContactRecords | None
     rows: Rows
@@ -106,11 +109,11 @@ class Records(NamedTuple):
 @cache
 def _kernel() -> Callable:
     """The rollout kernel."""
-    return compile_rollout(kernel_sources("layered_rollout"))
+    return compile_rollout(kernel_sources("rod_rollout"))
 
 
-class NativeLayered:
-    """Rollouts of one layered body with its cables.
+class NativeRod:
+    """Rollouts of one rod with its cables.
 
     Args:
         system: body, cables, and how many stations are held.
@@ -120,10 +123,11 @@ class NativeLayered:
         threads: lane blocks computed at the same time; None for all processors this process may use.
         lanes: samples side by side; None for as many as a vector register holds.
         scene: what the body pushes a cube on; None for a body that touches nothing.
-        integrator: how a step is taken.
+        integrator: how a step is taken; with "quasi-static" every step is a row at rest, and the time step is not
+            used.
 
     Raises:
-        InputError: unknown precision, or a number of threads or lanes that makes no sense.
+        InputError: unknown precision, a number of threads or lanes that makes no sense, or a scene at rest.
     """
 
     def __init__(
@@ -146,11 +150,13 @@ class NativeLayered:
         self.precision, self.dtype = precision, np.dtype(precision)
         self.threads = threads or available_processors()
         self.lanes = lanes or native_lanes(self.dtype)
-        self.points = len(points.node)
-        self.tables = layered_tables(system, points, self.dtype.type)
+        self.points = len(points.station)
+        self.tables = rod_tables(system, points, self.dtype.type)
         self._runs = runs_of(system.cables)
-        numbers, shape = np.arange(system.body.nodes), np.asarray(self.tables.shape, dtype=float)
-        self._scene = None if scene is None else scene_tables(scene, shape, numbers, self.dtype.type)
+        self._steps: Integrator = "euler" if integrator == "quasi-static" else integrator
+        if scene is not None and integrator == "quasi-static":
+            raise InputError("a body that touches a cube and is always at rest", remedy="use another integrator")
+        self._scene = None if scene is None else rod_scene(scene, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
 
@@ -198,12 +204,12 @@ class NativeLayered:
             tables, made = self.tables, (self.lanes, self.dtype.type)
             runs = KINDS * self._runs.count if rubs else 0
             pairs = 0 if self._scene is None else pairs_of(self._scene.spheres)
-            beside, border = (runs + 2) // 3 + pairs, border_panels(tables.cables)
+            beside = (runs + 2) // 3 + pairs
             kept[rubs] = Records(
                 *storage(tables, *made),
                 friction_storage(self._runs, *made) if rubs else None,
-                None if self._scene is None else touch_storage(self._scene.spheres, *made),
-                row_storage(3 * tables.stations * tables.modes, beside, border, *made),
+                None if self._scene is None else touch_storage(self._scene, *made),
+                row_storage(SIZE * tables.stations, beside, tables.panels, *made),
                 problem_storage(tables.cables + runs, pairs, *made),
             )
         return kept[rubs]
@@ -234,9 +240,10 @@ class NativeLayered:
         begin = np.zeros(cables) if given is None else np.asarray(given, dtype=float)
         if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
             raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
-        moves = displacement.reshape(-1, displacement.shape[-2] * cables)
+        moves = displacement[None] if displacement.ndim == 2 else displacement
+        moves = moves.reshape(len(moves), moves.shape[1] * cables)
         pushed, place = load_rows(loads)
-        batch = self._batch(material, {"start": begin.reshape(-1, cables), "displacement": moves, "loads": pushed})
+        batch = self._batch(material, {"start": np.atleast_2d(begin), "displacement": moves, "loads": pushed})
         if loads is not None:
             present = batch.present.copy()
             present[LOADED] = 1
@@ -246,18 +253,20 @@ class NativeLayered:
             raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
         cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
         settling = 0 if start is None else ITERATIONS
-        stages = timed_stages(self.integrator, self.time_step)
-        schedule = LayeredSchedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision], *stages)
+        still, stages = self.integrator == "quasi-static", timed_stages(self._steps, self.time_step)
+        numbers = _NUMERICS[self.precision]
+        schedule = RodSchedule(self.time_step, steps, int(stride), settling, *numbers, *stages, int(still))
         return self.with_output(Run(batch, cubes, schedule))
 
     def with_output(self, run: Run) -> Run:
         """The same run with room for what it records."""
         count, records = run.batch.count, 1 + run.schedule.steps // run.schedule.stride
-        output = LayeredOutput(
+        output = RodOutput(
             np.zeros((count, records, self.points, 3)),
             np.zeros((count, records, self.tables.cables)),
             np.zeros(count, dtype=np.uint8),
             np.zeros(count, dtype=np.uint8),
+            np.zeros(count),
             np.zeros(count),
             records,
         )
@@ -266,8 +275,8 @@ class NativeLayered:
 
     def _batch(self, material: Material, commands: dict[str, np.ndarray]) -> Batch:
         """Parameters and commands in the precision of the kernels."""
-        layers = self.tables.stations - 1
-        width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
+        elements = self.tables.stations - 1
+        width = {"gravity": (3,), "stiffness_scale": (elements,), "point_mass": (elements + 1,)}
         given, effects = material._asdict(), material.effects
         del given["effects"]
         values = {name: np.asarray(value, dtype=float) for name, value in given.items()}
@@ -282,43 +291,20 @@ class NativeLayered:
             if value.shape not in (shape, (1, *shape), (count, *shape)):
                 raise InputError(f"{name} has shape {value.shape}, expected {(count, *shape)}", where="material")
             rows[name] = np.broadcast_to(value, (count, *shape))
-        modulus, ratio = rows["young_modulus"], np.minimum(rows["poisson_ratio"], POISSON_LIMIT)
-        shear = modulus / (2.0 * (1.0 + ratio))
-        lame = 2.0 * shear * ratio / (1.0 - 2.0 * ratio)
-        first = modulus if self.system.body.sectional else lame
+        modulus = rows["young_modulus"]
+        shear = modulus / (2.0 * (1.0 + rows["poisson_ratio"]))
         arrays = {
-            "moduli": np.stack([first, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
+            "moduli": np.stack([modulus, shear], axis=1),
             "density": rows["density"][:, None],
             "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
             "gravity": rows["gravity"],
-            "layer_scale": rows["stiffness_scale"],
+            "scale": rows["stiffness_scale"],
             "point_mass": rows["point_mass"],
             "law": law_rows(effects, self.system.body, modulus, shear, rows["stiffness_scale"]),
-            "effects": effect_rows(effects, count, STAGES[self.integrator], self.time_step),
+            "effects": effect_rows(effects, count, STAGES[self._steps], self.time_step),
             **commands,
         }
         arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in commands.items()}
         nowhere = np.zeros(1, dtype=np.int64)
         return Batch(**arrays, present=effect_flags(effects), place=nowhere, places=0, count=count, **pitches)
-
-
-@cache
-def _workers(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads that wait for lane blocks; a forked ``process`` has none of its parent's."""
-    return ThreadPoolExecutor(threads, f"lanes_{process}")
-
-
-def in_blocks(block: Callable[[int], None], count: int, lanes: int, threads: int) -> None:
-    """Call for the first rollout of every lane block, in this thread or in several."""
-    threads = min(threads, -(-count // lanes))
-    following = counting(0, lanes)
-
-    def work() -> None:
-        while (first := next(following)) < count:
-            block(first)
-
-    waiting = [_workers(threads - 1, os.getpid()).submit(work) for _ in range(threads - 1)]
-    work()
-    for other in waiting:
-        other.result()

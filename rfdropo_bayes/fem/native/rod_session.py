@@ -1,4 +1,4 @@
-"""Sessions of a layered body: lanes that keep their state between calls, so that a body goes on where it stood.
+"""Sessions of a rod: lanes that keep their state between calls, so that a body goes on where it stood.
 
 A session runs the kernel of whole rollouts, on blocks of lanes whose parameters and state are its own; scratch belongs
 to the threads. Steps taken in several calls give the same bits as in one.
@@ -19,21 +19,22 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
 from rfdropo_bayes.fem.native.effect_rows import load_rows
-from rfdropo_bayes.fem.native.layered_effects import LOADED
-from rfdropo_bayes.fem.native.layered_engine import NativeLayered, Records, Run, in_blocks
-from rfdropo_bayes.fem.native.layered_records import LayeredSamples
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
+from rfdropo_bayes.fem.native.rod_effects import LOADED
+from rfdropo_bayes.fem.native.rod_engine import NativeRod, Records, Run
+from rfdropo_bayes.fem.native.rod_records import RodSamples
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads
 
 KEPT = {
-    "samples": tuple(name for name in LayeredSamples._fields if name != "present"),
-    "work": ("position", "velocity", "tension", "commanded", "branch", "softness", "lost", "failed", "imbalance"),
+    "samples": tuple(name for name in RodSamples._fields if name != "present"),
+    "work": ("turn", "frame", "velocity", "tension", "commanded", "branch", "softness", "lost", "failed", "imbalance"),
     "friction": ("mobilised", "segment"),
     "touch": ("cube", "values", "memory"),
 }
 """Fields of the kernels' records that outlive a step."""
-GIVEN = ("moduli", "density", "damping", "gravity", "layer_scale", "point_mass", "law", "effects", "start", "loads")
+GIVEN = ("moduli", "density", "damping", "gravity", "scale", "point_mass", "law", "effects", "start", "loads")
 """Fields of a batch that an initial state depends on."""
 PITCHED = ("start", "loads")
 """Those of them of which one row may serve all."""
@@ -64,8 +65,8 @@ def _places(records: Records) -> list[_Place]:
     return places
 
 
-class LayeredSession:
-    """Lanes of one layered body, each with its own parameters and its own time.
+class RodSession:
+    """Lanes of one rod, each with its own parameters and its own time.
 
     Args:
         engine: that computes rollouts of the body.
@@ -78,7 +79,7 @@ class LayeredSession:
         InputError: fewer than one lane.
     """
 
-    def __init__(self, engine: NativeLayered, count: int) -> None:
+    def __init__(self, engine: NativeRod, count: int) -> None:
         if count < 1:
             raise InputError(f"{count} lanes", remedy="use at least one")
         self.engine, self.count = engine, int(count)
@@ -106,8 +107,8 @@ class LayeredSession:
             material: fields with one entry per row.
             start: cable displacements [m] whose static equilibrium is the initial state; None starts undeformed. An
                 equilibrium that was found before is not computed again.
-            before: as in `NativeLayered.rollout`.
-            cube: of an engine with a scene, as in `NativeLayered.rollout`.
+            before: as in `NativeRod.rollout`.
+            cube: of an engine with a scene, as in `NativeRod.rollout`.
             loads: that act on the initial state, in one row. Lanes are always given some, or never.
 
         Returns:

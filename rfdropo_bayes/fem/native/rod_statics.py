@@ -1,0 +1,273 @@
+"""Static equilibrium of a rod in SIMD lanes: where a rollout starts, and every row of a quasi-static motion.
+
+Newton's method without geometric stiffness, neither of the rod nor of its cables, whose parts nearly cancel; what they
+leave is made up for by mixing iterations. A lane that has come to rest is not moved again: how long others take changes
+nothing of it.
+"""
+
+from __future__ import annotations
+
+from rfdropo_bayes.fem.equilibrium import LONGEST_STEP
+from rfdropo_bayes.fem.integrators import EULER
+from rfdropo_bayes.fem.native.chain_cholesky import PANEL
+from rfdropo_bayes.fem.native.fields import clear
+from rfdropo_bayes.fem.native.rod_assembly import add_element_force, add_station_loads, measure_element
+from rfdropo_bayes.fem.native.rod_constraints import hold
+from rfdropo_bayes.fem.native.rod_effects import GIVE, SURROUNDED, add_surroundings
+from rfdropo_bayes.fem.native.rod_step import condense_increment, gather_cables, move_stations, near, place_directors
+from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
+from rfdropo_bayes.fem.native.simd import (
+    any_greater,
+    fill,
+    fnma,
+    kernel,
+    load,
+    magnitude,
+    store,
+    where_greater,
+)
+from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_row, sum_losses
+
+UNBOUNDED = 1e30
+"""Relative force out of balance of a lane whose equilibrium was lost."""
+LARGEST_TURN = 0.5
+"""[rad] No section turns further in an iteration."""
+DISTINCT = 1e-6
+"""Squared sine of the least angle between two changes of the increment that count as two."""
+TINY = 1e-30
+"""Squared changes of the increment below this are none [m2]."""
+
+
+@kernel
+def _product(tables, a, b, token):
+    """Product of two changes of all stations; turns count by the length of the body."""
+    total, square = fill(0.0, a, token), tables.total * tables.total
+    for station in range(tables.held, tables.stations):
+        for i in range(SIZE):
+            row = SIZE * station + i
+            product = load(a, row, token) * load(b, row, token)
+            total = total + (product if i < 3 else product * square)
+    return total
+
+
+@kernel
+def _largest(tables, first, field, token):
+    """Largest displacement, or turn with ``first`` = 3, of any station along an axis."""
+    zero = fill(0.0, field, token)
+    largest = zero
+    for station in range(tables.held, tables.stations):
+        for i in range(first, first + 3):
+            value = magnitude(load(field, SIZE * station + i, token), zero)
+            largest = where_greater(value, largest, value, largest)
+    return largest
+
+
+@kernel
+def _remember(tables, work, token):
+    """Turn ``before``, the increment of the iteration before, into its change, and keep the two last changes, and the
+    ways that made them."""
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        store(work.older, row, load(work.change, row, token))
+        store(work.earlier, row, load(work.went, row, token))
+        store(work.change, row, load(work.solution, row, token) - load(work.before, row, token))
+        store(work.went, row, load(work.way, row, token))
+        store(work.before, row, load(work.solution, row, token))
+
+
+@kernel
+def _mixing(tables, work, number, token):
+    """Shares of the last two changes of the increment that cancel it best."""
+    zero, one, tiny = fill(0.0, work.frame, token), fill(1.0, work.frame, token), fill(TINY, work.frame, token)
+    first, along = _product(tables, work.change, work.change, token), _product(tables, work.change, work.solution, token)
+    alone = along / where_greater(first, tiny, first, one)
+    alone = where_greater(first, tiny, alone, zero)
+    if number < 2:
+        return alone, zero
+    second, beside = _product(tables, work.older, work.older, token), _product(tables, work.older, work.solution, token)
+    mixed = _product(tables, work.change, work.older, token)
+    area = fnma(mixed, mixed, first * second)
+    apart = where_greater(area, DISTINCT * first * second, one, zero)
+    apart = where_greater(area, tiny, apart, zero)
+    inverse = one / where_greater(apart, zero, area, one)
+    a, b = fnma(beside, mixed, along * second) * inverse, fnma(along, mixed, beside * first) * inverse
+    return where_greater(apart, zero, a, alone), where_greater(apart, zero, b, zero)
+
+
+@kernel
+def _choose_way(tables, work, number, token):
+    """Turn ``solution`` into the way that an iteration goes; returns the largest increment.
+
+    Anderson's mixing (1965, J. ACM 12:547) with the last two iterations, limited in length.
+    """
+    one, turning = fill(1.0, work.frame, token), fill(tables.total, work.frame, token)
+    size, turn = _largest(tables, 0, work.solution, token), turning * _largest(tables, 3, work.solution, token)
+    size = where_greater(size, turn, size, turn)
+    if number > 0:
+        _remember(tables, work, token)
+        a, b = _mixing(tables, work, number, token)
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        way = load(work.solution, row, token)
+        if number > 0:
+            way = fnma(a, load(work.went, row, token) + load(work.change, row, token), way)
+            way = fnma(b, load(work.earlier, row, token) + load(work.older, row, token), way)
+        else:
+            store(work.before, row, way)
+        store(work.way, row, way)
+    far, wide = _largest(tables, 0, work.way, token), _largest(tables, 3, work.way, token)
+    longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), fill(LARGEST_TURN, work.frame, token)
+    share = where_greater(far, longest, longest / far, one)
+    share = where_greater(share * wide, widest, widest / wide, share)
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        store(work.way, row, share * load(work.way, row, token))
+        store(work.solution, row, load(work.way, row, token))
+    return size
+
+
+@kernel
+def _take_tensions(tables, work, moving, token):
+    """Tensions [N] from the impulses in ``weight``, in the lanes that move."""
+    zero = fill(0.0, work.tension, token)
+    for c in range(tables.cables):
+        tension = -load(work.weight, tables.row[c], token)
+        store(work.tension, c, where_greater(moving, zero, tension, load(work.tension, c, token)))
+
+
+@kernel
+def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, number, bound, schedule, token):
+    """One iteration of the lanes that move; those whose increment was small stop."""
+    zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
+    unsolved = load(work.unsolved, 0, token)
+    condense_increment(tables, samples, factors, work, EULER, token)
+    if runs is not None and slips > 0:
+        slide(tables, runs, friction, slips, work, token)
+    hold(
+        tables, runs, None, samples, factors, work, friction, None, rows, p, slips, 0, 1.0, schedule, token
+    )  # fmt: skip
+    store(work.unsolved, 0, where_greater(moving, zero, load(work.unsolved, 0, token), unsolved))
+    _take_tensions(tables, work, moving, token)
+    left = _choose_way(tables, work, number, token)
+    if runs is not None and slips > 0:
+        sum_losses(tables, runs, samples, friction, p, token)
+        keep_row(tables, factors, friction, p, work, slips, moving, token)
+    move_stations(tables, moving, work, token)
+    store(work.solves, 0, load(work.solves, 0, token) + moving)
+    small = fill(bound * tables.total, work.frame, token)
+    store(work.moving, 0, where_greater(left, small, moving, zero))
+
+
+@kernel
+def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
+    """Find the equilibrium from where the body is, in at most so many iterations, to a largest increment relative to
+    the body's length."""
+    zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
+    _start_settling(tables, samples, factors, work, token)
+    store(work.moving, 0, one)
+    if runs is not None and slips > 0:
+        gather_cables(tables, work, one, False, token)
+        start_row(tables, runs, samples, friction, work, token)
+    for number in range(most):
+        _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, number, bound, schedule, token)
+        if not any_greater(load(work.moving, 0, token), zero):
+            break
+    if runs is not None:
+        end_row(friction, slips, token)
+
+
+@kernel
+def _start_settling(tables, samples, factors, work, token):
+    """Make the solves those of a static iteration."""
+    one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
+    store(factors.elasticity, 0, load(work.firmness, 0, token))
+    store(factors.inertia, 0, zero)
+    store(factors.force, 0, one)
+    store(factors.strain, 0, load(work.firmness, 0, token))
+    store(factors.strain_rate, 0, zero)
+    store(factors.drag, 0, zero)
+    store(factors.branch, 0, zero)
+    store(factors.share, 0, zero)
+    store(factors.wide, 0, one)
+    store(factors.narrow, 0, one)
+    store(factors.going, 0, zero)
+    store(factors.give, 0, load(samples.effects, GIVE, token))
+
+
+@kernel
+def _add_cable_forces(tables, work, token):
+    """Add the pull of all cables, whose rows dl/dx are in the border, to ``field``."""
+    for c in range(tables.cables):
+        row, tension = tables.row[c], load(work.tension, c, token)
+        for station in range(tables.stations):
+            for k in range(SIZE):
+                t, f = PANEL * (station * tables.panels + row // 3) + 3 * k + row % 3, station * SIZE + k
+                store(work.field, f, fnma(tension, load(work.border, t, token), load(work.field, f, token)))
+
+
+@kernel
+def _component(tables, field, station, i, token):
+    """Size of a force on a station, or of a moment over the body's length."""
+    value = magnitude(load(field, SIZE * station + i, token), fill(0.0, field, token))
+    return value if i < 3 else value * (1.0 / tables.total)
+
+
+@kernel
+def measure_imbalance(tables, samples, factors, work, token):
+    """Largest force out of balance relative to the sum of the loads; keeps it in ``imbalance``."""
+    zero, tiny = fill(0.0, work.field, token), fill(1e-30, work.field, token)
+    clear(work.field, 0, SIZE * tables.stations, token)
+    gather_cables(tables, work, fill(1.0, work.field, token), False, token)
+    loads, largest = zero, zero
+    for station in range(tables.stations):
+        add_station_loads(tables, samples, factors, station, work, token)
+        for i in range(SIZE):
+            loads = loads + _component(tables, work.field, station, i, token)
+    for c in range(tables.cables):
+        loads = loads + load(work.tension, c, token)
+    if samples.present[SURROUNDED]:
+        for station in range(tables.stations):
+            add_surroundings(tables, samples, factors, station, False, work, token)
+    for element in range(tables.stations - 1):
+        measure_element(tables, element, work, token)
+        add_element_force(tables, samples, factors, element, work, token)
+    _add_cable_forces(tables, work, token)
+    for station in range(tables.held, tables.stations):
+        for i in range(SIZE):
+            force = _component(tables, work.field, station, i, token)
+            largest = where_greater(largest, force, largest, force)
+    store(work.imbalance, 0, largest / where_greater(loads, tiny, loads, tiny))
+
+
+@kernel
+def put_at_rest(tables, accepted, work, token):
+    """Put the body where it is undeformed, in the lanes that are not accepted."""
+    zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
+    for station in range(tables.stations):
+        t, frame = 4 * station, FRAME * station
+        for i in range(3):
+            rest = fill(tables.rest[station], work.frame, token) if i == 2 else zero
+            store(work.frame, frame + i, where_greater(accepted, zero, load(work.frame, frame + i, token), rest))
+        for i in range(4):
+            rest = one if i == 0 else zero
+            store(work.turn, t + i, where_greater(accepted, zero, load(work.turn, t + i, token), rest))
+        place_directors(work, station, token)
+
+
+@kernel
+def keep_found(tables, work, measured, token):
+    """Whether the equilibria were found; lanes that are lost go back to rest, without tension.
+
+    ``measured``: by their ``imbalance``, which is beyond any tolerance if they were not; else by their iterations.
+    """
+    zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
+    clear(work.solution, 0, SIZE * tables.stations, token)
+    accepted = near(tables, work, zero, False, token)
+    if measured:
+        imbalance, bound = load(work.imbalance, 0, token), fill(UNBOUNDED, work.frame, token)
+        accepted = where_greater(bound, imbalance, accepted, zero)
+        store(work.imbalance, 0, where_greater(accepted, zero, imbalance, bound))
+    else:
+        failed = load(work.unsolved, 0, token) + load(work.moving, 0, token)
+        store(work.failed, 0, where_greater(failed, zero, one, load(work.failed, 0, token)))
+        store(work.lost, 0, where_greater(accepted, zero, load(work.lost, 0, token), one))
+    put_at_rest(tables, accepted, work, token)
+    for c in range(tables.cables):
+        store(work.tension, c, where_greater(accepted, zero, load(work.tension, c, token), zero))

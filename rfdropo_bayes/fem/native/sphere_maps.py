@@ -1,0 +1,101 @@
+"""Spheres of a body that pushes a cube, in SIMD lanes: where they are, and how contacts on them move with the body.
+
+A sphere of a mesh follows the affine motion of nodes around it; that of a rod is bound to sections. An entry of a
+sphere is a triple of the body's velocities. Entries of a rod come in pairs, translation and spin of a section.
+``arm``, of the scene, is None for a mesh: what is None is no part of the kernel that is compiled.
+"""
+
+from __future__ import annotations
+
+from rfdropo_bayes.fem.native.fields import weighted
+from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load3, store
+from rfdropo_bayes.fem.native.vectors import added, cross, dot, plus, put, scaled
+
+
+@kernel
+def _on_sections(scene, touch, sphere, position, token):
+    """Centre of a sphere of a rod; keeps its arms in space."""
+    zero = fill(0.0, position, token)
+    centre = zero, zero, zero
+    for k in range(scene.first[sphere], scene.within[sphere], 2):
+        frame, lever = FRAME * (scene.place[k] // SIZE), (zero, zero, zero)
+        for i in range(3):
+            lever = added(load3(position, frame + 3 + 3 * i, token), scene.arm[3 * k + i], lever)
+        put(touch.lever, 3 * k, lever)
+        centre = plus(centre, added(load3(position, frame, token), scene.centre[k], lever))
+    return centre
+
+
+@kernel
+def centre_of(scene, arm, touch, sphere, position, token):
+    """Centre of a sphere; ``position``: of nodes, or frames of stations."""
+    if arm is None:
+        return weighted(scene.place, scene.centre, scene.first[sphere], scene.within[sphere], position, token)
+    return _on_sections(scene, touch, sphere, position, token)
+
+
+@kernel
+def centre_velocity(scene, arm, touch, sphere, velocity, token):
+    """Velocity of a sphere's centre."""
+    first, last = scene.first[sphere], scene.within[sphere]
+    if arm is None:
+        return weighted(scene.place, scene.centre, first, last, velocity, token)
+    zero = fill(0.0, velocity, token)
+    total = zero, zero, zero
+    for k in range(first, last, 2):
+        total = added(load3(velocity, scene.place[k], token), scene.centre[k], total)
+        total = plus(total, cross(load3(velocity, scene.place[k + 1], token), load3(touch.lever, 3 * k, token)))
+    return total
+
+
+@kernel
+def _gradient_offset(scene, touch, slot, sphere, position, token):
+    """Where the sphere touches, from its centre in the body at rest: -radius F^-1 n with the deformation gradient F."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    a, b, c, d, e, f, g, h, i = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(scene.first[sphere], scene.first[sphere + 1]):
+        x, y, z = load3(position, scene.place[k], token)
+        u, v, w = scene.gradient[3 * k], scene.gradient[3 * k + 1], scene.gradient[3 * k + 2]
+        a, b, c = fma(x, u, a), fma(x, v, b), fma(x, w, c)
+        d, e, f = fma(y, u, d), fma(y, v, e), fma(y, w, f)
+        g, h, i = fma(z, u, g), fma(z, v, h), fma(z, w, i)
+    first = fnma(f, h, e * i), fnma(d, i, f * g), fnma(e, g, d * h)
+    second = fnma(b, i, c * h), fnma(c, g, a * i), fnma(a, h, b * g)
+    third = fnma(c, e, b * f), fnma(a, f, c * d), fnma(b, d, a * e)
+    scale = (-scene.radius[sphere] * one) / dot((a, b, c), first)
+    normal = load3(touch.frame, 9 * slot, token)
+    for i in range(3):
+        store(touch.offset, 3 * slot + i, scale * dot((first[i], second[i], third[i]), normal))
+
+
+@kernel
+def place_offset(scene, arm, touch, slot, sphere, position, token):
+    """Where the sphere of a candidate touches, from its centre: in the body at rest for a mesh, in space for a rod."""
+    if arm is None:
+        _gradient_offset(scene, touch, slot, sphere, position, token)
+    else:
+        back = fill(-scene.radius[sphere], touch.cube, token)
+        put(touch.offset, 3 * slot, scaled(load3(touch.frame, 9 * slot, token), back))
+
+
+@kernel
+def row_entry(scene, arm, touch, slot, k, r, token):
+    """Derivative of the velocity along row r of a candidate by entry k of its sphere.
+
+    Normal impulses act at the sphere's centre, friction on its surface.
+    """
+    way, centre = load3(touch.frame, 9 * slot + 3 * r, token), fill(scene.centre[k], touch.cube, token)
+    if arm is None:
+        if r > 0:
+            x, y, z = load3(touch.offset, 3 * slot, token)
+            centre = (
+                fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2])) + centre
+            )
+        return scaled(way, centre)
+    if scene.place[k] % SIZE == 0:
+        return scaled(way, centre)
+    lever = load3(touch.lever, 3 * (k - 1), token)
+    if r > 0:
+        lever = added(load3(touch.offset, 3 * slot, token), centre, lever)
+    return cross(lever, way)

@@ -1,0 +1,223 @@
+"""A rod written down anew, dense and slow: strains, their derivatives, steps and equilibria, in NumPy.
+
+Nothing of the engines is used: rotations are matrices, the maps from velocities to strains are matrices of 6 x 12, a
+step solves one dense system, and the cables are found by trying which of them pull.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.fem.rod import SHEAR, inertia_per_density
+
+SOFTNESS = 1e-9
+"""Of cables, relative to how far they give way: as ``fem.constraints.CABLE_SOFTNESS``."""
+
+
+def hat(a: np.ndarray) -> np.ndarray:
+    """Matrix of the cross product with a vector."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+def product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Product of two quaternions (w, x, y, z)."""
+    return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])])
+
+
+def matrix(q: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a unit quaternion."""
+    return np.eye(3) + 2.0 * q[0] * hat(q[1:]) + 2.0 * hat(q[1:]) @ hat(q[1:])
+
+
+def turned(q: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """A quaternion turned by a rotation vector in space."""
+    new = q + 0.5 * (1.0 + a @ a / 12.0) * product(np.concatenate([[0.0], a]), q)
+    return new / np.linalg.norm(new)
+
+
+class Shape:
+    """Places of all stations, and rotations as quaternions."""
+
+    def __init__(self, body: Any) -> None:
+        self.place = np.stack([0.0 * body.station, 0.0 * body.station, body.station], axis=1)
+        self.turn = np.tile([1.0, 0.0, 0.0, 0.0], (len(body.station), 1))
+
+    def moved(self, change: np.ndarray) -> Shape:
+        """Stations displaced by the first three of six numbers each, and turned by the others."""
+        new = object.__new__(Shape)
+        new.place = self.place + change[:, :3]
+        new.turn = np.array([turned(q, a) for q, a in zip(self.turn, change[:, 3:], strict=True)])
+        return new
+
+
+def strains(shape: Shape, length: np.ndarray, e: int) -> tuple[np.ndarray, np.ndarray]:
+    """Strains of an element, and their derivatives by the twists of both stations (6, 12)."""
+    first, second = shape.turn[e], shape.turn[e + 1]
+    if first @ second < 0.0:
+        second = -second
+    between = product(first * [1.0, -1.0, -1.0, -1.0], second)
+    middle = matrix((first + second) / np.linalg.norm(first + second))
+    chord, h = shape.place[e + 1] - shape.place[e], length[e]
+    strain = np.concatenate([middle.T @ chord / h - [0.0, 0.0, 1.0], 2.0 * between[1:] / h])
+    u = middle @ between[1:]
+    w, g = np.eye(3) - np.outer(u, u) / (1.0 + between[0]), hat(u / (1.0 + between[0]))
+    levers = [hat(chord) @ (np.eye(3) + sign * g) / 2.0 for sign in (1.0, -1.0)]
+    none = np.zeros((3, 3))
+    rows = np.block([[-np.eye(3), levers[0], np.eye(3), levers[1]], [none, -w, none, w]])
+    change = np.kron(np.eye(2), middle.T) @ rows / h
+    strain[2] += h**2 / 24.0 * strain[3:5] @ strain[3:5]  # an arc is longer than its chord
+    change[2] += h**2 / 12.0 * strain[3:5] @ change[3:5]
+    return strain, change
+
+
+def stiffness(body: Any, material: Any, e: int) -> np.ndarray:
+    """Stiffness of a section: shear twice, stretch, bending about x and about y, twist."""
+    young = material.young_modulus * material.stiffness_scale[e]
+    shear = young / (2.0 * (1.0 + material.poisson_ratio))
+    about_y, about_x = body.bending_moment_area[e]
+    area = body.axial_area[e]
+    return np.array(
+        [SHEAR * shear * area] * 2 + [young * area, young * about_x, young * about_y, shear * body.torsion_constant[e]]
+    )
+
+
+def energy(body: Any, material: Any, shape: Shape) -> float:
+    """Elastic energy [J] of a linear rod."""
+    length = np.diff(body.station)
+    parts = [(strains(shape, length, e)[0], stiffness(body, material, e), length[e]) for e in range(body.elements)]
+    return sum(0.5 * h * strain @ (stiff * strain) for strain, stiff, h in parts)
+
+
+def guides_of(system: Any, shape: Shape, cable: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a cable from its anchor on, and their derivatives (points, 3, stations, 6)."""
+    layout, stations = system.cables, len(system.body.station)
+    points, rows = [layout.anchor[cable]], [np.zeros((3, stations, 6))]
+    for guide in np.flatnonzero(layout.used[cable]):
+        point, row = np.zeros(3), np.zeros((3, stations, 6))
+        parts = (part[cable, guide] for part in (layout.station, layout.weight, layout.arm))
+        for station, weight, arm in zip(*parts, strict=True):
+            lever = matrix(shape.turn[station]) @ arm
+            point += weight * shape.place[station] + lever
+            row[:, station, :3] += weight * np.eye(3)
+            row[:, station, 3:] -= hat(lever)
+        points.append(point)
+        rows.append(row)
+    return np.array(points), np.array(rows)
+
+
+def cable_rows(system: Any, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths of all cables, and their derivatives (cables, stations * 6)."""
+    lengths, rows = [], []
+    for cable in range(len(system.cables.anchor)):
+        points, derivative = guides_of(system, shape, cable)
+        ways = np.diff(points, axis=0)
+        sizes = np.linalg.norm(ways, axis=1)
+        lengths.append(sizes.sum())
+        rows.append(np.einsum("gi,gisk->sk", ways / sizes[:, None], np.diff(derivative, axis=0)).ravel())
+    return np.array(lengths), np.reshape(rows, (len(lengths), 6 * len(system.body.station)))
+
+
+def pulls(compliance: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Impulses of cables that pull only: those of the set that neither pushes nor leaves a cable too long."""
+    count = len(free)
+    soft = compliance + SOFTNESS * np.diag(np.diag(compliance))
+    for size in range(count + 1):
+        for taut in itertools.combinations(range(count), size):
+            impulse, rows = np.zeros(count), list(taut)
+            if rows:
+                impulse[rows] = np.linalg.solve(soft[np.ix_(rows, rows)], -free[rows])
+            slack = free + compliance @ impulse
+            if np.all(impulse >= 0.0) and np.all(np.delete(slack, rows) >= 0.0):
+                return impulse
+    raise AssertionError("no set of taut cables")
+
+
+def inertia(system: Any, material: Any, shape: Shape) -> np.ndarray:
+    """Mass matrix (stations, 6, 6) in space."""
+    volume, moment = inertia_per_density(system.body)
+    total = np.zeros((len(volume), 6, 6))
+    for k, q in enumerate(shape.turn):
+        turn = matrix(q)
+        total[k, :3, :3] = (material.density * volume[k] + material.point_mass[k]) * np.eye(3)
+        total[k, 3:, 3:] = material.density * (turn * moment[k]) @ turn.T
+    return total
+
+
+class Motion:
+    """A rod in motion under its weight and cables that pull only: a linear body without effects."""
+
+    def __init__(self, system: Any, material: Any, integrator: str) -> None:
+        self.system, self.material, self.integrator = system, material, integrator
+        self.shape = Shape(system.body)
+        self.velocity = np.zeros((len(system.body.station), 6))
+        self.tension = np.zeros(len(system.cables.anchor))
+        self.rest = cable_rows(system, self.shape)[0]
+        self.command = np.zeros(len(self.rest))
+
+    def step(self, command: np.ndarray, time_step: float) -> None:
+        """A step to the commanded displacements [m]."""
+        g = 1.0 - 1.0 / np.sqrt(2.0)
+        if self.integrator == "euler":
+            self._stage(command, time_step, time_step, None)
+        else:
+            before = self.velocity
+            self._stage(self.command + g * (command - self.command), g * time_step, g * time_step, None)
+            change = (1.0 - 2.0 * g) / g * (self.velocity - before)
+            self._stage(command, (1.0 - g) * time_step, g * time_step, change)
+        self.command = command
+
+    def _stage(self, command: np.ndarray, elapsed: float, p: float, carried: np.ndarray | None) -> None:
+        system, material, velocity = self.system, self.material, self.velocity
+        euler, stations = self.integrator == "euler", len(velocity)
+        shape = self.shape if euler else self.shape.moved(elapsed * velocity)
+        mass = inertia(system, material, shape)
+        beta, alpha = material.rayleigh_stiffness, material.rayleigh_mass
+        size = 6 * stations
+        matrix_, right = np.zeros((size, size)), np.zeros((stations, 6))
+        for k in range(stations):
+            rows = slice(6 * k, 6 * k + 6)
+            matrix_[rows, rows] += (1.0 + p * alpha) * mass[k]
+            spin = velocity[k, 3:]
+            right[k] -= p * alpha * mass[k] @ velocity[k]
+            right[k, :3] += p * mass[k, 0, 0] * np.asarray(material.gravity)
+            right[k, 3:] -= p * np.cross(spin, mass[k, 3:, 3:] @ spin)
+            if carried is not None:
+                right[k] += mass[k] @ carried[k]
+        length = np.diff(system.body.station)
+        for e in range(system.body.elements):
+            strain, rows = strains(shape, length, e)
+            stiff, h = stiffness(system.body, material, e), length[e]
+            rate = rows @ velocity[e : e + 2].ravel()
+            behind = p + beta if euler else beta
+            force = rows.T @ (h * stiff * (strain + behind * rate))
+            right[e : e + 2] -= p * force.reshape(2, 6)
+            both = slice(6 * e, 6 * e + 12)
+            matrix_[both, both] += p * (p + beta) * h * (rows.T * stiff) @ rows
+        lengths, pull = cable_rows(system, shape)
+        free = slice(6 * system.clamped_stations, size)
+        solved = np.linalg.solve(matrix_[free, free], np.column_stack([right.ravel()[free], pull[:, free].T]))
+        slack = (self.rest - command - lengths) / p
+        if euler:
+            slack = slack - pull @ velocity.ravel()
+        impulse = pulls(pull[:, free] @ solved[:, 1:], slack - pull[:, free] @ solved[:, 0])
+        change = np.zeros(size)
+        change[free] = solved[:, 0] - solved[:, 1:] @ impulse
+        change = change.reshape(stations, 6)
+        self.velocity, self.tension = velocity + change, impulse / p
+        self.shape = shape.moved(p * (self.velocity if euler else change))
+
+
+def unbalanced(system: Any, material: Any, shape: Shape, tension: np.ndarray) -> np.ndarray:
+    """Forces and moments (stations, 6) out of balance on a linear rod at rest."""
+    mass, length = inertia(system, material, shape), np.diff(system.body.station)
+    total = np.zeros((len(mass), 6))
+    total[:, :3] = mass[:, 0, 0, None] * np.asarray(material.gravity)
+    for e in range(system.body.elements):
+        strain, rows = strains(shape, length, e)
+        force = rows.T @ (length[e] * stiffness(system.body, material, e) * strain)
+        total[e : e + 2] -= force.reshape(2, 6)
+    total -= (tension @ cable_rows(system, shape)[1]).reshape(total.shape)
+    return total[system.clamped_stations :]
