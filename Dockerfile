@@ -8,4 +8,4 @@ COPY --chown=lab . .
 RUN python -m venv .venv \
     && .venv/bin/pip install --no-cache-dir --disable-pip-version-check --constraint constraints.txt .
 ENV PATH=/app/.venv/bin:$PATH OPENBLAS_NUM_THREADS=1
-CMD ["rfdropo", "calibrate", "experiments/demo.toml", "--out", "reports/demo", "--overwrite"]
+CMD ["rfdropo", "calibrate", "experiments/demo.toml", "--out", "runs/demo", "--overwrite"]

@@ -9,6 +9,8 @@ BIN     = $(VENV)/bin
 # --no-compile: Python compiles the few modules that are used when it first meets them, which halves the set-up.
 PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 PYTEST  = $(BIN)/python -m pytest
+# Tests of one file share what they fit and compile: a worker takes whole files.
+BY_FILE = -n $(WORKERS) --dist loadfile
 CORE    = $(VENV)/core.stamp
 DEV     = $(VENV)/dev.stamp
 ALL     = $(VENV)/all.stamp
@@ -21,28 +23,42 @@ export OPENBLAS_NUM_THREADS = 1
 export PYTHONDONTWRITEBYTECODE =
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-portable test-compiler test-all matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
+.PHONY: help demo test test-slow test-studies test-typed test-portable test-compiler test-all part mutants matrix matrix-drawn notebook-drawn lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
 
 demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
-	$(BIN)/rfdropo calibrate experiments/demo.toml --out reports/demo --overwrite
-	@echo "The report: reports/demo/report.html"
+	$(BIN)/rfdropo calibrate experiments/demo.toml --out runs/demo --overwrite
+	@echo "The report: runs/demo/report.html"
 
 test: $(DEV) ## the tests that are not slow
-	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
+	$(PYTEST) $(BY_FILE) -m "not slow and not notebook" --ignore=tests/studies
 	$(BIN)/python tools/yardstick.py
 
-test-slow: $(ALL) ## the slow tests, those of optional packages included, without matrix and notebooks
-	$(PYTEST) -n $(WORKERS) -m "slow and not notebook" --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
+test-slow: $(DEV) ## the slow tests, without those of studies, matrix and notebooks
+	$(PYTEST) $(BY_FILE) -m "slow and not notebook" --ignore=tests/studies --ignore=tests/verbs/test_matrix.py --ignore=tests/verbs/test_commands_matrix.py
 
-# The rooms that compute. `make test-portable ROOMS="policies audit"` runs some of them: those that learn, sample and
+# The other tests leave this out: it doubles what the numerical rooms cost.
+test-typed: $(DEV) ## the tests of the numerical rooms with the shapes of all arrays checked at run time
+	$(PYTEST) $(BY_FILE) --typed -m "not slow and not notebook" tests/fem tests/bayes tests/inference tests/discrepancy tests/simulators
+
+test-studies: $(ALL) ## the tests of what is run for papers, in studies/
+	$(PYTEST) $(BY_FILE) tests/studies
+
+# The rooms that compute. `make test-portable ROOMS="policies discrepancy"` runs some of them: those that learn, sample and
 # search are where a test that rests on one processor shows, because a last bit becomes another curve there.
 test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
 	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)
 
-test-all: test test-slow test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
+test-all: test test-slow test-studies test-typed test-portable test-compiler matrix notebooks ## every test; each part can be run alone (hours)
+
+# `make part PART=test-slow`
+part: $(DEV) ## a part of test-all, with a line of what it found in reports/checks/parts.csv
+	$(BIN)/python tools/parts.py $(PART)
+
+mutants: $(DEV) ## faults that the tests must see, one at a time (tools/mutants.py; half an hour)
+	$(BIN)/python tools/mutants.py
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/verbs/test_matrix.py tests/verbs/test_commands_matrix.py
@@ -55,8 +71,8 @@ matrix-drawn: $(DEV) ## a tenth of the matrix, drawn by the commit
 notebook-drawn: $(DEV) ## one notebook, drawn by the commit
 	$(PYTEST) -m notebook --drawn 1 --by $(COMMIT) tests/test_notebooks.py
 
-test-compiler: $(DEV) ## the layered engine, its kernels compiled by Numba's own compilers (docs/native.md)
-	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_layered.py tests/fem/test_native_session.py tests/fem/test_compilers.py
+test-compiler: $(DEV) ## the engine of rods, its kernels compiled by Numba's own compilers (docs/native.md)
+	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_rod.py tests/fem/test_native_session.py tests/fem/test_compilers.py
 
 lint: $(DEV) ## ruff, its formatter, and mypy
 	$(BIN)/ruff check .
@@ -91,7 +107,7 @@ notebook-outputs: $(DEV) ## run every notebook and keep its outputs in it
 demo-data: $(CORE) ## make the recordings of the bundled example again
 	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo --overwrite
 
-clean: ## remove the environment and what the tools cached; reports stay
+clean: ## remove the environment and what the tools cached; runs stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
 	find rfdropo_bayes tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -108,9 +124,9 @@ $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable '.[dev]'
 	@touch $(CORE) $@
 
-# Apart from what `make test` needs: PyTorch is large.
-$(ALL): pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable '.[dev,sbi,cluster]'
+# Apart from what `make test` needs.
+$(ALL): pyproject.toml constraints.txt studies/requirements.txt | $(BIN)/python
+	$(PIP) --editable '.[dev]' --requirement studies/requirements.txt
 	@touch $(CORE) $(DEV) $@
 
 $(SITE): pyproject.toml constraints.txt | $(BIN)/python

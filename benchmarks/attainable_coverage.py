@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.studies.virtual_tasks import TASKS, InferenceTask, draw_truth
+from studies.virtual_tasks import TASKS, InferenceTask, draw_truth
 
 TRUTHS = 100_000
 INSIDE = 0.05, 0.95

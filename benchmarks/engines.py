@@ -2,7 +2,7 @@
 
     python benchmarks/engines.py [--truth mujoco] [--pieces 20] [--refine 2] [--poisson 0.42 0.1 0] [--seed 1]
 
-The recordings are the four different fitted ones of the study's data set with a payload (`rfdropo benchmark audit
+The recordings are the four different fitted ones of the study's data set with a payload (`python -m studies audit
 --truth mujoco`), the truth's values are given to ours, with the compliance of the servos. Each row is a difference of
 two arms: of their tips, root mean square; and its linear fit by the total mass, the damping, the servos' compliance,
 a payload and a tilt of gravity, with the deviations that the study's noise gives them. Poisson's ratio is held.
@@ -27,9 +27,9 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.studies.engine_study import FITTED, REPEATS, TRUTHS, Truth, drawn_arm, seed_of
-from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, experiment_tables
-from rfdropo_bayes.studies.mujoco_truth import CABLE
+from studies.engine_study import FITTED, REPEATS, TRUTHS, Truth, drawn_arm, seed_of
+from studies.hidden_effects import MEMORY, NOISE, experiment_tables
+from studies.mujoco_truth import CABLE
 
 MECHANISMS = ("cable_compliance", "payload", "base_tilt")
 STEPS = {"trunk_mass": 1e-4, "cable_compliance": 1e-6, "payload_mass": 2e-4, "base_tilt_x": 5e-3, "base_tilt_z": 5e-3}

@@ -41,11 +41,11 @@ COMMANDS = (
     'rfdropo init finger --recording "data/*.csv" --length-mm 250 --radius-mm 12 --segments 1 --mass-g 90 '
     "--counts-per-turn 4096 --spool-radius-mm 12 --gravity +z --defaults",
     "rfdropo check finger/experiment.toml",
-    "rfdropo check finger/experiment.toml --out reports/again",
-    "rfdropo calibrate finger/experiment.toml --set inference.method=laplace --out reports/arm",
-    "rfdropo audit finger/experiment.toml --base reports/arm --out reports/audit --set audit.minutes=300",
-    "rfdropo calibrate reports/audit/extended.toml --set inference.method=laplace --out reports/mended",
-    "rfdropo predict reports/mended --commands data/trial_03.csv --out reports/next",
+    "rfdropo check finger/experiment.toml --out runs/again",
+    "rfdropo calibrate finger/experiment.toml --set inference.method=laplace --out runs/arm",
+    "rfdropo audit finger/experiment.toml --from runs/arm --out runs/audit --set audit.minutes=300",
+    "rfdropo calibrate runs/audit/extended.toml --set inference.method=laplace --out runs/mended",
+    "rfdropo predict runs/mended --commands data/trial_03.csv --out runs/next",
 )
 PASTED = 1
 """The command after which the axes that it offers are pasted into the experiment file."""
@@ -81,7 +81,7 @@ def type_all(folder: Path) -> list[Step]:
         steps.append(typed(command, folder))
         print(f"{steps[-1].wall:6.0f} s {steps[-1].cpu:6.0f} s of processor  {command}", flush=True)
         if number == PASTED:
-            paste_axes(folder / "finger" / "experiment.toml", folder / "reports" / "finger-check" / "check.json")
+            paste_axes(folder / "finger" / "experiment.toml", folder / "runs" / "finger-check" / "check.json")
     return steps
 
 
@@ -165,15 +165,15 @@ def table(steps: list[Step]) -> str:
 
 def see(folder: Path) -> None:
     """Assert that the delay was named and measured, and that the prediction errs by little more than noise."""
-    audit = json.loads((folder / "reports" / "audit" / "audit.json").read_text(encoding="utf-8"))
-    extended = tomllib.loads((folder / "reports" / "audit" / "extended.toml").read_text(encoding="utf-8"))
+    audit = json.loads((folder / "runs" / "audit" / "audit.json").read_text(encoding="utf-8"))
+    extended = tomllib.loads((folder / "runs" / "audit" / "extended.toml").read_text(encoding="utf-8"))
     (named,) = extended["model"]["mechanisms"]
-    row = rb.load(folder / "reports" / "mended").summary.loc[named]
+    row = rb.load(folder / "runs" / "mended").summary.loc[named]
     print(audit["sentence"])
     print(f"{named} {row['mean']:.5f} +- {row['sd']:.5f} s; hidden was a command_delay of {DELAY} s")
     assert named == "command_delay"
     assert abs(row["mean"] - DELAY) < 1e-3
-    predicted = pd.read_csv(folder / "reports" / "next" / "prediction.csv")
+    predicted = pd.read_csv(folder / "runs" / "next" / "prediction.csv")
     recorded = pd.read_csv(folder / "data" / "trial_03.csv")
     x, y, z = (recorded[f"tip_{axis}_mm"] - clamp for axis, clamp in zip("XYZ", CLAMP, strict=True))
     off = [1e3 * predicted[f"tip_{axis}_mean"] - of for axis, of in zip("xyz", (z, -x, -y), strict=True)]

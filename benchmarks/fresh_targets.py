@@ -2,7 +2,7 @@
 
     python benchmarks/fresh_targets.py --scene push --kind unknown --seed 1 [--only-done]
 
-Makes the target of `rfdropo_bayes/studies/fresh_targets.py` from scene, kind and seed, trains the policies of every row
+Makes the target of `studies/fresh_targets.py` from scene, kind and seed, trains the policies of every row
 on what is learnt from its six recordings, and plays them on it. Settings are the constants below. Writes table2.json
 (every distance) and table.md into reports/fresh_targets/SCENE_KIND_SEED, of reaching into KIND_SEED; a second call goes
 on where the first stopped.
@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.files import write_text
-from rfdropo_bayes.studies.fresh_targets import KINDS, SCENES, make_target
-from rfdropo_bayes.studies.table2 import ORACLE, OURS, ROWS, Table2Size, run_table2, share_of
+from studies.fresh_targets import KINDS, SCENES, make_target
+from studies.table2 import ORACLE, OURS, ROWS, Table2Size, run_table2, share_of
 
 MINUTES = 300.0
 """Of an audit, by the clock on the wall: a study shares its machine, and what an audit says must not depend on that."""

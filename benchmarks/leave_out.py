@@ -89,7 +89,7 @@ def left_out(model: rb.Model, pattern: str, out: Path, start: Path | None) -> rb
         make_config(table.method, inference_options(table)),
         test=whole_recordings(model, pattern),
         seed=model.settings.seed,
-        start=start,
+        fit=start,
         out=out,
         overwrite=True,
     )

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.studies.comparison import misleads
-from rfdropo_bayes.studies.table1 import OWN
-from rfdropo_bayes.studies.virtual_tasks import TASKS, task_problem
+from studies.comparison import misleads
+from studies.table1 import OWN
+from studies.virtual_tasks import TASKS, task_problem
 
 FITS = Path(__file__).parents[1] / "reports" / "table1" / "push" / "fits.jsonl"
 TASK, ALONG = "TrunkPush", ("young_modulus", "poisson_ratio", "friction")

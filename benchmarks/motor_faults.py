@@ -32,7 +32,7 @@ import numpy as np
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
-from rfdropo_bayes.deployment.bench.simulated_drive import SimulatedFault
+from rfdropo_bayes.deployment.bench.simulated_node import SimulatedFault
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.cia402 import DriveState, state_of
 from rfdropo_bayes.deployment.objects import Object
@@ -76,6 +76,7 @@ CASES: dict[str, Case] = {
     "short RPDO": Case("emergency_message", "bus", "short RPDO"),
     "one send error": Case("send_error", "bus", "one send error"),
     "bus lost": Case("send_error", "bus", "all sends fail"),
+    "reception fails": Case("send_error", "bus", "recv raises"),
     "motor jammed": Case("following_error", "drive", SimulatedFault.JAMMED, bounded=False),
     "status frozen": Case("following_error", "drive", SimulatedFault.FROZEN_STATUS, bounded=False),
     "NaN action": Case("action_not_finite", "policy", "nan", ramp=True),
@@ -204,6 +205,8 @@ class FaultyBus(can.BusABC):
         self._inner.send(msg, timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self.armed and self._what == "recv raises":
+            raise ValueError("a garbled line")  # as serial adapters do
         return self._inner._recv_internal(timeout)
 
     def shutdown(self) -> None:

@@ -24,7 +24,7 @@ from mujoco import rollout
 from mujoco_sysid import ARM, NOISE, PARAMETERS, STEP, TRUTH, changed
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.audit.verdict import DESCRIBED
+from rfdropo_bayes.discrepancy.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line, read_lines
 
 REPEATS, OTHERS, UNTOUCHED = 3, 2, 3

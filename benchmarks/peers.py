@@ -107,6 +107,6 @@ def settle_all() -> list[Peer]:
         try:
             found.append(run(*arguments))
         except ImportError as error:
-            found.append(Peer(name, remark=f"{error.name} is not installed (extra: peers)"))
+            found.append(Peer(name, remark=f"{error.name} is not installed (studies/requirements.txt)"))
         print(f"{found[-1].name}: {found[-1].sag}, {found[-1].cost} s per simulated s")
     return found

@@ -2,7 +2,7 @@
 
     python benchmarks/prior_alarms.py [--datasets 10] [--seed 7] [--spread 0.3] [--out reports/audit_power/prior_alarms]
 
-Data sets of the study of audits' power with nothing hidden (`rfdropo benchmark audit`, condition null). The base model
+Data sets of the study of audits' power with nothing hidden (`python -m studies audit`, condition null). The base model
 is fitted under the known noise, from the truth on, and cautioned about as at an audit's end; no candidate is screened.
 ``spread`` is how far truths lie from the middle of their priors, in deviations of these: the study's 0.3, or 1 for
 truths as the priors have them. A line of the ledger for each data set; one that is in it is not fitted again.
@@ -22,18 +22,18 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
-from rfdropo_bayes.audit.fit import FitTarget, climb
-from rfdropo_bayes.audit.prior_ends import decided_by_priors
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
+from rfdropo_bayes.discrepancy.fit import FitTarget, climb
+from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
 from rfdropo_bayes.files import read_lines
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.studies.fits import Job, run_fits
-from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, REPEATS, Setting, experiment_tables, hide
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from studies.fits import Job, run_fits
+from studies.hidden_effects import MEMORY, NOISE, REPEATS, Setting, experiment_tables, hide
 
 DRAWS = 1000  # as many as an audit's
 _WORKSHOP: Workshop = {}  # of this process

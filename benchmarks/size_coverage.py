@@ -23,18 +23,18 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.audit.audit_record import STIFFNESS, relative_sizes
-from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.audit.fit import Fit, climb, widened
-from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import first_target
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.discrepancy.audit_record import STIFFNESS, relative_sizes
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.fit import Fit, climb, widened
+from rfdropo_bayes.discrepancy.journal import Journal
+from rfdropo_bayes.discrepancy.pipeline import first_target
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable
-from rfdropo_bayes.studies.hidden_effects import MEMORY, NOISE, Hidden, Setting, hide
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from studies.hidden_effects import MEMORY, NOISE, Hidden, Setting, hide
 
 WITHIN = 1.645  # deviations of a normal to the ends of its central 90 %
 LEARNT = 0.5  # of a prior's deviation that a size is known better than, to count

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
-from scipy.sparse.linalg import spsolve
-
 from rfdropo_bayes.fem.hexahedron import elastic_stiffness, elasticity
+from scipy.sparse.linalg import spsolve
 
 
 def bricks(

@@ -27,12 +27,12 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, run_ended
 from rfdropo_bayes.policies import training
 from rfdropo_bayes.policies.evaluation import EVALUATION_SEED, draw_cases, play
-from rfdropo_bayes.studies.fresh_targets import make_target
-from rfdropo_bayes.studies.table2 import share_of
 from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.evaluate import CSV, evaluate
 from rfdropo_bayes.verbs.make_vec import make_vec
 from rfdropo_bayes.verbs.train import train
+from studies.fresh_targets import make_target
+from studies.table2 import share_of
 
 OUT = Path("reports/fresh_targets/transfer")
 SCENE, KIND, SEED, TASK = "push", "unknown", 1, "TrunkPush-v0"

@@ -3,7 +3,7 @@
     python benchmarks/unknown_effects.py [--out reports/unknown_effects] [--effects crosstalk,bouc_wen] [--seeds 0,1]
                                          [--rho 1.0] [--null 0] [--alone | --force] [--body arm]
 
-Effects are those of `rfdropo_bayes/studies/unknown_effects.py`, hidden in recordings of the layered arm, or, with
+Effects are those of `studies/unknown_effects.py`, hidden in recordings of the layered arm, or, with
 ``--body mesh``, of SOFA's trunk on its own mesh, whose data and audits have one mesh and one time step; ``--null`` is
 the number of data sets with nothing hidden. A line of the ledger for each data set: verdict, port, law, unseen errors,
 and seconds. All share compiled simulators. A data set in the ledger is not run again. One takes one to four minutes on
@@ -29,16 +29,16 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.audit.law_search import law_search
-from rfdropo_bayes.audit.pipeline import base_model
-from rfdropo_bayes.audit.verdict import DESCRIBED
+from rfdropo_bayes.discrepancy.law_search import law_search
+from rfdropo_bayes.discrepancy.pipeline import base_model
+from rfdropo_bayes.discrepancy.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.studies.audit_study import MESH
-from rfdropo_bayes.studies.hidden_effects import Setting
-from rfdropo_bayes.studies.unknown_effects import EFFECTS, FOREIGN, conceal
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from studies.audit_study import MESH
+from studies.hidden_effects import Setting
+from studies.unknown_effects import EFFECTS, FOREIGN, conceal
 
 ALL, NONE, FORCED = "all", "none", "forced"
 WITHIN = 1.15  # of the noise, an unseen error counts as explained

@@ -42,7 +42,7 @@ axes[0].legend(ncols=4, fontsize="small", loc="upper center")
 spread = {}
 for words, second in (("another like it", again), ("the proposed one", designed)):
     fit = rb.calibrate(model, [*first, *second], rb.Laplace(starts=1), seed=0, show=False)
-    draws = fit.posterior.posterior["rayleigh_stiffness"].values.ravel()
+    draws = fit.idata.posterior["rayleigh_stiffness"].values.ravel()
     axes[1].hist(1e3 * draws, bins=30, density=True, alpha=0.5, label=words)
     spread[words] = float(np.std(np.log(draws)))
 axes[1].axvline(1e3 * TRUTH["rayleigh_stiffness"], color="k", label="truth")

@@ -17,11 +17,11 @@ fast = {"precision": "float32"}
 model = rb.Model("virtual_trunk", priors=priors, mechanisms=["actuator_lag"], noise="ar1", simulator=fast)
 fit = rb.calibrate(model, rb.read("reach_1.nc", folder=VIRTUAL), rb.Laplace(starts=1), seed=0, show=False)
 
-venv = rb.make_vec("TrunkReach-v0", model, posterior=fit, n=64)
+venv = rb.make_vec("TrunkReach-v0", model, fit=fit, n=64)
 venv.seed(0)
 venv.reset()
 seen = {name: np.array([info["parameters"][name] for info in venv.reset_infos]) for name in priors}
-draws = fit.posterior.posterior
+draws = fit.idata.posterior
 
 figure, axes = plt.subplots(figsize=(5, 3.6), layout="constrained")
 axes.plot(draws["trunk_mass"].values.ravel(), 1e-6 * draws["young_modulus"].values.ravel(), ".", color="0.7")

@@ -25,7 +25,7 @@ figure, axes = plt.subplots(figsize=(5, 3.6), layout="constrained")
 spread = {}
 for words, each in (("recordings alone", model), ("and the arm weighed", heavy)):
     fit = rb.calibrate(each, runs, rb.Laplace(starts=1), seed=0, show=False)
-    draws = {name: fit.posterior.posterior[name].values.ravel() for name in ("trunk_mass", "young_modulus")}
+    draws = {name: fit.idata.posterior[name].values.ravel() for name in ("trunk_mass", "young_modulus")}
     axes.plot(draws["trunk_mass"], 1e-6 * draws["young_modulus"], ".", markersize=3, alpha=0.4, label=words)
     spread[words] = float(np.std(np.log(draws["young_modulus"])))
 axes.set_xlabel("mass of the trunk [kg]")

@@ -6,17 +6,58 @@
     model = rb.Model("trunk_sofa", priors={"young_modulus": {}, "trunk_mass": {}})
     fit = rb.calibrate(model, runs, rb.SMC(rollouts=20_000), seed=0)
 
-Every command of ``rfdropo`` is one call of a function here. Nothing is loaded before it is used.
+Every command of ``rfdropo`` is one call of a function here. Nothing is loaded before it is used; type checkers and
+editors read the same names from the imports below.
 """
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads
+from rfdropo_bayes.runtime import keep_callback_threads, limit_blas_threads, refuse_lost_threads
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.cautions import Caution as Caution
+    from rfdropo_bayes.cautions import Code as Code
+    from rfdropo_bayes.data import Trajectory as Trajectory
+    from rfdropo_bayes.deployment.session import deploy as deploy
+    from rfdropo_bayes.deployment.settings import load_deployment as load_deployment
+    from rfdropo_bayes.errors import InputError as InputError
+    from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig as Laplace
+    from rfdropo_bayes.inference.nested import NestedConfig as Nested
+    from rfdropo_bayes.inference.nuts import NutsConfig as NUTS
+    from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RFDROPO
+    from rfdropo_bayes.inference.smc.bridge import BridgeConfig as Bridge
+    from rfdropo_bayes.inference.smc.sampler import SmcConfig as SMC
+    from rfdropo_bayes.model.model import Model as Model
+    from rfdropo_bayes.results.audited import Audit as Audit
+    from rfdropo_bayes.results.calibrated import Calibration as Calibration
+    from rfdropo_bayes.results.designed import Design as Design
+    from rfdropo_bayes.results.load import load as load
+    from rfdropo_bayes.results.predicted import Prediction as Prediction
+    from rfdropo_bayes.robots import Robot as Robot
+    from rfdropo_bayes.robots.parameter import Parameter as Parameter
+    from rfdropo_bayes.robots.sections import Cone as Cone
+    from rfdropo_bayes.robots.sections import Cylinder as Cylinder
+    from rfdropo_bayes.robots.sections import Disks as Disks
+    from rfdropo_bayes.robots.sections import Tube as Tube
+    from rfdropo_bayes.robots.sections import section_profile as section_profile
+    from rfdropo_bayes.simulators.adapters.mujoco_model import MuJoCo as MuJoCo
+    from rfdropo_bayes.simulators.black_box import BlackBox as BlackBox
+    from rfdropo_bayes.simulators.parameters import ParameterSpec as ParameterSpec
+    from rfdropo_bayes.verbs.adapt import adapt as adapt
+    from rfdropo_bayes.verbs.audit import audit as audit
+    from rfdropo_bayes.verbs.calibrate import calibrate as calibrate
+    from rfdropo_bayes.verbs.check import check as check
+    from rfdropo_bayes.verbs.design import design as design
+    from rfdropo_bayes.verbs.design_day import design_day as design_day
+    from rfdropo_bayes.verbs.evaluate import evaluate as evaluate
+    from rfdropo_bayes.verbs.make_vec import make_vec as make_vec
+    from rfdropo_bayes.verbs.predict import predict as predict
+    from rfdropo_bayes.verbs.read import read as read
+    from rfdropo_bayes.verbs.simulate import simulate as simulate
+    from rfdropo_bayes.verbs.train import train as train
 
 limit_blas_threads()
 keep_callback_threads()
@@ -26,6 +67,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Audit": "results.audited",
     "BlackBox": "simulators.black_box",
+    "Bridge": "inference.smc.bridge:BridgeConfig",
     "Calibration": "results.calibrated",
     "Caution": "cautions",
     "Code": "cautions",
@@ -34,12 +76,17 @@ _HOMES = {
     "Design": "results.designed",
     "Disks": "robots.sections",
     "InputError": "errors",
+    "Laplace": "inference.modes.mode_search:LaplaceConfig",
     "Model": "model.model",
     "MuJoCo": "simulators.adapters.mujoco_model",
+    "NUTS": "inference.nuts:NutsConfig",
+    "Nested": "inference.nested:NestedConfig",
     "Parameter": "robots.parameter",
     "ParameterSpec": "simulators.parameters",
     "Prediction": "results.predicted",
+    "RFDROPO": "inference.rfdropo.phi_search:RfdropoConfig",
     "Robot": "robots",
+    "SMC": "inference.smc.sampler:SmcConfig",
     "Trajectory": "data",
     "Tube": "robots.sections",
     "adapt": "verbs.adapt",
@@ -60,45 +107,68 @@ _HOMES = {
     "train": "verbs.train",
 }
 """Where each name is defined: ``module`` under the same name, or ``module:name``."""
-_METHODS = {
-    "BayesSim": "bayessim",
-    "Bridge": "bridge",
-    "Laplace": "laplace",
-    "NPDR": "npdr",
-    "NUTS": "nuts",
-    "Nested": "nested",
-    "RFDROPO": "rfdropo",
-    "SMC": "smc",
-    "UDR": "udr",
-}
-"""Options of each method of inference, by the method's name in an experiment file."""
 
-__all__ = ["__version__", *_HOMES, *_METHODS]
+_COMPUTING = ("inference.", "model.", "simulators.", "verbs.")
+"""Rooms that make arrays of JAX when they are imported."""
 
-
-def __getattr__(name: str) -> Any:
-    """Load what a name stands for, once it is asked for."""
-    if name in _METHODS:
-        found = import_module(f"{__name__}.inference.methods").METHODS[_METHODS[name]].config
-    elif name in _HOMES:
-        module, _, attribute = _HOMES[name].partition(":")
-        found = getattr(import_module(f"{__name__}.{module}"), attribute or name)
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = found
-    return found
+__all__ = [
+    "NUTS",
+    "RFDROPO",
+    "SMC",
+    "Audit",
+    "BlackBox",
+    "Bridge",
+    "Calibration",
+    "Caution",
+    "Code",
+    "Cone",
+    "Cylinder",
+    "Design",
+    "Disks",
+    "InputError",
+    "Laplace",
+    "Model",
+    "MuJoCo",
+    "Nested",
+    "Parameter",
+    "ParameterSpec",
+    "Prediction",
+    "Robot",
+    "Trajectory",
+    "Tube",
+    "__version__",
+    "adapt",
+    "audit",
+    "calibrate",
+    "check",
+    "deploy",
+    "design",
+    "design_day",
+    "evaluate",
+    "load",
+    "load_deployment",
+    "make_vec",
+    "predict",
+    "read",
+    "section_profile",
+    "simulate",
+    "train",
+]
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-class _FrontDoor(ModuleType):
-    """This module. Importing the room `audit` does not hide the function of that name."""
+if not TYPE_CHECKING:  # with this function every name would be Any to a type checker
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _HOMES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _FrontDoor
+    def __getattr__(name: str) -> Any:
+        """Load what a name stands for, once it is asked for."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, _, attribute = _HOMES[name].partition(":")
+        if module.startswith(_COMPUTING):
+            refuse_lost_threads()
+        found = getattr(import_module(f"{__name__}.{module}"), attribute or name)
+        globals()[name] = found
+        return found

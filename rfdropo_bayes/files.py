@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import plain
 
 DATA_VARIABLE = "RFDROPO_DATA"
 _GLOB = "*?["
@@ -100,7 +101,7 @@ def write_json(path: Path, content: Any, *, finite: bool = False) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    write_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=not finite) + "\n")
+    write_text(path, json.dumps(plain(content), indent=2, ensure_ascii=False, allow_nan=not finite) + "\n")
 
 
 def append_line(path: Path, line: str) -> None:

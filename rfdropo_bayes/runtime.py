@@ -5,7 +5,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from pathlib import Path
+
+from rfdropo_bayes.errors import InputError
 
 # The rollout of a value and those of a central difference call out of a program at once; one thread is left to copy.
 CALLBACK_THREADS = 4
@@ -35,6 +38,37 @@ def keep_callback_threads() -> None:
     """
     if available_processors() < CALLBACK_THREADS:
         os.environ.setdefault("PJRT_NPROC", str(CALLBACK_THREADS))
+
+
+class _Fork:
+    """Whether this process was forked off after JAX had started its threads, which a fork leaves behind."""
+
+    without_threads = False
+
+
+def _after_fork() -> None:
+    bridge = sys.modules.get(
+        "jax._src.xla_bridge"
+    )  # asking JAX itself could wait for a lock that nobody holds any more
+    _Fork.without_threads |= bridge is not None and bool(getattr(bridge, "_backends", True))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def refuse_lost_threads() -> None:
+    """Refuse to compute in a forked process that JAX's threads are missing in: it would wait for them for ever.
+
+    Raises:
+        InputError: with the way out.
+    """
+    if _Fork.without_threads:
+        raise InputError(
+            "was forked after JAX had started, and JAX would wait for threads that it lacks",
+            where=f"process {os.getpid()}",
+            remedy='start workers with multiprocessing.get_context("spawn")',
+        )
 
 
 def configure_jax() -> None:

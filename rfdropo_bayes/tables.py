@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from rfdropo_bayes.errors import InputError
@@ -21,6 +23,34 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
 
 
+def read_toml(text: str) -> dict[str, Any]:
+    """Tables of a TOML text.
+
+    Raises:
+        tomllib.TOMLDecodeError: it is not TOML; the message says what to do about a path of Windows.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        place = re.search(r"line (\d+)", str(error))
+        line = text.splitlines()[int(place[1]) - 1] if place else ""
+        if '"' not in line or "\\" not in line:
+            raise
+        said = f"{error}: in double quotes a backslash begins a sign of its own; write paths with / or in single quotes"
+        raise tomllib.TOMLDecodeError(said) from None
+
+
+def plain(value: Any) -> Any:
+    """A value as TOML and JSON write it: NumPy's numbers become Python's, in tables and lists as well."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(plain(entry) for entry in value)
+    return value
+
+
 def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -> Parsed:
     """Validate a table.
 
@@ -29,7 +59,7 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
             unknown.
     """
     try:
-        return schema.model_validate(dict(table))
+        return schema.model_validate(plain(dict(table)))
     except ValidationError as error:
         # A renamed key is both unknown and missing: its own name says more.
         first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")

@@ -15,6 +15,7 @@ import psutil
 import pytest
 from jaxtyping import install_import_hook
 
+from rfdropo_bayes.runtime import keep_compilations
 from tests.costs import Costs, spent
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -38,18 +39,27 @@ def checked_modules() -> list[str]:
     return sorted(name for name in names if not name.endswith("__init__") and not name.startswith(UNCHECKED_MODULES))
 
 
-install_import_hook(checked_modules(), "beartype.beartype")
-
-
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--typed", action="store_true", help="check array shapes at run time (twice as slow)")
     parser.addoption("--drawn", metavar="COUNT", help="run so many of the tests, or so many percent, drawn by --by")
     parser.addoption("--by", metavar="SEED", default="", help="seed of --drawn")
     parser.addoption("--costs", metavar="FILE", help="write the processor seconds of every test to FILE, dearest first")
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--typed"):  # before any test imports a module that is checked
+        install_import_hook(checked_modules(), "beartype.beartype")
+    share_compilations()
     config.spent_so_far = spent()
     config.pluginmanager.register(Costs(config.getoption("--costs")), "costs")
+
+
+def share_compilations() -> None:
+    """Keep what JAX compiles where programs keep it, for all workers and for the next run: half of what tests cost."""
+    keep_compilations()
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    least = float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
 
 
 @pytest.hookimpl(trylast=True)  # after -m and -k
@@ -65,7 +75,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
-MOST_MEMORY = 1.0e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
+MOST_MEMORY = 2.5e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
 
 
 @pytest.fixture(scope="module", autouse=True)

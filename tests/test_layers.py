@@ -25,47 +25,24 @@ MAY_IMPORT: dict[str, set[str]] = {
     "mechanisms": {"robots", "fem", "simulators"},
     "bayes": {"data", "posteriors", "robots", "simulators", "mechanisms"},
     "inference": {"posteriors", "bayes"},
-    "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
+    "discrepancy": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
     "prediction": {"data", "posteriors", "simulators", "bayes", "inference"},
-    "report": {"data", "posteriors", "bayes", "inference", "audit"},
+    "report": {"data", "posteriors", "bayes", "inference", "discrepancy"},
     "policies": {"posteriors", "robots", "simulators", "mechanisms", "inference", "report"},
     "deployment": {"data", "robots"},
 }
 MAY_IMPORT["model"] = set(MAY_IMPORT)
 MAY_IMPORT["results"] = set(MAY_IMPORT)
 MAY_IMPORT["verbs"] = set(MAY_IMPORT)
-MAY_IMPORT["studies"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
+MAY_IMPORT["__init__"] = set(MAY_IMPORT)  # the front door: for type checkers alone
 
 WITHOUT_JAX = {"data", "posteriors", "robots", "deployment"}  # read recordings and drive motors on a small computer
 JAX_FAMILY = {"jax", "jaxlib", "numpyro", "blackjax"}
 
 MODULE_LINES = 700
-FUNCTION_LINES, FUNCTION_LINES_EVER = 60, 80  # the first without the docstring, the second with it
-# Functions longer than the rule, though never than the second figure, with the reason: "room/module.py:function".
-LONGER_FOR_A_REASON: dict[str, str] = {}
-MOST_ARGUMENTS = 10
-# Functions with more arguments than that, outside the command line, with the reason: "room/module.py:function".
-KERNEL = "a kernel of one lane block: what may be absent is an argument of its own, so that None is compiled away"
-MORE_ARGUMENTS_FOR_A_REASON: dict[str, str] = {
-    "data/in_memory.py:from_arrays": "a user's way in: every array, its names and its unit by name",
-    "verbs/audit.py:audit": "a user's way in: what an audit may be told, by name",
-    "simulators/adapters/mujoco_model.py:MuJoCo": "a user's way in: parts of a MuJoCo model by name",
-    "fem/rollouts.py:simulate": "the reference engine: state, commands and loads, each traced by itself",
-    "fem/native/contact_geometry.py:_list": "three vectors by component, as SIMD lanes have them",
-    "fem/native/layered_constraints.py:_hold": KERNEL,
-    "fem/native/layered_constraints.py:constrained_stage": KERNEL,
-    "fem/native/layered_rollout.py:begin_stage": KERNEL,
-    "fem/native/layered_rollout.py:rollout": KERNEL,
-    "fem/native/slip_rows.py:gather_slip": KERNEL,
-    "fem/native/tetrahedral_constraints.py:_condense": KERNEL,
-    "fem/native/tetrahedral_constraints.py:_weigh": KERNEL,
-    "fem/native/tetrahedral_constraints.py:end_stage": KERNEL,
-    "fem/native/tetrahedral_constraints.py:hold": KERNEL,
-    "fem/native/tetrahedral_constraints.py:hold_again": KERNEL,
-    "fem/native/tetrahedral_rollout.py:rollout": KERNEL,
-}
+FUNCTION_LINES = 120  # a page and a half
 NAMELESS = re.compile(r"(^|_)(utils?|utilities|helpers?|managers?|magic|misc|common|stuff)(_|$)")
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -116,21 +93,25 @@ def test_rooms_import_from_rooms_above_them_in_the_table_only() -> None:
 
 
 def test_every_room_is_in_the_table() -> None:
-    known = set(MAY_IMPORT) | FOUNDATION | {"__init__"}
+    known = set(MAY_IMPORT) | FOUNDATION
     assert {room_of(path) for path in MODULES} <= known
 
 
 def test_the_parser_sees_every_way_to_import() -> None:
     source = (
-        "import rfdropo_bayes.fem.layered\nfrom rfdropo_bayes import audit\nfrom . import cables\n"
+        "import rfdropo_bayes.fem.layered\nfrom rfdropo_bayes import discrepancy\nfrom . import cables\n"
         "from ..data import Trajectory\nfrom .. import report\ndef late():\n    from rfdropo_bayes.cli import main\n"
     )
     imported = imported_modules(source, ["rfdropo_bayes", "robots"])
-    assert forbidden_rooms("robots", imported) == {"fem", "audit", "data", "report", "cli"}
+    assert forbidden_rooms("robots", imported) == {"fem", "discrepancy", "data", "report", "cli"}
 
 
 def test_imports_come_from_above() -> None:
-    below = {relative(path): forbidden_rooms(room_of(path), imports_of(path)) for path in MODULES}
+    below = {
+        relative(path): forbidden_rooms(room_of(path), imports_of(path))
+        for path in MODULES
+        if room_of(path) != "__init__"  # the front door names what stands in every room
+    }
     wrong = {name: sorted(rooms) for name, rooms in below.items() if rooms}
     assert not wrong, f"imports from rooms below; see the table in docs/architecture.md: {wrong}"
 
@@ -159,13 +140,6 @@ def test_one_room_knows_arviz() -> None:
     assert not [relative(path) for path in others if "arviz" in {name.split(".")[0] for name in imports_of(path)}]
 
 
-def without_docstring(node: ast.FunctionDef | ast.AsyncFunctionDef, lines: int) -> int:
-    first = node.body[0]
-    if ast.get_docstring(node) is None:
-        return lines
-    return lines - ((first.end_lineno or first.lineno) - first.lineno + 1)
-
-
 def too_long(path: Path) -> list[str]:
     """What is longer in a module than the rules allow."""
     text, name = path.read_text(), relative(path)
@@ -173,34 +147,14 @@ def too_long(path: Path) -> list[str]:
     found = [f"{name}: {length} lines"] if length > MODULE_LINES else []
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            function = f"{name}:{node.name}"
             lines = (node.end_lineno or node.lineno) - node.lineno + 1
-            code = without_docstring(node, lines)
-            if lines > FUNCTION_LINES_EVER or (code > FUNCTION_LINES and function not in LONGER_FOR_A_REASON):
-                found.append(f"{function}: {code} lines, {lines} with its docstring")
+            if lines > FUNCTION_LINES:
+                found.append(f"{name}:{node.name}: {lines} lines")
     return found
 
 
-def test_modules_and_functions_are_short() -> None:
+def test_modules_and_functions_are_as_long_as_their_story_and_no_longer() -> None:
     assert not [line for path in MODULES for line in too_long(path)]
-
-
-def arguments_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """How many arguments a call may name, without self and cls."""
-    given = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-    return len(given) - (given[:1] in (["self"], ["cls"]))
-
-
-def test_functions_take_few_arguments() -> None:
-    """The command line has an argument for every option; elsewhere what belongs together is a record."""
-    many = {
-        f"{relative(path)}:{node.name}"
-        for path in MODULES
-        if room_of(path) != "cli"
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and arguments_of(node) > MOST_ARGUMENTS
-    }
-    assert many == set(MORE_ARGUMENTS_FOR_A_REASON), "group arguments into records, or name the reason here"
 
 
 def test_module_names_are_nouns_of_the_field() -> None:

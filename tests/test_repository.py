@@ -21,6 +21,7 @@ from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.robots import Robot
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+STUDIES = "studies/requirements.txt"
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 DOCUMENTS = sorted(REPOSITORY.glob("*.md")) + sorted((REPOSITORY / "docs").rglob("*.md"))
 
@@ -32,7 +33,10 @@ INDEX_OPTION = re.compile(r"--(?:extra-)?index[-]url|--find[-]links|--trusted[-]
 
 
 def requirements(extra: str | None) -> list[Requirement]:
-    lines = PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
+    if extra == STUDIES:
+        lines = [line for line in (REPOSITORY / STUDIES).read_text().splitlines() if not line.startswith("#")]
+    else:
+        lines = PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
     return [requirement for requirement in map(Requirement, lines) if requirement.name != PROJECT["name"]]
 
 
@@ -63,7 +67,7 @@ def tracked_text() -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("extra", [None, *PROJECT["optional-dependencies"]])
+@pytest.mark.parametrize("extra", [None, *PROJECT["optional-dependencies"], STUDIES])
 def test_every_dependency_is_pinned_inside_its_range(extra: str | None) -> None:
     pins = constraints()
     for requirement in requirements(extra):

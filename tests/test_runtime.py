@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
+import jax.numpy as jnp
 import pytest
 
-from rfdropo_bayes.runtime import CALLBACK_THREADS, keep_callback_threads, keep_compilations
+import rfdropo_bayes as rb
+from rfdropo_bayes.runtime import CALLBACK_THREADS, keep_callback_threads, keep_compilations, refuse_lost_threads
 
 VARIABLES = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
 
@@ -51,3 +56,49 @@ def test_callbacks_have_the_threads_that_they_wait_for(
         monkeypatch.delenv("PJRT_NPROC")
     keep_callback_threads()
     assert os.environ.get("PJRT_NPROC") == (None if threads is None else str(threads))
+
+
+def in_a_fork(body: Callable[[], bool]) -> bool:
+    """Whether something holds in a process that is forked off here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # JAX says that this may hang
+        child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # one that hangs dies
+        try:
+            os._exit(0 if body() else 1)
+        finally:
+            os._exit(2)
+    return os.waitpid(child, 0)[1] == 0
+
+
+def said(call: Callable[[], object]) -> str:
+    """What an error of the user's says; nothing without one."""
+    try:
+        call()
+    except rb.InputError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no forks")
+def test_a_fork_behind_the_back_of_jax_is_refused_in_one_line() -> None:
+    """Its threads are not there: a computation would wait for them for ever."""
+    jnp.zeros(1)
+    remedy = 'multiprocessing.get_context("spawn")'
+    refuse_lost_threads()
+    for call in (
+        refuse_lost_threads,
+        lambda: rb.simulate(None, []),
+        lambda: rb.calibrate(None),
+        lambda: rb.predict(None, []),
+    ):
+        assert in_a_fork(lambda call=call: remedy in said(call) and "\n" not in said(call))
+    assert in_a_fork(lambda: in_a_fork(lambda: remedy in said(refuse_lost_threads)))
+    refuse_lost_threads()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no forks")
+def test_a_fork_before_jax_has_started_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jax._src.xla_bridge._backends", {})
+    assert in_a_fork(lambda: said(refuse_lost_threads) == "")

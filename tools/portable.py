@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOMS = ("policies", "prediction", "audit", "inference", "bayes", "simulators", "fem")
+ROOMS = ("policies", "prediction", "discrepancy", "inference", "bayes", "simulators", "fem")
 """The rooms that compute; others read, write and print."""
 
 # Without a list of features Numba would take the name, and this processor's features with it.

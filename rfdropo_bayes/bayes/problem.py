@@ -4,7 +4,7 @@
 |---|---|
 | `Problem` | every method |
 | `ResidualProblem`, `BatchedResiduals` | climbs by Gauss-Newton |
-| `TraceableProblem` | climbs by Hessians, NUTS, nested sampling |
+| `TraceableProblem` | NUTS, nested sampling |
 | `WarmStart` | climbs that need not start at the prior |
 | `Hierarchy` | climbs of a posterior some of whose parameters are standard deviations of others |
 | `RolloutProblem` | RF-DROPO, and methods that learn from simulations |
@@ -26,6 +26,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.errors import InputError
+
+LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
 # Arrays of JAX or of NumPy: a problem takes and returns either.
 Values = Mapping[str, Float[Any, " n"]]
@@ -100,25 +102,14 @@ Derivatives = tuple[Callable[[Any], Any], Callable[[Any], Any]]
 
 
 @runtime_checkable
-class ClimbedProblem(Problem, Protocol):
-    """A problem with the derivatives of its log prior.
-
-    Attributes:
-        prior_derivatives: of the log prior.
-    """
-
-    @property
-    def prior_derivatives(self) -> Derivatives: ...
-
-
-@runtime_checkable
-class ResidualProblem(ClimbedProblem, Protocol):
+class ResidualProblem(Problem, Protocol):
     """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it.
 
     Attributes:
         physical_names: parameters that the simulation depends on; the others are noise. All of ``names`` where that is
             not known: it is then found out.
         jacobian: how Jacobians are to be taken: "forward", "central", or "auto".
+        prior_derivatives: of the log prior.
     """
 
     @property
@@ -126,6 +117,9 @@ class ResidualProblem(ClimbedProblem, Protocol):
 
     @property
     def jacobian(self) -> str: ...
+
+    @property
+    def prior_derivatives(self) -> Derivatives: ...
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Any, " m"]:
         """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
@@ -146,8 +140,8 @@ class BatchedResiduals(ResidualProblem, Protocol):
 
 
 @runtime_checkable
-class TraceableProblem(ClimbedProblem, Protocol):
-    """A problem whose likelihood JAX can trace; NUTS and Hessians also differentiate it."""
+class TraceableProblem(Problem, Protocol):
+    """A problem whose likelihood JAX can trace; NUTS also differentiates it."""
 
     def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
         """Log likelihood of all rows at one unconstrained point."""
@@ -294,6 +288,26 @@ def with_rollouts(problem: Problem) -> RolloutProblem:
     if not isinstance(problem, RolloutProblem):
         raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
     return problem
+
+
+def traced_densities(problem: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Log prior and log likelihood of one unconstrained point, traceable.
+
+    Raises:
+        InputError: the problem has no likelihood that JAX can trace.
+    """
+    if not isinstance(problem, TraceableProblem):
+        what, remedy = "this problem has no likelihood that JAX can trace", 'use method = "smc"'
+        raise InputError(what, where="[inference] method", remedy=remedy)
+
+    def prior(u: Float[Array, " d"]) -> Float[Array, ""]:
+        return jnp.asarray(problem.log_prior(u[None]))[0]
+
+    def likelihood(u: Float[Array, " d"]) -> Float[Array, ""]:
+        value = problem.log_likelihood_at(u)
+        return jnp.where(jnp.isfinite(value), value, LOWEST)
+
+    return prior, likelihood
 
 
 CAPABILITIES: dict[str, type] = {

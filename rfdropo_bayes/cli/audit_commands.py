@@ -1,4 +1,4 @@
-"""Commands around the audit: what the simulator lacks, what to measure next, how often the audit is right."""
+"""Commands around the audit: what the simulator lacks, and what to measure next."""
 
 from __future__ import annotations
 
@@ -17,29 +17,24 @@ from rfdropo_bayes.cli.options import (
     Resume,
     Seed,
     folder_for,
-    say_progress,
     see_calibration,
 )
 from rfdropo_bayes.cli.terminal_summary import say, show_audit
 from rfdropo_bayes.errors import InputError
 
-Base = Annotated[
-    Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
+Fit = Annotated[
+    Path | None, typer.Option("--from", help="folder of an earlier calibration, to start the base model from")
 ]
 
 
 def audit(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    base: Base = None,
+    fit: Fit = None,
     between: Annotated[
         tuple[str, str] | None,
         typer.Option("--between", metavar="GROUP GROUP", help="name what differs between two of [model.groups]"),
     ] = None,
-    separate: Annotated[
-        bool,
-        typer.Option("--separate", help="only say which mechanisms of [separation] the recordings tell apart"),
-    ] = False,
     seed: Seed = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -48,31 +43,20 @@ def audit(
     overrides: Overrides = None,
 ) -> None:
     """Name what the simulator lacks. Writes audit.json, extended.toml and report.html."""
-    see_calibration(base, "--base")
-    if separate and between is not None:
-        raise InputError("groups are compared by the search only", where="--separate", remedy="leave --between out")
-    command = "separate" if separate else "audit"
-    folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
+    see_calibration(fit, "--from")
+    folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
-
-    if separate:
-        from rfdropo_bayes.verbs.separate import TABLE, separate_mechanisms
-
-        model, said = Model.read(experiment, overrides), say_progress(quiet)
-        told = separate_mechanisms(model, folder, base=base, seed=seed, resume=resume, overwrite=overwrite, report=said)
-        say(told, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
-        return
     from rfdropo_bayes.verbs.audit import audit as ask
 
     found = ask(
         Model.read(experiment, overrides),
         out=folder,
-        base=base,
+        fit=fit,
         between=between,
         seed=seed,
         resume=resume,
         overwrite=overwrite,
-        report=say_progress(quiet),
+        show=not quiet,
     )
     show_audit(found.content, folder, quiet=quiet, as_json=as_json)
 
@@ -80,7 +64,7 @@ def audit(
 def design(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    base: Base = None,
+    fit: Fit = None,
     adapt: Annotated[
         bool, typer.Option("--adapt", help="propose the shortest recording of another day that rfdropo adapt needs")
     ] = False,
@@ -99,9 +83,9 @@ def design(
     overrides: Overrides = None,
 ) -> None:
     """Propose commands that tell causes apart. Writes next_commands.csv and design.json."""
-    see_calibration(base, "--base")
-    if adapt and base is None:
-        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --base")
+    see_calibration(fit, "--from")
+    if adapt and fit is None:
+        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --from")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.results.calibrated import Calibration
@@ -110,46 +94,11 @@ def design(
     from rfdropo_bayes.verbs.design_day import design_day
 
     model = Model.read(experiment, overrides)
-    options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "report": say_progress(quiet)}
-    if adapt and base is not None:
-        found = design_day(Calibration.of_posterior(base, model), seconds=seconds, group=group, **options)
+    options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "show": not quiet}
+    if adapt and fit is not None:
+        found = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
     else:
-        found = propose(model, base=base, **options)
+        found = propose(model, fit=fit, **options)
     commands = folder / COMMANDS
     content = {**found.content, "commands": str(commands)}
     say(content, found.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)
-
-
-def benchmark_audit(
-    datasets: Annotated[int, typer.Option(help="data sets per condition")] = 100,
-    seed: Annotated[int, typer.Option(help="seed of the study")] = 0,
-    condition: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="only this condition; may be repeated")
-    ] = None,
-    hide: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="mechanism to hide; may be repeated; all by default")
-    ] = None,
-    exclude: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="mechanism to leave out; may be repeated")
-    ] = None,
-    cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
-    truth: Annotated[
-        str, typer.Option("--truth", help="engine that makes recordings: own, mujoco or pyelastica")
-    ] = "own",
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
-) -> None:
-    """Count how often audits are right. Effects are hidden in recordings; a study goes on where it was stopped."""
-    if truth not in ("own", "mujoco", "pyelastica"):
-        raise InputError(f"unknown engine {truth!r}", where="--truth", remedy="own, mujoco or pyelastica")
-    if truth != "own":
-        from rfdropo_bayes.studies.engine_study import TABLE as ENGINES
-        from rfdropo_bayes.studies.engine_study import run_engine_study
-
-        run_engine_study(out, datasets, seed, engine=truth, effects=hide or [])
-        typer.echo((out / ENGINES).read_text(encoding="utf-8"))
-        return
-    from rfdropo_bayes.studies.audit_study import TABLE, run_study
-
-    chosen = {"conditions": condition or [], "mechanisms": hide or [], "exclude": exclude or []}
-    run_study(out, datasets, seed, cluster=cluster, **chosen)
-    typer.echo((out / TABLE).read_text(encoding="utf-8"))

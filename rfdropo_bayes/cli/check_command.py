@@ -19,7 +19,7 @@ PROBLEMS = 2
 def check(
     experiment: ExperimentFile,
     out: Annotated[
-        Path | None, typer.Option("--out", help="folder of the pictures; by default reports/EXPERIMENT-check")
+        Path | None, typer.Option("--out", help="folder of the pictures; by default runs/EXPERIMENT-check")
     ] = None,
     overrides: Overrides = None,
     quick: Annotated[
@@ -30,7 +30,7 @@ def check(
     and says what a fit could determine and how long it takes."""
     from rfdropo_bayes.verbs.check import run_check
 
-    folder = out or Path("reports") / f"{experiment_name(experiment)}-check"
+    folder = out or Path("runs") / f"{experiment_name(experiment)}-check"
     found = run_check(experiment, folder, overrides or [], ahead=not quick)
     width = max(len(label) for label, _ in found.lines)
     for label, text in found.lines:

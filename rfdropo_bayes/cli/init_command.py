@@ -40,6 +40,31 @@ class Questions:
             self.assumed.add(key)
         return reply
 
+    def names(self, file: Path, given: str | None, commands: int | None, markers: str | None) -> list[str] | None:
+        """Names of the columns of a CSV without names; None where it has names."""
+        from rfdropo_bayes.data.csv_table import unnamed_rows
+        from rfdropo_bayes.data.mapped_formats import recognised_format
+        from rfdropo_bayes.verbs.column_names import suggested_names
+
+        if given is not None or recognised_format(file) != "csv":
+            return _listed(given)
+        rows = unnamed_rows(file)
+        if rows is None:
+            return None
+        heights = [part.partition("=")[0].strip() for part in (markers or "").split(",") if part.strip()]
+        likely = ",".join(suggested_names(rows, commands, heights) or [])
+        shown = [", ".join(row) for row in rows]
+        if self.ask:
+            typer.echo("\n".join([f"{file} has no names of columns. Its first rows:", *shown]))
+            return _listed(typer.prompt(f"Names of the {len(rows[0])} columns", default=likely or None))
+        raise InputError(
+            f"the first line holds values, not the names of its {len(rows[0])} columns: {'; '.join(shown[:2])}",
+            where=str(file),
+            remedy=f'if they are in this order, write {likely} above it, or give --names "{likely}"'
+            if likely
+            else 'write a line of names above it, or give --names "t,c1,c2,c3,c4,tip_x,tip_y,tip_z" with all of them',
+        )
+
     def counts(self, guess: Any, given: float | None) -> float | None:
         """Counts in one turn of the spool; None where nothing is in counts. They have no default: gears differ."""
         if given is not None or not guess.counts:
@@ -76,7 +101,9 @@ InnerRadius = Annotated[
     float | None,
     typer.Option("--inner-radius-mm", help="radius of the hollow of a tube, or of the backbone of disks [mm]"),
 ]
-NumberOfDisks = Annotated[int, typer.Option("--disks", help="number of disks")]
+NumberOfDisks = Annotated[
+    int | None, typer.Option("--disks", help="number of disks; 10 by default, or the next multiple of the segments")
+]
 DiskThickness = Annotated[float, typer.Option("--disk-thickness-mm", help="thickness of each disk [mm]")]
 Segments = Annotated[int | None, typer.Option(help="number of segments, each with its own cables")]
 Cables = Annotated[int | None, typer.Option(help="number of cables of each segment")]
@@ -90,6 +117,14 @@ CommandUnit = Annotated[
 CountsPerTurn = Annotated[
     float | None,
     typer.Option(help="counts of an encoder, or steps of a drive, in one turn of the spool, gear included"),
+]
+Names = Annotated[
+    str | None,
+    typer.Option(help='names of all columns of a CSV without a line of names: "t,c1,c2,c3,c4,tip_x,tip_y,tip_z"'),
+]
+CommandNames = Annotated[str | None, typer.Option("--command-names", help="the same for the CSV that --commands names")]
+SampleTime = Annotated[
+    float | None, typer.Option("--sample-time", help="seconds from row to row, if no column holds times")
 ]
 PositionUnit = Annotated[str | None, typer.Option(help="mm, cm or m; guessed from a recording")]
 SpoolRadius = Annotated[float | None, typer.Option("--spool-radius-mm", help="radius of the motors' spools [mm]")]
@@ -123,7 +158,7 @@ def init(
     radius: Radius = None,
     tip_radius: TipRadius = None,
     inner_radius: InnerRadius = None,
-    disks: NumberOfDisks = 10,
+    disks: NumberOfDisks = None,
     disk_thickness: DiskThickness = 3.0,
     segments: Segments = None,
     cables: Cables = None,
@@ -132,6 +167,9 @@ def init(
     command_unit: CommandUnit = None,
     counts_per_turn: CountsPerTurn = None,
     position_unit: PositionUnit = None,
+    names: Names = None,
+    command_names: CommandNames = None,
+    sample_time: SampleTime = None,
     spool_radius: SpoolRadius = None,
     gravity: Gravity = None,
     mass: Mass = None,
@@ -140,18 +178,30 @@ def init(
     defaults: Defaults = False,
 ) -> None:
     """Write a first robot file and experiment file. Asks for what options and recordings do not say."""
-    from rfdropo_bayes.verbs.init import assumed_of_columns, matching_commands, matching_recordings, write_first_files
+    from rfdropo_bayes.verbs.init import (
+        assumed_of_columns,
+        matching_commands,
+        matching_recordings,
+        of_robot,
+        with_counts,
+        with_given,
+        write_first_files,
+    )
 
     ask = Questions(sys.stdin.isatty() and not defaults)
     files = matching_recordings(recording or [])
     sent = matching_commands(commands or [], files)
-    guess = _guess(ask, files, sent, command_unit, position_unit, counts_per_turn) if files else None
+    guess = None
+    if files:
+        columns = ask.names(files[0], names, None if cables is None else cables * (segments or 1), markers)
+        guess = _columns(files[0], sent, columns, command_names)
+        guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
+        guess = with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None)
     if folder.suffix in MODELS:
         _init_model(folder, files, sent, guess)
         return
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
-    if unit not in UNITS:
-        raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}")
+    _check_unit(unit, guess)
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
     answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
@@ -163,6 +213,7 @@ def init(
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
     outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
+    guess = None if guess is None else of_robot(guess, outline)
     for path in write_first_files(folder, outline, files, sent, guess):
         typer.echo(f"wrote {path}")
     if ask.assumed:
@@ -172,19 +223,30 @@ def init(
     typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(folder / 'experiment.toml')])}")
 
 
-def _guess(
-    ask: Questions,
-    files: list[Path],
-    sent: list[Path],
-    command_unit: str | None,
-    position_unit: str | None,
-    counts: float | None,
-) -> Guess:
-    """What the columns of the first recording are, with the counts of one turn where any are in counts."""
-    from rfdropo_bayes.verbs.init import guess_units, with_counts
+def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:
+    """What the columns of the first recording are."""
+    from rfdropo_bayes.verbs.column_names import guess_columns
 
-    guess = guess_units(files[0], sent[0] if sent else None, command_unit, position_unit)
-    return with_counts(guess, ask.counts(guess, counts), command_unit is not None)
+    return guess_columns(file, sent[0] if sent else None, names, _listed(command_names))
+
+
+def _listed(names: str | None) -> list[str] | None:
+    return None if names is None else [name.strip() for name in names.split(",")]
+
+
+def _check_unit(unit: str, guess: Guess | None) -> None:
+    """Raise an InputError if commands are neither lengths of cable nor angles of motors."""
+    if unit in UNITS:
+        return
+    remedy = f"use one of {', '.join(UNITS)}"
+    if guess is None or unit != guess.command_unit:
+        raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=remedy)
+    raise InputError(
+        f"commands are in {unit!r} ({', '.join(guess.commands)}), neither lengths of cable nor angles of a motor",
+        where="--recording",
+        remedy="record what the cables or motors do, or convert it; if a turn of the spool is so many of them, give "
+        "--command-unit counts and --counts-per-turn",
+    )
 
 
 def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
@@ -219,7 +281,7 @@ def _body(
     return {"shape": form, "length": long, "radius": wide, "tip_radius": tip, "cable_radius": apart}
 
 
-def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed: set[str]) -> RobotOutline:
+def _outline(name: str, disks: int | None, unit: str, answers: dict[str, Any], assumed: set[str]) -> RobotOutline:
     """The robot, in SI units."""
     from rfdropo_bayes.robots.outline import RobotOutline
 
@@ -229,6 +291,7 @@ def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
     kind: Literal["m", "rad"] = "rad" if unit in ANGLES else "m"
+    assumed |= {"disks"} if given["shape"] == "disks" and disks is None else set()
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
 
 

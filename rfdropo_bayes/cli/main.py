@@ -73,41 +73,27 @@ def calibrate(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
-    check: Annotated[
-        str | None,
-        typer.Option(metavar="sbc", help="instead of fitting, check the method by simulation-based calibration"),
-    ] = None,
-    datasets: Annotated[int, typer.Option(help="number of data sets of a check")] = 200,
-    start: Annotated[
+    fit: Annotated[
         Path | None,
         typer.Option("--from", help="folder of an earlier calibration of this robot, to start climbs from"),
     ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Fit the simulator to recordings. Writes posterior.nc, summary.json and report.html."""
-    if check is not None and start is not None:
-        raise InputError("a check has no start", where="--from", remedy="leave it out")
-    see_calibration(start, "--from")
-    command = "calibrate" if check is None else "check"
-    folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
-    if check is not None:
-        posterior_commands.check(experiment, folder, check, datasets, overrides or [], resume, overwrite)
-        return
+    see_calibration(fit, "--from")
+    folder = folder_for("calibrate", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
-    from rfdropo_bayes.verbs.calibrate import calibrate as fit
+    from rfdropo_bayes.verbs.calibrate import calibrate as run_fit
 
     shown = False if quiet else None
     model = Model.read(experiment, overrides)
-    found = fit(model, out=folder, start=start, resume=resume, overwrite=overwrite, show=shown)
+    found = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite, show=shown)
     show_calibration(found, experiment, quiet=quiet, as_json=as_json)
 
 
 def simulate(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    balance: Annotated[
-        bool, typer.Option("--balance", help="also write base reaction, energies and work to the NetCDF")
-    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -120,7 +106,7 @@ def simulate(
     from rfdropo_bayes.verbs.simulate import simulate_all
 
     say_step(f"simulating the recordings of {experiment}", show=False if quiet or as_json else None)
-    found = simulate_all(Model.read(experiment, overrides), folder, balance=balance, overwrite=overwrite)
+    found = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
     show_simulation(found, quiet=quiet, as_json=as_json)
 
 
@@ -150,48 +136,47 @@ for listing in (
 ):
     app.command()(listing)
 
-benchmark = typer.Typer(help="Comparisons that take hours. Each can be interrupted and resumed.", no_args_is_help=True)
-benchmark.command()(posterior_commands.table1)
-benchmark.command()(policy_commands.table2)
-benchmark.command("audit")(audit_commands.benchmark_audit)
-app.add_typer(benchmark, name="benchmark")
-
 
 def main() -> None:
-    """Run the command line; bad input ends with one line on stderr and status 2, an interrupted run with status 3."""
+    """Run the command line of the package."""
+    run(app, "rfdropo")
+
+
+def run(commands: typer.Typer, name: str) -> None:
+    """Run a command line; bad input ends with one line on stderr and status 2, an interrupted run with status 3."""
     try:
         watch_interrupts()
-        # Not app(): Typer's own main keeps KeyboardInterrupt to itself.
-        command = typer.main.get_command(app)
-        with command.make_context("rfdropo", sys.argv[1:]) as context:
+        # Not commands(): Typer's own main keeps KeyboardInterrupt to itself.
+        command = typer.main.get_command(commands)
+        with command.make_context(name, sys.argv[1:]) as context:
             command.invoke(context)
         sys.exit(0)
     except typer.Exit as done:
         sys.exit(done.exit_code)
     except InputError as error:
-        print(f"rfdropo: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         sys.exit(INPUT_ERROR)
     except USAGE_ERROR as error:
-        if len(sys.argv) == 1 or sys.argv[1:] == ["benchmark"]:  # no argument is a question for help
+        if len(sys.argv) == 1:  # no argument is a question for help
             print(error)
             sys.exit(0)
-        print(f"rfdropo: {error}; see rfdropo --help", file=sys.stderr)
+        print(f"{name}: {error}; see {name} --help", file=sys.stderr)
         sys.exit(INPUT_ERROR)
     except OSError as error:
         if error.filename is None or error.errno not in OF_THE_USER:
             raise
-        print(f"rfdropo: {unwritten(error, Path(error.filename))}", file=sys.stderr)
+        print(f"{name}: {unwritten(error, Path(error.filename))}", file=sys.stderr)
         sys.exit(INPUT_ERROR)
     except (KeyboardInterrupt, typer.Abort) as stop:
-        print(f"rfdropo: {_after(stop)}", file=sys.stderr)
+        print(f"{name}: {_after(stop, name)}", file=sys.stderr)
         sys.exit(EXIT_STATUS)
 
 
-def _after(stop: BaseException) -> str:
+def _after(stop: BaseException, name: str) -> str:
     """What an interrupted user can do next."""
     again = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
     if isinstance(stop, Interrupted) and stop.going_on is not None:
-        command = shlex.join(["rfdropo", *again, *stop.going_on.split()])
+        command = shlex.join([*name.split(), *again, *stop.going_on.split()])
         return f"interrupted; what is done is kept in {stop.folder}; to go on: {command}"
     if isinstance(stop, Interrupted):
         return f"interrupted; {stop.folder} holds no result; to start again: {shlex.join(['rfdropo', *again])}"

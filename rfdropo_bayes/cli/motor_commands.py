@@ -28,9 +28,7 @@ def register(app: typer.Typer) -> None:
 def deploy(
     deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="the deployment file")],
     mode: Annotated[str, typer.Option(help="check, home, dry-run, shadow, run or replay")] = "dry-run",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="folder of the session; by default reports/NAME-TIME")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="folder of the session; by default runs/NAME-TIME")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="what to replay: a session's folder, or a trajectory")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no live view")] = False,
@@ -46,7 +44,7 @@ def deploy(
 
     if mode not in set(Mode):
         raise InputError(f"unknown mode {mode!r}", where="--mode", remedy=f"choose one of {', '.join(Mode)}")
-    folder = out or Path("reports") / f"{deployment.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folder = out or Path("runs") / f"{deployment.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     show = not quiet and sys.stdout.isatty() and mode != "check"
     settings = load_deployment(deployment, overrides or [])
     if not quiet and (simulated or mode == Mode.DRY_RUN):

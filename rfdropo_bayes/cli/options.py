@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.interrupts import check_interrupt
 from rfdropo_bayes.model.experiment_file import look_through
 from rfdropo_bayes.model.run_folder import check_folder
 
@@ -19,7 +17,7 @@ OutFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="folder to write to  [default: reports/EXPERIMENT_COMMAND; of calibrate reports/EXPERIMENT; "
+        help="folder to write to  [default: runs/EXPERIMENT_COMMAND; of calibrate runs/EXPERIMENT; "
         "of DIR/experiment.toml the name of DIR]",
     ),
 ]
@@ -58,7 +56,7 @@ def folder_for(
     look_through(experiment, overrides or [])
     title = experiment_name(experiment)
     name = title if command == "calibrate" else f"{title}_{command.split()[0]}"
-    folder = out or Path("reports") / name
+    folder = out or Path("runs") / name
     check_folder(folder, command, resume=resume, overwrite=overwrite)
     return folder
 
@@ -81,15 +79,3 @@ def see_calibration(folder: Path | None, option: str) -> None:
         raise InputError(
             f"{folder} holds no posterior.nc", where=option, remedy="name the folder of a finished rfdropo calibrate"
         )
-
-
-def say_progress(quiet: bool = False) -> Callable[[str], None]:
-    """Lines of progress on the standard error stream, so that results alone are on the standard output."""
-    began = time.monotonic()
-
-    def say(line: str) -> None:
-        check_interrupt()
-        if not quiet:
-            typer.echo(f"  {time.monotonic() - began:5.0f} s  {line}", err=True)
-
-    return say

@@ -12,11 +12,10 @@ def view(
     source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="what to draw")],
     out: Annotated[
         Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
-    ] = Path("reports/view.png"),
+    ] = Path("runs/view.png"),
     recording: Annotated[
         str | None, typer.Option(help="which recording of an experiment; the first by default")
     ] = None,
-    rate: Annotated[int, typer.Option(min=1, help="frames per second of an animation")] = 20,
     robot: Annotated[
         Path | None, typer.Option(help="file of the robot, where a NetCDF file has none beside it")
     ] = None,
@@ -27,5 +26,5 @@ def view(
     """Draw a motion. Simulates an experiment, or reads a NetCDF file of simulate or predict."""
     from rfdropo_bayes.verbs.view import run_view
 
-    written = run_view(source, out, overrides or [], recording, rate, robot)
+    written = run_view(source, out, overrides or [], recording, robot)
     typer.echo(f"{written[0]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -22,14 +21,13 @@ from rfdropo_bayes.cli.options import (
 )
 from rfdropo_bayes.cli.terminal_summary import say
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.model.run_folder import check_folder
 
 
 def train(
     experiment: Annotated[
         Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; not beside --from")
     ] = None,
-    calibration: Annotated[
+    fit: Annotated[
         Path | None, typer.Option("--from", help="folder of a calibration: its model, under draws of its posterior")
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="reach or push; that of the experiment by default")] = None,
@@ -44,11 +42,11 @@ def train(
     overrides: Overrides = None,
 ) -> None:
     """Train a policy and play it. Writes report.html, policy.onnx, its card and its learning curve."""
-    if (experiment is None) == (calibration is None):
+    if (experiment is None) == (fit is None):
         raise InputError("takes an experiment file or --from DIR", where="train", remedy="give one of them")
-    see_calibration(calibration, "--from")
-    if calibration is not None:
-        experiment, out = calibration / "config.toml", out or calibration.with_name(f"{calibration.name}_train")
+    see_calibration(fit, "--from")
+    if fit is not None:
+        experiment, out = fit / "config.toml", out or fit.with_name(f"{fit.name}_train")
     assert experiment is not None
     overrides = [*(overrides or []), *_task_and_goal(task, goal)]
     folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
@@ -58,9 +56,9 @@ def train(
     from rfdropo_bayes.verbs.train import train as learn
 
     model = Model.read(experiment, overrides)
-    if calibration is not None:
+    if fit is not None:
         model = with_training(model, {"randomisation": "posterior"})
-    found = learn(model, folder, posterior=calibration, resume=resume, overwrite=overwrite)
+    found = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
     done = f"after {found['steps']} steps in {found['seconds']:.0f} s: {learnt(found)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
@@ -112,54 +110,3 @@ def evaluate(
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}
-VIRTUAL = Path("experiments/virtual")
-
-
-def table2(
-    experiments: Annotated[
-        list[Path] | None, typer.Argument(metavar="EXPERIMENT.toml", help="one file for each task")
-    ] = None,
-    target: Annotated[Path, typer.Option(help="experiment file of the robot that policies are evaluated on")] = VIRTUAL
-    / "truth.toml",
-    audited: Annotated[Path, typer.Option("--audit", help="experiment file of the audit")] = VIRTUAL / "audit.toml",
-    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table2"),
-    seeds: Annotated[int, typer.Option(help="number of policies trained for each row")] = 3,
-    steps: Annotated[int, typer.Option(help="number of environment steps of a training")] = 1_000_000,
-    episodes: Annotated[int, typer.Option(help="number of episodes of an evaluation, the same for all policies")] = 200,
-    budget: Annotated[int, typer.Option(help="number of rollouts of a fit")] = 10_000,
-    minutes: Annotated[float, typer.Option(help="time limit of the audit, in minutes")] = 65.0,
-    exact_oracle: Annotated[
-        bool, typer.Option("--exact-oracle", help="train the oracle on the target's own mesh and time step; slower")
-    ] = False,
-    rows: Annotated[
-        list[str] | None, typer.Option("--row", metavar="NAME", help="only this row; may be repeated")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with an interrupted study")] = False,
-    only_done: Annotated[
-        bool, typer.Option("--only-done", help="write the tables of an interrupted study as far as it is done")
-    ] = False,
-    overwrite: Overwrite = False,
-) -> None:
-    """Make the paper's Table II. Plays policies of every method on a robot that they never touched."""
-    check_folder(out, "benchmark table2", resume=resume or only_done, overwrite=overwrite)
-    from rfdropo_bayes.studies.table2 import Table2Size, run_table2
-
-    content = run_table2(
-        experiments or [VIRTUAL / "push.toml", VIRTUAL / "reach.toml"],
-        target,
-        audited,
-        out,
-        Table2Size(seeds, steps, episodes, budget, minutes, exact_oracle),
-        rows=rows or (),
-        resume=resume,
-        only_done=only_done,
-        overwrite=overwrite,
-        command=shlex.join(["rfdropo", *sys.argv[1:]]),
-    )
-    for claim in content["claims"]:
-        typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.2f}")
-    for cell, why in content["failed"].items():
-        typer.echo(f"failed: {cell}: {why}")
-    if content["not_done"]:
-        typer.echo(f"{content['not_done']} cells are not done: go on with --resume")
-    typer.echo(f"table: {out / 'table2.md'}")

@@ -31,14 +31,9 @@ def predict(
     ],
     commands: Annotated[str, typer.Option("--commands", help="file of commands, in the format of the experiment")],
     out: Annotated[Path, typer.Option("--out", help="folder to write to")],
-    posterior: Annotated[
-        Path | None, typer.Option("--posterior", help="folder of its calibration; DIR by default")
-    ] = None,
+    fit: Annotated[Path | None, typer.Option("--from", help="folder of its calibration; DIR by default")] = None,
     start: Annotated[
         str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
-    ] = None,
-    rows: Annotated[
-        str | None, typer.Option("--rows", metavar="FIRST:LAST", help="observation rows, counted from 0, both included")
     ] = None,
     episode: Episode = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
@@ -50,24 +45,23 @@ def predict(
 ) -> None:
     """Predict the motion under new commands. Writes mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
     if experiment.is_dir():
-        posterior, experiment = posterior or experiment, experiment / "config.toml"
-    if posterior is None:
-        raise InputError("no posterior was named", where="predict", remedy="add --posterior, or give a run's folder")
-    see_calibration(posterior, "--posterior")
+        fit, experiment = fit or experiment, experiment / "config.toml"
+    if fit is None:
+        raise InputError("no calibration was named", where="predict", remedy="add --from, or give a run's folder")
+    see_calibration(fit, "--from")
     look_through(experiment, overrides or [])
     check_folder(out, "predict", overwrite=overwrite)
     from rfdropo_bayes.inference.progress import say_step
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.predict import run_prediction
 
-    say_step(f"predicting {commands} with draws of {posterior}", show=False if quiet or as_json else None)
+    say_step(f"predicting {commands} with draws of {fit}", show=False if quiet or as_json else None)
     facts = run_prediction(
         Model.read(experiment, overrides),
-        posterior,
+        fit,
         _from_here(commands),
         out,
         start=None if start is None else _from_here(start),
-        rows=_window(rows),
         episode=episode,
         seed=seed,
         group=group,
@@ -88,9 +82,6 @@ def adapt(
         float | None, typer.Option(help="length of the beginning that is used, in seconds; all by default")
     ] = None,
     group: Group = None,
-    experiment: Annotated[
-        Path | None, typer.Option("--experiment", help="the experiment file, where DIR holds a posterior alone")
-    ] = None,
     seed: Annotated[int | None, typer.Option(help="seed; that of the experiment by default")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -110,7 +101,7 @@ def adapt(
     )
     found = run_adaptation(
         run,
-        fitted_model(run, experiment, overrides),
+        fitted_model(run, overrides),
         entry,
         out,
         seconds=seconds,
@@ -125,12 +116,3 @@ def adapt(
 def _from_here(name: str) -> str:
     """A path that counts from the current folder, where there is such a recording; else as the experiment has it."""
     return str(Path(name).resolve()) if Path(name).exists() else name
-
-
-def _window(rows: str | None) -> tuple[int, int] | None:
-    if rows is None:
-        return None
-    first, _, last = rows.partition(":")
-    if not (first.isdecimal() and last.isdecimal()):
-        raise InputError(f"{rows!r} is not FIRST:LAST", where="--rows", remedy="e.g. --rows 10000:15000")
-    return int(first), int(last)

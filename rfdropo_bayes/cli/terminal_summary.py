@@ -29,7 +29,7 @@ COLOURS = {
     "unexplained": BAD,
 }
 CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "cautions")
-AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
+AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment", "cautions")
 MOST_ROWS = 20
 
 
@@ -71,7 +71,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
             console.print(sentence, soft_wrap=True)
     ready = experiment is None or found.verdict == "safe"
     words = (
-        ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--base", str(folder)]
+        ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--from", str(folder)]
     )
     console.print(f"next: {shlex.join(['rfdropo', *words, '--out', 'OUT'])}", soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
@@ -91,6 +91,8 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     console.print(verdict + Text(f": {first}", style="not bold"), soft_wrap=True)
     for sentence in further:
         console.print(Text(sentence), soft_wrap=True)
+    for caution in found["cautions"]:
+        console.print(Text(f"caution: {caution['sentence']}", style=FAIR), soft_wrap=True)
     rows = [
         (name, row, finding["mechanism"].replace("_", " "))
         for finding in found["findings"]

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import codecs
-import csv
 import difflib
 import gzip
 import io
-import re
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from rfdropo_bayes.data.csv_layout import SAMPLED, cells_of, dialect_of, header_of, is_value, units_above, without_names
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
+HEAD = 100_000
+"""Letters of a file that hold its first rows."""
 MOTIVE = "Format Version"
 """How the first line of an export of Motive's begins."""
 
@@ -72,48 +72,29 @@ def _decoded(raw: bytes) -> str:
     return raw.decode("latin-1")
 
 
-class Dialect(NamedTuple):
-    """How a CSV file separates its values, and what stands before their decimals."""
+def unnamed_rows(path: Path) -> list[list[str]] | None:
+    """The cells of the first rows of a CSV that has no names of columns; None if it has names.
 
-    separator: str
-    decimal: str
-
-
-def dialect_of(lines: Sequence[str]) -> Dialect:
-    """Separator of a file (comma, semicolon or tab, whichever gives its header the most names) and decimal sign.
-
-    Spaces separate where none of these does and all lines have as many words. Decimals follow a comma where cells do
-    that are not separated by commas, or are quoted.
+    Raises:
+        InputError: see `read_text`.
     """
-    separator = max(",;\t", key=lambda sign: len(_cells(lines[0], sign)))
-    if (
-        len(_cells(lines[0], separator)) == 1 < len(lines[0].split())
-        and len({len(line.split()) for line in lines}) == 1
-    ):
-        separator = " "
-    wall = '"' if separator == "," else f'["{separator}]'
-    comma = re.compile(rf"(?:^|{wall})\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*(?:$|{wall})")
-    if separator == "," and '"' not in "".join(lines[1:]):
-        return Dialect(separator, ".")
-    return Dialect(separator, "," if any(comma.search(line) for line in lines[1:]) else ".")
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return line.split()
-    if '"' not in line:
-        return line.split(separator)
-    return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    lines = read_text(path)[:HEAD].splitlines()[: SAMPLED + 1]
+    separator = dialect_of(lines).separator if lines else ","
+    if len(lines) < 2 or not without_names(lines, separator):
+        return None
+    return [[cell.strip() for cell in cells_of(line, separator)] for line in lines[:3]]
 
 
 class CsvTable:
     """A rectangular table of numbers with named columns.
 
-    Values may be separated by commas, semicolons, tabs or spaces, and decimals may follow a comma (`dialect_of`).
+    Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma
+    (`dialect_of`). A second line of units is no row: ``units`` maps the names of columns to what it says.
 
     Args:
         path: the file, plain or gzipped.
         required: columns that must be there.
+        names: of the columns, if the first line holds values.
         machine_written: the format has a writer and columns of its own: it ends every line with a newline, so a last
             line without one was cut. Else a table [data.columns] names the columns.
 
@@ -124,20 +105,24 @@ class CsvTable:
     missing_remedy = "correct its name in [data.columns]"
     """What to do about a column that is not there."""
 
-    def __init__(self, path: Path, required: Sequence[str], *, machine_written: bool = True) -> None:
+    def __init__(
+        self, path: Path, required: Sequence[str], *, names: Sequence[str] | None = None, machine_written: bool = True
+    ) -> None:
         self.path = path
         if machine_written:
             self.missing_remedy = "rename the column, or use format = 'csv' with a [data.columns] mapping"
         text = read_text(path)
+        ended = text.endswith("\n")
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        del text  # of a long recording as large as the lines
         if lines[0].lower().startswith("sep="):  # spreadsheets write so which separator follows
             lines.pop(0)
         if lines and lines[0].startswith(MOTIVE):
             raise InputError(
                 "is Motive's own export, whose header has several lines", where=str(path), remedy='use "motive-csv"'
             )
-        self._parse(lines)
-        if machine_written and not text.endswith("\n"):
+        self._parse(lines, names)
+        if machine_written and not ended:
             raise InputError(
                 "the last line does not end: the file is cut short",
                 where=f"{path}, row {len(self) - 1}",
@@ -145,7 +130,7 @@ class CsvTable:
             )
         self.require(required)
 
-    def _parse(self, lines: list[str]) -> None:
+    def _parse(self, lines: list[str], names: Sequence[str] | None = None) -> None:
         """Read a header and rows; empty lines at the end are none."""
         while lines and not lines[-1].strip():
             lines.pop()
@@ -158,16 +143,24 @@ class CsvTable:
             lines = bare
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
-        _check_rectangular(self.path, lines, dialect.separator)
+        _check_first_line(self.path, lines, dialect.separator)
+        header = header_of(self.path, lines, dialect.separator, names)
+        rows = lines if without_names(lines, dialect.separator) else lines[1:]
+        units = units_above(rows, dialect.separator) or []
+        self.units = {name: unit for name, unit in zip(header, units, strict=bool(units)) if unit}
+        rows = rows[1:] if units else rows
+        _check_names(self.path, header)
+        _check_rectangular(self.path, rows, dialect.separator, len(header))
         self.frame = pd.read_csv(
-            io.StringIO("\n".join(lines)),
+            io.BytesIO("\n".join(rows).encode()),
             sep=r"\s+" if dialect.separator == " " else dialect.separator,
             decimal=dialect.decimal,
+            header=None,
             skipinitialspace=True,
             low_memory=False,
             index_col=False,
         )
-        self.frame.columns = [str(name).strip() for name in self.frame.columns]
+        self.frame.columns = _told_apart(header)
 
     @classmethod
     def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
@@ -194,7 +187,7 @@ class CsvTable:
             called = frame.index.name if frame.index.name is not None else "index"
             frame = frame.reset_index(drop=called in frame.columns)
         table = cls.__new__(cls)
-        table.path, table.decimal = Path(name), "."
+        table.path, table.decimal, table.units = Path(name), ".", {}
         table.frame = frame.rename(columns=str).reset_index(drop=True)
         _check_names(table.path, list(table.frame.columns))
         if len(frame) == 0:
@@ -259,10 +252,11 @@ class CsvTable:
         told = numbers.notna() | cells.isna()
         return read_stamps(numbers if told.all() else cells, unit, where=str(self.path), column=name)
 
-    def numeric(self) -> pd.DataFrame:
-        """The columns that hold nothing but numbers and empty cells, as numbers."""
-        values = self.frame.apply(self._number)
-        told = values.notna().any() & (values.notna() | self.frame.isna()).all()
+    def numeric(self, rows: int) -> pd.DataFrame:
+        """The columns that hold nothing but numbers and empty cells in the first rows, as numbers."""
+        cells = self.frame.head(rows)
+        values = cells.apply(self._number)
+        told = values.notna().any() & (values.notna() | cells.isna()).all()
         return values.loc[:, told]
 
     def _number(self, cells: pd.Series) -> pd.Series:
@@ -296,15 +290,18 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
 
 
-def _check_rectangular(path: Path, lines: Sequence[str], separator: str) -> None:
-    header = [name.strip() for name in _cells(lines[0], separator)]
-    fields = len(header)
-    _check_names(path, header)
-    for row, line in enumerate(lines[1:]):
-        found = len(_cells(line, separator))
+def _told_apart(header: Sequence[str]) -> list[str]:
+    """Names of columns, a number in place of those that are empty."""
+    return [name or f"Unnamed: {column}" for column, name in enumerate(header)]
+
+
+def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: int) -> None:
+    for row, line in enumerate(rows):
+        if separator != " " and '"' not in line and line.count(separator) == fields - 1:
+            continue
+        found = len(cells_of(line, separator))
         if found != fields:
-            _check_first_line(path, lines, separator)
-            last = row == len(lines) - 2
+            last = row == len(rows) - 1
             raise InputError(
                 f"has {found} values where the header names {fields}" + (": the file is cut short" if last else ""),
                 where=f"{path}, row {row}",
@@ -315,12 +312,21 @@ def _check_rectangular(path: Path, lines: Sequence[str], separator: str) -> None
 
 
 def _check_first_line(path: Path, lines: Sequence[str], separator: str) -> None:
-    """Raise an InputError where names of columns stand further down, below what a program says of itself."""
-    width = len(_cells(lines[-1], separator))
-    first = next(row for row, line in enumerate(lines) if len(_cells(line, separator)) == width)
-    if first > 0 and numbers_of(pd.Series(_cells(lines[first], separator))).isna().all():
+    """Raise an InputError if the table begins further down, below what a program says of itself."""
+    width = len(cells_of(lines[-1], separator))
+    first = next(row for row, line in enumerate(lines) if len(cells_of(line, separator)) == width)
+    cells = cells_of(lines[first], separator)
+    if first == 0 or len(lines) - first < 2:
+        return
+    if not any(is_value(cell) and cell.strip() for cell in cells):
         raise InputError(
             f"the names of its {width} columns stand in line {first + 1}, below other lines",
             where=str(path),
             remedy="leave out the lines above them",
+        )
+    if lines[0].lstrip().startswith(("#", "%", "//")) and all(map(is_value, cells)):
+        raise InputError(
+            f"the rows of its {width} columns begin in line {first + 1}, and no line names them",
+            where=str(path),
+            remedy="write one line of names in the place of the lines above them",
         )

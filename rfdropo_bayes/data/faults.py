@@ -40,6 +40,8 @@ FAR = 10e-3  # [m] from a zero to where the marker is before and after
 FAR_STEPS = 3.0  # the same in steps of a fast row
 _VELOCITY_ROWS = 5
 _DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
+_MARGIN = 2  # longest runs, on both sides of a step that is not smooth
+_BLOCK = 20_000  # rows
 _ONSET_ROWS = 3  # over this few rows a motion may start or stop at once
 _FEW = 5.0  # quanta
 
@@ -108,8 +110,9 @@ def find_faults(
         "breaks": breaks,
     } | {kind: each.sum(axis=0).tolist() for kind, each in (("zero", zero), ("renamed", renamed)) if each.any()}
     names = names or [f"marker {number}" for number in range(1, position.shape[1] + 1)]
+    mask = ~(missing | held | jumping | renamed)
     notes = clock_notes(time) + _zero_notes(zero, doubtful, names) + _name_notes(renamed, changes, names)
-    return Faults(~(missing | held | jumping | renamed), counts, notes)
+    return Faults(mask, counts, notes + _mostly_masked(mask | renamed, counts, names))
 
 
 def _check_rows(time: np.ndarray, position: np.ndarray, where: str) -> None:
@@ -157,6 +160,19 @@ def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) ->
         for marker in np.flatnonzero(kind.any(axis=0)).tolist():
             rows = np.flatnonzero(kind[:, marker])
             said.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
+    return said
+
+
+def _mostly_masked(seen: np.ndarray, counts: dict[str, list[int]], names: Sequence[str]) -> list[str]:
+    """Markers of which more positions are masked than kept: what was found is hardly a fault then."""
+    said, rows = [], len(seen)
+    for marker in np.flatnonzero(2 * seen.sum(axis=0) < rows).tolist():
+        found = {kind: each[marker] for kind, each in counts.items() if kind not in ("breaks", "renamed")}
+        kinds = ", ".join(f"{count} {kind}" for kind, count in found.items() if count)
+        said.append(
+            f"{int((~seen[:, marker]).sum())} of {rows} positions of {names[marker]} are masked ({kinds}): if most of "
+            "them were measured, look at the unit of times, at the unit of positions and at the marker's columns"
+        )
     return said
 
 
@@ -216,51 +232,86 @@ def _off_path(
 ) -> tuple[np.ndarray, int]:
     """Rows off the longest smooth path of one marker, and the number of breaks in that path.
 
+    A path through rows whose every step is smooth leaves nothing out: it is looked for around the other steps alone.
+    """
+    wrong, breaks = np.zeros(len(time), dtype=bool), 0
+    if len(time) < 4 * _VELOCITY_ROWS:
+        return wrong, breaks
+    interval = float(np.median(np.diff(time)))
+    reach = int(np.clip(round(longest_run / interval), 2, MOST_ROWS))
+    motion = _Motion(time, position, *_end_velocities(time, position), interval, tolerance, max_acceleration)
+    rough = np.flatnonzero(~motion.smooth(1)) + 1
+    for part in _around(rough, _MARGIN * reach, len(time)):
+        wrong[part], broken = _longest_path(motion.part(part), reach)
+        breaks += broken
+    return wrong, breaks
+
+
+def _around(rows: np.ndarray, margin: int, length: int) -> list[slice]:
+    """Parts of so many rows on both sides of some rows; parts that touch are one."""
+    groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * margin) + 1) if len(rows) else []
+    return [slice(max(int(group[0]) - margin, 0), min(int(group[-1]) + margin, length)) for group in groups]
+
+
+class _Motion(NamedTuple):
+    """Rows of one marker, with the velocities that arrive at each and leave it."""
+
+    time: np.ndarray
+    position: np.ndarray
+    arriving: np.ndarray
+    leaving: np.ndarray
+    interval: float
+    tolerance: float
+    max_acceleration: float
+
+    def part(self, rows: slice) -> _Motion:
+        """Some rows of it."""
+        return self._replace(**{key: getattr(self, key)[rows] for key in ("time", "position", "arriving", "leaving")})
+
+    def smooth(self, apart: int) -> Bool[np.ndarray, " row"]:
+        """Whether the motion from each row to the one that is ``apart`` rows later is one a body can make.
+
+        It is, if it agrees with the mean of the velocities before and after it; a short one may agree with either
+        alone, as the onset of a motion does.
+        """
+        first, last = slice(0, len(self.time) - apart), slice(apart, len(self.time))
+        gap = (self.time[last] - self.time[first])[:, None]
+        step = self.position[last] - self.position[first]
+        before, after = self.arriving[first], self.leaving[last]
+        allowed = self.tolerance + self.max_acceleration * self.interval**2
+        allowed = allowed * (1.0 + _DRIFT_PER_ROW * (gap[:, 0] / self.interval - 1.0).clip(0.0))
+        agrees = np.linalg.norm(step - gap * 0.5 * (before + after), axis=1) <= allowed
+        if apart <= _ONSET_ROWS:
+            for velocity in (before, after):
+                agrees |= np.linalg.norm(step - gap * velocity, axis=1) <= allowed
+        return agrees
+
+
+def _longest_path(motion: _Motion, reach: int) -> tuple[np.ndarray, int]:
+    """Rows off the longest smooth path, and its breaks.
+
     Dynamic programming over "the best path that ends in this row": it extends a path that ended shortly before if the
     step between them is smooth, or breaks with it at the price of half the longest run (a wrong run takes two breaks).
     """
-    if len(time) < 4 * _VELOCITY_ROWS:
-        return np.zeros(len(time), dtype=bool), 0
-    interval = float(np.median(np.diff(time)))
-    reach = int(np.clip(round(longest_run / interval), 2, MOST_ROWS))
-    allowed = tolerance + max_acceleration * interval**2
-    smooth = _smooth_steps(time, position, reach, interval, allowed)
+    rows = len(motion.time)
+    smooth = np.zeros((rows, reach), dtype=bool)  # from row r - 1 - b to row r
+    for back in range(min(reach, rows - 1)):
+        smooth[back + 1 :, back] = motion.smooth(back + 1)
     step_value = np.where(smooth, 1.0, 1.0 - 0.5 * reach)
-    length = np.concatenate([np.full(reach, -np.inf), np.ones(len(time))])
-    back = np.zeros(len(time), dtype=int)
-    for row in range(1, len(time)):
+    length = np.concatenate([np.full(reach, -np.inf), np.ones(rows)])
+    last = np.zeros(rows, dtype=int)
+    for row in range(1, rows):
         value = step_value[row] + length[row + reach - 1 :: -1][:reach]
-        back[row] = np.argmax(value)
-        length[row + reach] = max(value[back[row]], 1.0)
-    kept = np.zeros(len(time), dtype=bool)
+        last[row] = np.argmax(value)
+        length[row + reach] = max(value[last[row]], 1.0)
+    kept = np.zeros(rows, dtype=bool)
     row, breaks = int(np.argmax(length)) - reach, 0
     while True:
         kept[row] = True
         if row == 0 or length[row + reach] == 1.0:
             return ~kept, breaks
-        breaks += int(not smooth[row, back[row]])
-        row -= int(back[row]) + 1
-
-
-def _smooth_steps(
-    time: np.ndarray, position: np.ndarray, reach: int, interval: float, allowed: float
-) -> Bool[np.ndarray, "row back"]:
-    """Whether the motion from row ``r - 1 - b`` to row ``r`` is one a body can make, for b = 0 ... reach - 1.
-
-    It is, if it agrees with the mean of the velocities before and after it; a short one may agree with either alone, as
-    the onset of a motion does.
-    """
-    arriving, leaving = _end_velocities(time, position)
-    smooth = np.zeros((len(time), reach), dtype=bool)
-    for back in range(min(reach, len(time) - 1)):
-        first, last = slice(0, len(time) - 1 - back), slice(back + 1, len(time))
-        gap = (time[last] - time[first])[:, None]
-        step = position[last] - position[first]
-        before, after = arriving[first], leaving[last]
-        predictions = (before, after, 0.5 * (before + after)) if back < _ONSET_ROWS else (0.5 * (before + after),)
-        distance = np.min([np.linalg.norm(step - gap * velocity, axis=1) for velocity in predictions], axis=0)
-        smooth[last, back] = distance <= allowed * (1.0 + _DRIFT_PER_ROW * (gap[:, 0] / interval - 1.0).clip(0.0))
-    return smooth
+        breaks += int(not smooth[row, last[row]])
+        row -= int(last[row]) + 1
 
 
 def _end_velocities(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -268,8 +319,10 @@ def _end_velocities(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray,
     velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
     edge = np.full((_VELOCITY_ROWS, 3), np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([edge, velocity, edge]), _VELOCITY_ROWS, axis=0)
+    median = np.empty(windows.shape[:2])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the first row has no arriving step, the last no leaving one
-        median = np.nan_to_num(np.nanmedian(windows, axis=2))
+        for first in range(0, len(windows), _BLOCK):  # each block of windows is copied
+            median[first : first + _BLOCK] = np.nan_to_num(np.nanmedian(windows[first : first + _BLOCK], axis=2))
     rows = len(time)
     return median[:rows], median[_VELOCITY_ROWS : _VELOCITY_ROWS + rows]

@@ -10,11 +10,12 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
+from rfdropo_bayes.data.command_notes import command_notes
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.first_command import MEMORY, Rule
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS, METRES, CsvColumns, read_frame
 from rfdropo_bayes.data.recorded import AXES, Measured, Origin, Recorded, SentCommands
-from rfdropo_bayes.data.sample_times import PER_SECOND, check_times, read_stamps
+from rfdropo_bayes.data.sample_times import PER_SECOND, check_times, read_stamps, rounded_notes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest, parse_table
 
@@ -81,6 +82,12 @@ def from_arrays(
         wanted = f"({len(stamps)} times, {len(channels)} channels)"
         raise InputError(f"commands have the shape {sent.shape}, and not {wanted}", where=name)
     faults = find_faults(clock, place, where=name, names=markers)
+    notes = [
+        *faults.notes,
+        *rounded_notes(begins, clock),
+        *(() if command_time is None else command_notes(stamps, sent)),
+    ]
+    faults = faults._replace(notes=notes)
     pose = None
     if object_pose is not None:
         pose = _numbers(object_pose, "poses", rows | {"": 7}, name) * np.repeat([metres, 1.0], [3, 4])
@@ -105,13 +112,35 @@ def from_arrays(
     )
 
 
-def from_pandas(
-    frame: pd.DataFrame, columns: CsvColumns | Mapping[str, Any], name: str, mask_missing: bool
-) -> Recorded:
+def from_pandas(frame: Any, columns: CsvColumns | Mapping[str, Any], name: str, mask_missing: bool) -> Recorded:
     """A recording from a table; see `Trajectory.from_pandas`."""
+    frame = _table(frame, name)
     if not isinstance(columns, CsvColumns):
         columns = parse_table(CsvColumns, _as_lists(columns), where="columns")
     return read_frame(frame, columns, name, mask_missing=mask_missing)
+
+
+def _table(frame: Any, name: str) -> pd.DataFrame:
+    """A table of pandas from one of pandas, Polars or PyArrow.
+
+    Raises:
+        InputError: something else.
+    """
+    if isinstance(frame, pd.DataFrame):
+        return frame
+    for convert in ("collect", "to_pandas"):  # a lazy table of Polars is computed first
+        if hasattr(frame, convert):
+            try:
+                frame = getattr(frame, convert)()
+            except ImportError as error:
+                raise InputError(f"{error}", where=name, remedy="pip install pyarrow") from None
+    if isinstance(frame, pd.DataFrame):
+        return frame
+    raise InputError(
+        f"a {type(frame).__name__} is no table",
+        where=name,
+        remedy="give a DataFrame of pandas, or a table that has to_pandas(), as those of Polars and PyArrow",
+    )
 
 
 def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:

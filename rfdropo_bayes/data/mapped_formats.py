@@ -8,16 +8,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from rfdropo_bayes.data import lerobot, motive_csv, named_columns, rosbag
+from rfdropo_bayes.data import lerobot, motive_csv, named_arrays, named_columns, rosbag
 from rfdropo_bayes.data.csv_table import MOTIVE, CsvTable
 from rfdropo_bayes.data.named_columns import CsvColumns, command_clock, coordinates, read_tables
-from rfdropo_bayes.data.plain_csv import command_table
+from rfdropo_bayes.data.plain_csv import command_table, csv_table
 from rfdropo_bayes.data.recorded import Origin
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import changed
 
-MAPPED = (named_columns.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT)
+MAPPED = (named_columns.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT, *named_arrays.FORMATS)
 FOLDERS = (rosbag.FORMAT, lerobot.FORMAT)
 """Formats in which a recording, or several, may be a folder."""
 _MAGIC = {b"#ROSBAG": rosbag.FORMAT, b"\x89MCAP0": rosbag.FORMAT, b"SQLite format 3\x00": rosbag.FORMAT}
@@ -58,6 +58,9 @@ def recognised_format(path: Path) -> str:
     for magic, format in _MAGIC.items():
         if first.startswith(magic):
             return format
+    arrays = named_arrays.array_format(path, first)
+    if arrays is not None:
+        return arrays
     return (
         motive_csv.FORMAT if first.removeprefix(b"\xef\xbb\xbf").startswith(MOTIVE.encode()) else named_columns.FORMAT
     )
@@ -79,12 +82,14 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
         number = lerobot.episode_numbers(path)[0] if episode is None else episode
         frame = lerobot.read_episode(path, number)
         return Observed(CsvTable.of_frame(frame, f"{path}, episode {number}", places), columns)
+    if format in named_arrays.FORMATS:
+        return Observed(CsvTable.of_frame(named_arrays.read_arrays(path), str(path), places), columns)
     if format == motive_csv.FORMAT:
         file = motive_csv.read_motive(path)
         file.table.require(places)
         unit = file.length_unit or columns.position_unit
         return Observed(file.table, changed(_in_seconds(columns, path), where=str(path), position_unit=unit))
-    return Observed(CsvTable(path, places, machine_written=False), columns)
+    return Observed(csv_table(path, columns), columns)
 
 
 def _in_seconds(columns: CsvColumns, path: Path) -> CsvColumns:
@@ -129,7 +134,7 @@ def read_mapped(
             where=str(path),
             remedy="give {observations = ..., commands = ...}, the latter a CSV with times of its own (command_time)",
         )
-    for ending in (".csv", *rosbag.STORAGE):
+    for ending in (".csv", ".mat", ".npz", *rosbag.STORAGE):
         name = name.removesuffix(ending)
     recorded = read_tables(
         table,

@@ -8,8 +8,9 @@ table of their own, with as many rows as the observations or one fewer; or with 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -17,11 +18,13 @@ from jaxtyping import Float
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
+from rfdropo_bayes.data.command_notes import command_notes
+from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.recorded import Measured, Origin, Recorded, SentCommands
-from rfdropo_bayes.data.sample_times import TimeUnit
+from rfdropo_bayes.data.sample_times import TimeUnit, rounded_notes
 from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
@@ -42,10 +45,16 @@ COUNTS = "counts"
 CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "bar", "psi", "-"]
 
 
-def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
-    matrix = axes_matrix(axes)
-    if not np.isclose(np.linalg.det(matrix), 1.0):
-        raise ValueError("axes must name x, y and z once each, with signs that make a right-handed frame")
+ROWS = "rows"
+"""In the place of a column of times: rows have none, and their number counts."""
+ROW_SECONDS = 1.0
+"""Nominal time from row to row [s] of rows without times."""
+UNTIMED = "rows have no times: one a second is assumed, which means nothing but for poses at rest"
+
+
+def _each_once(axes: tuple[str, str, str]) -> tuple[str, str, str]:
+    if not np.isclose(abs(np.linalg.det(axes_matrix(axes))), 1.0):
+        raise ValueError('axes must name x, y and z once each, each with a sign or without, e.g. ["x", "z", "-y"]')
     return axes
 
 
@@ -65,9 +74,16 @@ class CsvColumns(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    names: list[str] | None = Field(
+        default=None, description="names of all columns, in their order, of a CSV without a line of names"
+    )
+    command_names: list[str] | None = Field(
+        default=None, description="the same for a CSV of the commands, if they have a file of their own"
+    )
     time: str | None = Field(
         default=None,
-        description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; for "
+        description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; "
+        '"rows" for rows without any time, such as poses at rest: one a second is assumed; for '
         '"rosbag": "header", stamps where messages have them, or "log", the recorder\'s times',
     )
     time_unit: TimeUnit = Field(
@@ -100,6 +116,11 @@ class CsvColumns(BaseModel):
         description="largest command that is to be believed, in command_unit, where drives go farther than 20 rad or "
         "5 m, as a winch or a lead screw of many turns does",
     )
+    units: dict[str, str] = Field(
+        {},
+        description="unit of each column of commands or positions that has another one than command_unit or "
+        "position_unit, by the name of the column",
+    )
     command_time: str | None = Field(
         default=None,
         description="column of the commands' own times, in their file; by default command k is sent in row k of the "
@@ -119,10 +140,11 @@ class CsvColumns(BaseModel):
     position_unit: Literal["m", "cm", "mm"] = Field(
         description='unit of the positions; the header of a "motive-csv" file comes first'
     )
-    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = Field(
+    axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(
         ("x", "y", "z"),
         description="the base frame's x, y, z in terms of the file's axes, e.g. "
-        '["x", "z", "-y"] for a trunk that hangs in a frame with y up',
+        '["x", "z", "-y"] for a trunk that hangs in a frame with y up; if the file\'s frame is left-handed, '
+        "as Unity's is, axes that are left-handed as well",
     )
     origin: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0),
@@ -142,6 +164,11 @@ class CsvColumns(BaseModel):
         default=None, description="columns of the measured motor angles, one for each command; empty cells are left out"
     )
     motor_angle_unit: Literal["rad", "deg", "counts"] = Field(default="rad", description="unit of the motor angles")
+    unwrap: dict[str, float] = Field(
+        {},
+        description="turn of the counter of each column of commands or motor angles that begins anew after a turn, in "
+        "the unit of the column, by its name: 4096 of an encoder, 360 of an angle in degrees",
+    )
     object_pose: list[str] | None = Field(
         default=None,
         min_length=7,
@@ -186,7 +213,9 @@ class CsvColumns(BaseModel):
     def _fits(self) -> CsvColumns:
         if (self.time is None) == (self.sample_time is None):
             raise ValueError("give either time (a column) or sample_time (seconds)")
-        if (COUNTS in (self.command_unit, self.motor_angle_unit)) != (self.counts_per_turn is not None):
+        if (COUNTS in (self.command_unit, self.motor_angle_unit, *self.units.values())) != (
+            self.counts_per_turn is not None
+        ):
             raise ValueError(f'counts_per_turn belongs to the unit "{COUNTS}": give both or neither')
         for key, names, count in (
             ("markers", self.markers, len(self.positions)),
@@ -206,6 +235,15 @@ class CsvColumns(BaseModel):
             if point in self.positions[:number]:
                 first = self.positions.index(point) + 1
                 raise ValueError(f"markers {first} and {number + 1} of positions have the same columns {list(point)}")
+        if self.object_pose is not None and self.left_handed:
+            raise ValueError("object_pose needs axes of a right-handed frame: quaternions have no mirror image")
+        for name in self.units:
+            self._factor(name)
+        for name, turn in self.unwrap.items():
+            if name not in (*self.commands, *(self.motor_angles or ())):
+                raise ValueError(f"unwrap names {name!r}, which is no column of commands or motor_angles")
+            if not (np.isfinite(turn) and turn > 0.0):
+                raise ValueError(f"unwrap gives {name!r} a turn of {turn:g}, which must be positive")
         return self
 
     def sized(self, unit: CommandUnit) -> tuple[str, float]:
@@ -213,6 +251,30 @@ class CsvColumns(BaseModel):
         if unit == COUNTS and self.counts_per_turn is not None:
             return "rad", 2.0 * np.pi / self.counts_per_turn
         return COMMAND_UNITS[unit]
+
+    @property
+    def left_handed(self) -> bool:
+        """Whether the file's frame is left-handed, as ``axes`` say."""
+        return bool(np.linalg.det(axes_matrix(self.axes)) < 0.0)
+
+    def factors(self, names: Sequence[str]) -> Float[np.ndarray, " column"]:
+        """What brings columns of commands or positions to command_unit or position_unit."""
+        return np.array([self._factor(name) if name in self.units else 1.0 for name in names])
+
+    def _factor(self, name: str) -> float:
+        unit = self.units[name]
+        if name in self.commands:
+            common, sizes = self.command_unit, {key: self.sized(key) for key in get_args(CommandUnit) if self._has(key)}
+        elif name in coordinates(self):
+            common, sizes = self.position_unit, {key: ("m", size) for key, size in METRES.items()}
+        else:
+            raise ValueError(f"units names {name!r}, which is no column of commands or positions")
+        if unit not in sizes or sizes[unit][0] != sizes[common][0]:
+            raise ValueError(f"units gives {name!r} in {unit!r}, which cannot be brought to {common!r}")
+        return sizes[unit][1] / sizes[common][1]
+
+    def _has(self, unit: str) -> bool:
+        return unit != COUNTS or self.counts_per_turn is not None
 
 
 def axes_matrix(axes: tuple[str, str, str]) -> Float[np.ndarray, "3 3"]:
@@ -254,10 +316,14 @@ def read_tables(
     faults = find_faults(time, position, where=str(table.path), names=markers)
     command = _commands(table, source, columns)
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
-    angle = None
-    if columns.motor_angles is not None:
-        angle = columns.sized(columns.motor_angle_unit)[1] * table.numbers(columns.motor_angles, allow_missing=True)
-    settings = faults.settings | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)})
+    angle = _angles(table, columns)
+    notes = [*faults.notes, *_timing_notes(table, columns, time)]
+    if columns.command_time is not None:
+        notes += command_notes(sent, command)
+    seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)
+    notes += _counter_notes(table, source, columns, Motion(sent, time, seen))
+    settings = faults._replace(notes=notes).settings
+    settings |= {} if angle is None else {"motor_angle_hold": hold_time(time, angle)}
     return Recorded(
         replace(origin or origin_of(table, columns), settings=settings),
         SentCommands(sent, command, *_channels(columns), command[0], _largest(columns)),
@@ -306,14 +372,31 @@ def _largest(columns: CsvColumns) -> float | None:
 
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
     """Positions of the markers [m] in the base frame."""
-    place = table.points(coordinates(columns), allow_missing=mask_missing)
+    return in_base(table.points(coordinates(columns), allow_missing=mask_missing), columns)
+
+
+def in_base(place: Float[np.ndarray, "*rows marker 3"], columns: CsvColumns) -> Float[np.ndarray, "*rows marker 3"]:
+    """Positions [m] in the base frame of those that a file has."""
+    place = place * columns.factors(coordinates(columns)).reshape(-1, 3)
     return METRES[columns.position_unit] * (place - columns.origin) @ axes_matrix(columns.axes).T
 
 
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
-    if columns.time is None:
-        return float(columns.sample_time or 0.0) * np.arange(len(table))
+    if columns.time is None or untimed(columns):
+        return float(columns.sample_time or ROW_SECONDS) * np.arange(len(table))
     return _from_first(table, columns.time, columns.time_unit)
+
+
+def untimed(columns: CsvColumns) -> bool:
+    """Whether the number of a row stands in for its time."""
+    return columns.time == ROWS
+
+
+def _timing_notes(table: CsvTable, columns: CsvColumns, time: Float[np.ndarray, " rows"]) -> list[str]:
+    """What the form of the times lets doubt."""
+    if untimed(columns):
+        return [UNTIMED]
+    return [] if columns.time is None else rounded_notes(table.stamps(columns.time, columns.time_unit), time)
 
 
 def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray, " rows"]:
@@ -322,8 +405,9 @@ def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray
 
 
 def command_clock(columns: CsvColumns) -> tuple[str | None, TimeUnit]:
-    """Column of times in a file of commands, and its unit."""
-    return columns.command_time or columns.time, columns.command_time_unit or columns.time_unit
+    """Column of times in a file of commands, and its unit; None if its rows have no times of their own."""
+    shared = None if untimed(columns) else columns.time
+    return columns.command_time or shared, columns.command_time_unit or columns.time_unit
 
 
 def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " command"]:
@@ -334,7 +418,7 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
     """
     clock, unit = command_clock(columns)
     stamps, where = source.stamps(str(clock), unit), f"{table.path} with {source.path}"
-    if columns.time is None:
+    if columns.time is None or untimed(columns):
         sent = stamps.ticks / stamps.per_second
     else:
         sent = stamps.since(table.stamps(columns.time, columns.time_unit), where)
@@ -349,8 +433,33 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
     return sent
 
 
+def _angles(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"] | None:
+    """Motor angles [rad], if they were measured."""
+    if columns.motor_angles is None:
+        return None
+    values = table.numbers(columns.motor_angles, allow_missing=True)
+    return columns.sized(columns.motor_angle_unit)[1] * read_on(values, columns.motor_angles, columns.unwrap)
+
+
+def _counter_notes(table: CsvTable, source: CsvTable, columns: CsvColumns, motion: Motion) -> list[str]:
+    """Jumps of counters, of commands and of motor angles, that no marker follows."""
+    sent = (columns.commands, columns.command_unit, source.numbers(columns.commands), motion)
+    names, found = columns.motor_angles or [], motion._replace(sent=motion.time)
+    read = (names, columns.motor_angle_unit, table.numbers(names, allow_missing=True) if names else None, found)
+    notes = []
+    for names, unit, values, seen in (sent, read):
+        if values is not None:
+            values = read_on(values, names, columns.unwrap)
+            own = [
+                Column(n, v, turns_of(unit, columns.counts_per_turn, v)) for n, v in zip(names, values.T, strict=True)
+            ]
+            notes += counter_notes(own, seen, unit)
+    return notes
+
+
 def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
-    values = columns.sized(columns.command_unit)[1] * source.numbers(columns.commands)
+    factors = columns.sized(columns.command_unit)[1] * columns.factors(columns.commands)
+    values = factors * read_on(source.numbers(columns.commands), columns.commands, columns.unwrap)
     if columns.command_time is None and len(values) not in (len(table), len(table) - 1):
         raise InputError(
             f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",

@@ -37,14 +37,21 @@ def read_plain_csv(
     Raises:
         InputError: on a damaged file (see ``CsvTable``), a column that is not there, or files that do not fit together.
     """
-    table = CsvTable(path, coordinates(columns), machine_written=False)
+    table = csv_table(path, columns)
     source = command_table(commands, columns) or table
     return Trajectory.build(*read_tables(table, source, columns, mask_missing=mask_missing))
 
 
+def csv_table(path: Path, columns: CsvColumns) -> CsvTable:
+    """The file of the observations."""
+    return CsvTable(path, coordinates(columns), names=columns.names, machine_written=False)
+
+
 def command_table(path: Path | None, columns: CsvColumns) -> CsvTable | None:
-    """The file of the commands, where they have one of their own."""
-    return None if path is None else CsvTable(path, columns.commands, machine_written=False)
+    """The file of the commands, if they have a file of their own."""
+    if path is None:
+        return None
+    return CsvTable(path, columns.commands, names=columns.command_names, machine_written=False)
 
 
 def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row: int = 0) -> Trajectory:
@@ -53,7 +60,7 @@ def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row:
     Raises:
         InputError: on a damaged file, a column that is not there, or a start without that row.
     """
-    table = CsvTable(path, columns.commands, machine_written=False)
+    table = _commands_alone(path, columns)
     return commands_alone(
         origin_of(table, columns),
         read_commands(table, columns),
@@ -70,12 +77,18 @@ def command_columns(
     """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
     clock, unit = command_clock(columns)
     stamped = {} if clock is None else {clock: time * PER_SECOND[unit]}
-    return stamped | dict(zip(columns.commands, command.T / columns.sized(columns.command_unit)[1], strict=True))
+    sizes = columns.sized(columns.command_unit)[1] * columns.factors(columns.commands)
+    return stamped | dict(zip(columns.commands, (command / sizes).T, strict=True))
+
+
+def _commands_alone(path: Path, columns: CsvColumns) -> CsvTable:
+    """A file of commands to predict from, with the columns of either file of a recording."""
+    return CsvTable(path, columns.commands, names=columns.command_names or columns.names, machine_written=False)
 
 
 def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:
     """Whether a file holds commands with their times, and no positions."""
-    table = CsvTable(path, columns.commands, machine_written=False)
+    table = _commands_alone(path, columns)
     clock, _ = command_clock(columns)
     timed = clock is None or clock in table
     return timed and not any(name in table for point in columns.positions for name in point)

@@ -25,6 +25,8 @@ LONGEST_WINDOW, SHORTEST_WINDOW = 100, 8  # rows that a local interval is a mean
 JUMP = 10.0  # intervals: a longer one is a jump of the clock, or lost rows
 COARSE = 0.1  # share of repeated stamps from which on the clock is coarser than the rows
 ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
+GRAIN = 0.02  # of the usual interval: stamps of single precision that are coarser are said
+ON_GRID = 0.2  # of the grain: stamps are as near to single precision where text has rounded them
 SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: what follows a moving robot lies between
 SET_BACK = 0.01  # share of rows out of order up to which the clock was set back; else rows are not sorted
 
@@ -207,6 +209,24 @@ def _between(time: np.ndarray, short: np.ndarray) -> float:
     longest = JUMP * float(np.median(gaps[starts - 1]))
     within = gaps[starts[0] : starts[-1]]
     return float(within[within <= longest].mean())
+
+
+def rounded_notes(stamps: Stamps, time: Float[np.ndarray, " rows"]) -> list[str]:
+    """Stamps that were kept in single precision until they no longer told rows apart evenly; ``time`` in seconds."""
+    if stamps.ticks.dtype.kind != "f" or len(time) < SHORTEST_WINDOW:
+        return []
+    single = stamps.ticks.astype(np.float32)
+    grain = float(np.spacing(np.abs(single).max()))
+    gaps = np.diff(time) * stamps.per_second
+    usual = float(np.median(gaps))
+    on_grid = np.abs(stamps.ticks - single.astype(float)).max() < ON_GRID * grain  # text rounds them once more
+    if not on_grid or grain < GRAIN * usual or np.ptp(gaps) < 0.5 * grain:
+        return []
+    return [
+        f"times have single precision: they go in steps of {1e3 * grain / stamps.per_second:.3g} ms, and rows come "
+        f"every {1e3 * usual / stamps.per_second:.4g} ms; for rows that were measured evenly give sample_time = "
+        f"{float(time[-1]) / (len(time) - 1):.4g} in place of time, or record double precision"
+    ]
 
 
 def clock_notes(time: Float[np.ndarray, " rows"]) -> list[str]:

@@ -21,7 +21,9 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files
 from rfdropo_bayes.tables import parse_table
 
-Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "motive-csv", "rosbag", "lerobot", "netcdf"]
+Format = Literal[
+    "sofa-csv", "optitrack-csv", "asl-csv", "csv", "motive-csv", "rosbag", "lerobot", "mat", "npz", "netcdf"
+]
 
 InitialCommand = Literal["first", "zero"] | list[float] | None
 
@@ -54,7 +56,8 @@ class DataSpec(BaseModel):
     test: list[RecordingEntry] = Field([], description="recordings that no fit sees")
     columns: CsvColumns | None = Field(
         default=None,
-        description="what the columns are, for formats that have them in any order: csv, motive-csv, rosbag, lerobot",
+        description="what the columns are, for formats that have them in any order: csv, motive-csv, rosbag, lerobot, "
+        "mat, npz",
     )
     resample: float | None = Field(
         default=None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"

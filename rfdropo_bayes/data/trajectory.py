@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
@@ -112,7 +111,7 @@ class Trajectory:
     @classmethod
     def from_pandas(
         cls,
-        frame: pd.DataFrame,
+        frame: Any,
         columns: CsvColumns | Mapping[str, Any],
         name: str = "recording",
         *,
@@ -121,7 +120,7 @@ class Trajectory:
         """A recording from a table.
 
         Args:
-            frame: one row per observation.
+            frame: a table of pandas, Polars or PyArrow, one row per observation.
             columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`. The index is a
                 column under its name, or "index".
             name: of the recording.

@@ -16,6 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.errors import InputError
 
+_RETRY = 0.02  # [s]: between two tries to receive from a bus that fails
+
 
 class BusTable(BaseModel):
     """The table [bus] of a deployment file.
@@ -82,24 +84,60 @@ class FrameLog(can.Listener):
         self._writer.stop()
 
 
+class Reception(can.Listener):
+    """Keeps the first exception of the receiving thread, of any type: adapters raise what their driver raises.
+
+    python-can goes on receiving after it, so that the drives' status is seen while they brake.
+    """
+
+    def __init__(self) -> None:
+        self._lost: Exception | None = None
+        self._told = False
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Frames are taken by the other listeners."""
+
+    def on_error(self, exc: Exception) -> None:
+        """Keep an exception; the wait keeps a bus that fails at once from taking the whole processor."""
+        self._lost = self._lost or exc
+        time.sleep(_RETRY)
+
+    def check(self) -> None:
+        """Tell of the exception, once: whoever hears of it stops the drives, and must not be kept from that.
+
+        Raises:
+            CanOperationError: if reception has failed.
+        """
+        if self._lost is not None and not self._told:
+            self._told = True
+            raise can.CanOperationError(f"reception has failed: {_words(self._lost)}")
+
+
 class LoggedNetwork(canopen.Network):
-    """canopen's network on an open bus, with a log of the frames of both directions."""
+    """canopen's network on an open bus, with a log of the frames of both directions.
+
+    All that the bus raises, of whatever type, leaves this class as a CanError.
+    """
 
     def __init__(self, bus: can.BusABC, log: FrameLog | None = None) -> None:
         super().__init__(bus)
-        self._log = log
-        listeners: list[can.Listener] = [*self.listeners, *([log] if log is not None else [])]
+        self._log, self._reception = log, Reception()
+        listeners: list[can.Listener] = [*self.listeners, self._reception, *([log] if log is not None else [])]
         self.listeners = listeners  # type: ignore[assignment]
         before = set(threading.enumerate())
         self.connect()
         self.receivers = set(threading.enumerate()) - before
         """Threads that python-can receives with; they need the control loop's priority."""
 
+    def check(self) -> None:
+        """Raise a CanError if reception has failed; the first call alone does."""
+        self._reception.check()
+
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
         """Send a frame.
 
         Raises:
-            CanError: if the bus does not take it, or reception has ended with an error.
+            CanError: if the bus does not take it; or, once, if reception has failed.
         """
         message = can.Message(is_extended_id=can_id > 0x7FF, arbitration_id=can_id, data=data, is_remote_frame=remote)
         with self.send_lock:
@@ -107,13 +145,29 @@ class LoggedNetwork(canopen.Network):
                 raise can.CanOperationError("the bus is closed")
             try:
                 self.bus.send(message)
-            except OSError as error:  # some interfaces let the socket's own error through
-                raise can.CanOperationError(f"{type(error).__name__}: {error}") from None
+            except can.CanError:
+                raise
+            except Exception as error:
+                raise can.CanOperationError(_words(error)) from None
             if self._log is not None:
                 message.is_rx = False
                 message.timestamp = time.time()
                 self._log.on_message_received(message)
+        self.check()
+
+    def disconnect(self) -> None:
+        """Close the bus.
+
+        Raises:
+            CanError: if its driver fails to.
+        """
         try:
-            self.check()
-        except OSError as error:
-            raise can.CanOperationError(f"reception has ended: {error}") from None
+            super().disconnect()
+        except can.CanError:
+            raise
+        except Exception as error:
+            raise can.CanOperationError(_words(error)) from None
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

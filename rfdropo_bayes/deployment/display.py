@@ -19,15 +19,17 @@ def session_table(snapshot: Snapshot, mode: str) -> Table:
     for column in ("channel", "node", "state", "set-point [mm]", "actual [mm]", "tension [N]"):
         table.add_column(column, justify="left" if column in ("channel", "state") else "right")
     for drive, length in zip(snapshot.drives, snapshot.set_point, strict=True):
+        axis = f" axis {drive.motor.axis}" if drive.motor.axis > 1 else ""
+        node = f"{drive.motor.node}{axis}"
         if drive.reading is None:
-            table.add_row(escape(drive.motor.channel), str(drive.motor.node), "silent", "", "", "")
+            table.add_row(escape(drive.motor.channel), node, "silent", "", "", "")
             continue
         state = drive.state
         limit = drive.motor.tension_limit_n[1]
         tension = f"{drive.tension:.2f}"
         table.add_row(
             escape(drive.motor.channel),
-            str(drive.motor.node),
+            node,
             "unknown" if state is None else state.words,
             f"{1e3 * length:.2f}",
             f"{1e3 * drive.length:.2f}",

@@ -110,7 +110,7 @@ def scan(bus: BusTable, patience: float = 0.5) -> dict[str, dict[str, int]]:
     except can.CanError as error:
         raise InputError(f"fails: {error}", where="bus", remedy="look at its wiring and power") from None
     finally:
-        with contextlib.suppress(can.CanError, OSError):
+        with contextlib.suppress(can.CanError):
             network.disconnect()
     return {
         str(node): {"device_type": answers[node, int(objects.Object.DEVICE_TYPE), 0]}

@@ -13,9 +13,8 @@ from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import can
-import canopen
+from canopen.objectdictionary import ODVariable
 from canopen.pdo.base import PdoMap
-from canopen.sdo.exceptions import SdoError
 
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import LoggedNetwork
@@ -26,7 +25,9 @@ from rfdropo_bayes.deployment.cia402 import (
     controlword_towards,
     state_of,
 )
-from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
+from rfdropo_bayes.deployment.nodes import Node
+from rfdropo_bayes.deployment.objects import Identifiers, Nmt, NmtState, Object, identifiers, of_axis
+from rfdropo_bayes.deployment.sheets import EDS_REMEDY
 from rfdropo_bayes.deployment.vendors import (
     LEFT_OUT,
     STANDARD,
@@ -45,10 +46,10 @@ from rfdropo_bayes.robots import Motor
 
 
 class Emergency(NamedTuple):
-    """An emergency message: when it came [s, monotonic], from which channel, its code and error register."""
+    """An emergency message: when it came [s, monotonic], the channels of its node, its code and error register."""
 
     time: float
-    channel: str
+    channels: tuple[str, ...]
     code: int
     register: int
 
@@ -72,49 +73,38 @@ class Identity(NamedTuple):
 
 
 class Drive:
-    """One drive.
+    """One axis of a node, which drives one motor.
 
     Args:
-        network: that it is on.
+        node: that it is on.
         motor: what it drives.
-        eds: path of its electronic data sheet.
         offset: counts at length zero.
-        answer: how long it has to answer an SDO request [s].
+        identifiers: of its frames.
         units: of its objects, where vendors differ.
         unguarded: guards that it may be without, by index.
     """
 
     def __init__(
         self,
-        network: LoggedNetwork,
+        node: Node,
         motor: Motor,
-        eds: str,
         offset: float,
-        answer: float = 0.3,
+        identifiers: Identifiers,
         units: Units = STANDARD,
         unguarded: Collection[int] = (),
     ) -> None:
-        self.motor, self.offset = motor, offset
-        self.network, self.units, self.unguarded = network, units, unguarded
-        try:
-            self.node = canopen.RemoteNode(motor.node, eds)
-        except Exception as error:  # configparser and canopen raise many types on damaged data sheets
-            raise InputError(f"is no readable data sheet ({error})", where=eds, remedy=_EDS_REMEDY) from None
-        self.node.sdo.RESPONSE_TIMEOUT = answer
-        network.add_node(self.node)
-        self._sdo = threading.Lock()
+        self.node, self.motor, self.offset, self.identifiers = node, motor, offset, identifiers
+        self.units, self.unguarded = units, unguarded
         self.controlword, self.target = int(Controlword.DISABLE_VOLTAGE), 0
         self.reading: Reading | None = None
         self.short_frames = 0
         self.unanswered = 0  # cycles since the last status
-        self.nmt: int | None = None
-        self.heartbeat = 0.0  # time of the last one [s, monotonic]
-        network.subscribe(objects.HEARTBEAT + motor.node, self._on_heartbeat)
 
     @property
     def name(self) -> str:
         """For messages."""
-        return f"drive {self.motor.channel!r} (node {self.motor.node})"
+        axis = f", axis {self.motor.axis}" if self.motor.axis > 1 else ""
+        return f"drive {self.motor.channel!r} (node {self.motor.node}{axis})"
 
     @property
     def state(self) -> DriveState | None:
@@ -133,57 +123,35 @@ class Drive:
         assert self.reading is not None
         return self.motor.tension(self.reading.torque)
 
-    # SDO
+    # SDO; indices are those of a first axis
+
+    def index(self, index: int) -> int:
+        """Index of an object on this axis."""
+        return of_axis(index, self.motor.axis)
+
+    def variable(self, index: int, subindex: int = 0) -> ODVariable | None:
+        """The object in the data sheet; None if it has none."""
+        return self.node.variable(self.index(index), subindex)
 
     def knows(self, index: int, subindex: int = 0) -> bool:
         """Whether the data sheet has the object."""
-        return self.node.object_dictionary.get_variable(index, subindex) is not None
+        return self.variable(index, subindex) is not None
 
     def read(self, index: int, subindex: int = 0) -> int:
         """Read an object.
 
         Raises:
-            InputError: if the drive does not answer, or refuses; with index and reason.
+            InputError: see `Node.read`.
         """
-        variable = self.node.object_dictionary.get_variable(index, subindex)
-        where = f"{self.name}, object 0x{index:04X}:{subindex}"
-        if variable is None:
-            raise InputError("is not in its data sheet", where=where, remedy=_EDS_REMEDY)
-        try:
-            with self._sdo:
-                data = self.node.sdo.upload(index, subindex)
-        except (SdoError, can.CanError, OSError) as error:
-            raise InputError(f"cannot be read ({error})", where=where, remedy=_SDO_REMEDY) from None
-        if 8 * len(data) < len(variable):
-            raise InputError(
-                f"has {len(data)} bytes, {len(variable) // 8} by the data sheet", where=where, remedy=_EDS_REMEDY
-            )
-        return int(variable.decode_raw(data))
+        return self.node.read(self.index(index), subindex, self.name)
 
     def write(self, index: int, value: int, subindex: int = 0, read_back: bool = True) -> None:
         """Write an object, and read it again.
 
         Raises:
-            InputError: if the drive does not answer, refuses, or keeps another value.
+            InputError: see `Node.write`.
         """
-        variable = self.node.object_dictionary.get_variable(index, subindex)
-        where = f"{self.name}, object 0x{index:04X}:{subindex}"
-        if variable is None:
-            raise InputError("is not in its data sheet", where=where, remedy=_EDS_REMEDY)
-        try:
-            data = variable.encode_raw(value)
-        except ValueError:
-            bits = f"does not fit into {len(variable)} bits"
-            raise InputError(
-                f"{value} {bits}", where=where, remedy="correct the motor's limits, or its units"
-            ) from None
-        try:
-            with self._sdo:
-                self.node.sdo.download(index, subindex, data)
-        except (SdoError, can.CanError, OSError) as error:
-            raise InputError(f"does not take {value} ({error})", where=where, remedy=_SDO_REMEDY) from None
-        if read_back and variable.readable and (kept := self.read(index, subindex)) != value:
-            raise InputError(f"keeps {kept} where {value} was written", where=where, remedy="look into its manual")
+        self.node.write(self.index(index), value, subindex, self.name, read_back)
 
     # Set-up
 
@@ -202,10 +170,11 @@ class Drive:
                 unit, a guard that it lacks, or positions that it reverses or shifts.
         """
         self._check_layout()
-        kind = self.read(Object.DEVICE_TYPE)
+        own = self.motor.axis > 1 and self.knows(Object.PROFILE)  # 0x1000 describes the first axis
+        kind = self.read(Object.PROFILE if own else Object.DEVICE_TYPE)
         if kind & 0xFFFF != 402:
             raise InputError(
-                f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node"
+                f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
             )
         found = self._check_identity(identity, check_eds)
         if self.knows(Object.SUPPORTED_MODES):
@@ -227,7 +196,7 @@ class Drive:
         """Objects that would be set or asked, and that its data sheet does not have, or lets nobody write."""
         found = []
         for index, subindexes in _SET.items():
-            variables = [self.node.object_dictionary.get_variable(index, subindex) for subindex in subindexes]
+            variables = [self.variable(index, subindex) for subindex in subindexes]
             if not all(variable is not None and variable.writable for variable in variables):
                 found.append(int(index))
         return found if self.knows(Object.RATED_TORQUE) else [*found, int(Object.RATED_TORQUE)]
@@ -269,17 +238,17 @@ class Drive:
     def _check_layout(self) -> None:
         """A data sheet in which the process data have other sizes is another drive's."""
         for index, subindex, bits in (*objects.SETPOINT_MAP, *objects.STATUS_MAP):
-            variable = self.node.object_dictionary.get_variable(index, subindex)
+            variable = self.variable(index, subindex)
             if variable is None or len(variable) != bits:
                 size = "lacks it" if variable is None else f"gives it {len(variable)} bits"
                 raise InputError(
                     f"has {bits} bits by CiA 402; the data sheet {size}",
-                    where=f"{self.name}, object 0x{index:04X}",
-                    remedy=_EDS_REMEDY,
+                    where=f"{self.name}, object 0x{self.index(index):04X}",
+                    remedy=EDS_REMEDY,
                 )
 
     def _check_identity(self, identity: Identity, check_eds: bool) -> dict[str, int]:
-        sheet = self.node.object_dictionary.device_information
+        sheet = self.node.remote.object_dictionary.device_information
         stated = {"vendor": sheet.vendor_number, "product": sheet.product_number} if check_eds else {}
         found = {}
         for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
@@ -288,7 +257,7 @@ class Drive:
                     raise InputError(
                         f"is not in the data sheet: its {key} cannot be asked",
                         where=f"{self.name}, object 0x1018:{subindex}",
-                        remedy=f"{_EDS_REMEDY}, or leave [drives] {key} out",
+                        remedy=f"{EDS_REMEDY}, or leave [drives] {key} out",
                     )
                 continue
             found[key] = self.read(Object.IDENTITY, subindex)
@@ -300,7 +269,7 @@ class Drive:
                 raise InputError(
                     f"{key} is 0x{found[key]:X}, that of the data sheet 0x{stated[key]:X}",
                     where=where,
-                    remedy=f"{_EDS_REMEDY}, or set check_eds = false",
+                    remedy=f"{EDS_REMEDY}, or set check_eds = false",
                 )
         return found
 
@@ -349,27 +318,33 @@ class Drive:
             raise InputError(
                 f"stays in mode {mode}", where=f"{self.name}, object 0x6061", remedy="look into its manual"
             )
-        node = self.motor.node
-        rpdos, tpdos = self.node.rpdo, self.node.tpdo
-        for number, maps in ((1, rpdos), (2, rpdos), (1, tpdos)):
-            if number not in maps:
-                raise InputError(f"has no process data {number}", where=f"{self.name}, data sheet", remedy=_EDS_REMEDY)
-        self._map(rpdos[1], objects.RPDO1 + node, 1, objects.SETPOINT_MAP)
-        self._map(rpdos[2], objects.RPDO2 + node, 255, objects.COMMAND_MAP)
-        self._map(tpdos[1], objects.TPDO1 + node, 1, objects.STATUS_MAP)
-        for index, maps, used in ((Object.RPDO, rpdos, 2), (Object.TPDO, tpdos, 1)):
-            for number in maps:
-                if number > used:
-                    cob = self.read(index + number - 1, 1)
-                    if not cob & objects.PDO_INVALID:
-                        self.write(index + number - 1, cob | objects.PDO_INVALID, 1)
-        self.network.subscribe(objects.TPDO1 + node, self._on_status)
+        set_point, command, status = self.process_data()
+        self._map(self.node.remote.rpdo[set_point], self.identifiers.set_point, 1, objects.SETPOINT_MAP)
+        self._map(self.node.remote.rpdo[command], self.identifiers.command, 255, objects.COMMAND_MAP)
+        self._map(self.node.remote.tpdo[status], self.identifiers.status, 1, objects.STATUS_MAP)
+        self.node.network.subscribe(self.identifiers.status, self._on_status)
         self.target = self.read(Object.POSITION)
         self.controlword = int(Controlword.DISABLE_VOLTAGE)
 
+    def process_data(self) -> tuple[int, int, int]:
+        """Numbers of its process data: RPDO of set-points, RPDO of the controlword alone, TPDO of its status.
+
+        CiA 402 has 64 of each for an axis; a node without process data 65 is taken to number those of all axes in turn.
+
+        Raises:
+            InputError: if the data sheet has too few.
+        """
+        axis, rpdo, tpdo = self.motor.axis, self.node.remote.rpdo, self.node.remote.tpdo
+        first = objects.PDOS_OF_AXIS * (axis - 1) + 1
+        wanted = (first, first + 1, first) if first in rpdo else (2 * axis - 1, 2 * axis, axis)
+        for number, maps in zip(wanted, (rpdo, rpdo, tpdo), strict=True):
+            if number not in maps:
+                raise InputError(f"has no process data {number}", where=f"{self.name}, data sheet", remedy=EDS_REMEDY)
+        return wanted
+
     def _within(self, index: int, subindex: int, value: int, say: Callable[[str], None]) -> int:
         """The value, or the drive's largest where that is less and stricter."""
-        variable = self.node.object_dictionary.get_variable(index, subindex)
+        variable = self.variable(index, subindex)
         largest = None if variable is None else variable.max
         if index not in STRICTER_BELOW or largest is None or value <= largest:
             return value
@@ -405,21 +380,18 @@ class Drive:
     def _map(self, pdo: PdoMap, cob: int, kind: int, entries: Sequence[tuple[int, int, int]]) -> None:
         """Map one PDO in the order that the standard asks for (off, empty, fill, count, on), and read it back."""
         where = f"{self.name}, process data 0x{cob:03X}"
-        wanted = [(int(index), subindex, bits) for index, subindex, bits in entries]
-        try:
-            with self._sdo:
-                pdo.read()
-                # Off under its own identifier first: only an invalid PDO may change it.
-                pdo.com_record[1].raw = int(pdo.com_record[1].raw) | objects.PDO_INVALID
-                pdo.clear()
-                for index, subindex, bits in wanted:
-                    if pdo.add_variable(index, subindex, bits) is None:
-                        raise InputError(f"lacks object 0x{index:04X}", where=where, remedy=_EDS_REMEDY)
-                pdo.cob_id, pdo.trans_type, pdo.enabled = cob, kind, True
-                pdo.save()
-                pdo.read()
-        except (SdoError, can.CanError, OSError, KeyError) as error:
-            raise InputError(f"cannot be mapped ({error})", where=where, remedy=_SDO_REMEDY) from None
+        wanted = [(self.index(index), subindex, bits) for index, subindex, bits in entries]
+        with self.node.sdo("cannot be mapped", where):
+            pdo.read()
+            # Off under its own identifier first: only an invalid PDO may change it.
+            pdo.com_record[1].raw = int(pdo.com_record[1].raw) | objects.PDO_INVALID
+            pdo.clear()
+            for index, subindex, bits in wanted:
+                if pdo.add_variable(index, subindex, bits) is None:
+                    raise InputError(f"lacks object 0x{index:04X}", where=where, remedy=EDS_REMEDY)
+            pdo.cob_id, pdo.trans_type, pdo.enabled = cob, kind, True
+            pdo.save()
+            pdo.read()
         found = [(variable.index, variable.subindex, variable.length) for variable in pdo.map]
         if found != wanted or pdo.cob_id != cob or pdo.trans_type != kind or not pdo.enabled:
             said = ", ".join(f"0x{index:04X}:{sub} {bits} bits" for index, sub, bits in found)
@@ -429,9 +401,9 @@ class Drive:
                 remedy="look into its manual: it may map only what its EDS says",
             )
         # canopen would take frames of ours that the bus echoes for the drive's, and overwrite its buffer.
-        with_echo = self.network.subscribers.get(cob, [])
-        if pdo.on_message in with_echo:
-            self.network.unsubscribe(cob, pdo.on_message)
+        network = self.node.network
+        if pdo.on_message in network.subscribers.get(cob, []):
+            network.unsubscribe(cob, pdo.on_message)
 
     # Process data
 
@@ -445,9 +417,33 @@ class Drive:
 
     on_status: Callable[[Drive], None] = staticmethod(lambda drive: None)
 
-    def _on_heartbeat(self, identifier: int, data: bytearray, timestamp: float) -> None:
-        if data:
-            self.nmt, self.heartbeat = data[0] & 0x7F, time.monotonic()
+
+def drives_of(
+    network: LoggedNetwork,
+    motors: Sequence[Motor],
+    offsets: Sequence[float],
+    eds: str,
+    answer: float = 0.3,
+    units: Units = STANDARD,
+    unguarded: Collection[int] = (),
+) -> list[Drive]:
+    """The drives of motors, several of which may be axes of one node.
+
+    Args:
+        network: that they are on.
+        motors: what they drive.
+        offsets: counts of each at length zero.
+        eds: path of their electronic data sheet.
+        answer: how long a node has to answer an SDO request [s].
+        units, unguarded: see `Drive`.
+    """
+    axes = {motor.node: max(other.axis for other in motors if other.node == motor.node) for motor in motors}
+    nodes = {number: Node(network, number, eds, highest, answer) for number, highest in axes.items()}
+    own = identifiers([motor.place for motor in motors])
+    return [
+        Drive(nodes[motor.node], motor, offset, frames, units, unguarded)
+        for motor, offset, frames in zip(motors, offsets, own, strict=True)
+    ]
 
 
 class Guards(NamedTuple):
@@ -480,20 +476,21 @@ class Drives:
         self.network, self.guards = network, guards
         self.all = tuple(drives)
         self.emergencies: deque[Emergency] = deque(maxlen=1000)
-        self._awaited: set[int] = set()
+        self._nodes = {drive.motor.node: drive.node for drive in self.all}
+        self._awaited: set[Drive] = set()
         self._complete = threading.Event()
         self._sending = threading.Lock()
         self._stopped = threading.Event()
         self._next_heartbeat = 0.0
         for drive in self.all:
             drive.on_status = self._arrived
-            network.subscribe(objects.EMCY + drive.motor.node, self._on_emergency)
-        self._names = {drive.motor.node: drive.motor.channel for drive in self.all}
+        for number in self._nodes:
+            network.subscribe(objects.EMCY + number, self._on_emergency)
 
     def manage(self, command: Nmt) -> None:
-        """Send a command of network management to every drive of ours, and to no other node."""
-        for drive in self.all:
-            self.network.send_message(objects.NMT, bytes([command, drive.motor.node]))
+        """Send a command of network management to every node of ours, and to no other."""
+        for number in self._nodes:
+            self.network.send_message(objects.NMT, bytes([command, number]))
 
     def configure(self, period: float, say: Callable[[str], None]) -> None:
         """Bring every drive to rest, then configure it, then start its process data.
@@ -507,12 +504,17 @@ class Drives:
         self.manage(Nmt.PRE_OPERATIONAL)
         for drive in self.all:
             drive.configure(period, self.guards, say)
+        for number, node in self._nodes.items():
+            mine = [drive for drive in self.all if drive.motor.node == number]
+            numbers = [drive.process_data() for drive in mine]
+            received = {number for set_point, command, _ in numbers for number in (set_point, command)}
+            node.switch_off_process_data(received, {status for _, _, status in numbers}, mine[0].name)
         self.manage(Nmt.START)
         end = time.monotonic() + 1.0
-        while waiting := [drive for drive in self.all if drive.nmt != NmtState.OPERATIONAL]:
+        while waiting := [drive for drive in self.all if drive.node.nmt != NmtState.OPERATIONAL]:
             if time.monotonic() > end:
                 raise InputError(
-                    f"does not become OPERATIONAL (its heartbeat says {waiting[0].nmt})",
+                    f"does not become OPERATIONAL (its heartbeat says {waiting[0].node.nmt})",
                     where=waiting[0].name,
                     remedy="power it off and on",
                 )
@@ -537,8 +539,8 @@ class Drives:
                 if stopped:
                     drive.controlword = int(Controlword.QUICK_STOP)
                 data = objects.SETPOINT.pack(drive.controlword, drive.target)
-                self.network.send_message(objects.RPDO1 + drive.motor.node, data)
-            self._awaited = {drive.motor.node for drive in self.all}
+                self.network.send_message(drive.identifiers.set_point, data)
+            self._awaited = set(self.all)
             self._complete.clear()
             self.network.send_message(objects.SYNC, b"")
         self.send_heartbeat()
@@ -546,7 +548,7 @@ class Drives:
             meanwhile()
         complete = self._complete.wait(timeout)
         for drive in self.all:
-            drive.unanswered = drive.unanswered + 1 if drive.motor.node in self._awaited else 0
+            drive.unanswered = drive.unanswered + 1 if drive in self._awaited else 0
         return complete
 
     def send_heartbeat(self) -> None:
@@ -573,9 +575,7 @@ class Drives:
             for drive in self.all:
                 drive.controlword = int(Controlword.QUICK_STOP)
                 try:
-                    self.network.send_message(
-                        objects.RPDO2 + drive.motor.node, objects.COMMAND.pack(Controlword.QUICK_STOP)
-                    )
+                    self.network.send_message(drive.identifiers.command, objects.COMMAND.pack(Controlword.QUICK_STOP))
                 except can.CanError as error:
                     failures.append(f"{drive.name}: {error}")
         finally:
@@ -589,7 +589,7 @@ class Drives:
         return self._stopped.is_set()
 
     def _arrived(self, drive: Drive) -> None:
-        self._awaited.discard(drive.motor.node)
+        self._awaited.discard(drive)
         if not self._awaited:
             self._complete.set()
 
@@ -597,8 +597,8 @@ class Drives:
         if len(data) != 8:
             data = bytearray(data[:8].ljust(8, b"\0"))
         code, register, _ = objects.EMERGENCY.unpack(data)
-        channel = self._names.get(identifier - objects.EMCY, "?")
-        self.emergencies.append(Emergency(time.monotonic(), channel, code, register))
+        channels = tuple(drive.motor.channel for drive in self.all if drive.motor.node == identifier - objects.EMCY)
+        self.emergencies.append(Emergency(time.monotonic(), channels, code, register))
 
 
 _SET: dict[Object, tuple[int, ...]] = {
@@ -618,5 +618,3 @@ _SET: dict[Object, tuple[int, ...]] = {
 """Objects that `Drive.configure` writes, with their subindexes."""
 
 _MODE_TIME = 0.2  # [s]: a drive may take some cycles of its own to change its mode
-_EDS_REMEDY = "give the data sheet that came with this drive"
-_SDO_REMEDY = "check power, node number, bit rate and termination; `rfdropo doctor` lists who answers"

@@ -23,7 +23,7 @@ from rfdropo_bayes.deployment.policy import CommandSource, PolicyScene
 from rfdropo_bayes.deployment.sensors import MarkerView
 from rfdropo_bayes.deployment.setpoints import SetPoints
 from rfdropo_bayes.deployment.settings import SafetyTable
-from rfdropo_bayes.deployment.watch import Watch
+from rfdropo_bayes.deployment.watch import AfterStop, Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
@@ -132,8 +132,8 @@ class ControlLoop:
             self.drives.exchange(_ANSWER * self.period, meanwhile)
         except can.CanError as error:
             raise Stop(Cause.SEND_ERROR, str(error)) from None
-        self.markers.update(self.pulse)
         try:
+            self.markers.update(self.pulse)
             if phase is not Phase.BRAKED:
                 if self.demanded is not None:  # what follows from a stop by another thread is not its cause
                     raise self.demanded
@@ -186,12 +186,8 @@ class ControlLoop:
         try:
             phases(self)
             stop = Stop(Cause.FINISHED)
-        except Stop as raised:
-            stop = raised
-        except InputError as error:
-            stop = Stop(Cause.PROGRAM_ERROR, str(error))
         except Exception as error:  # the drives must come to rest before anything else
-            stop = Stop(Cause.PROGRAM_ERROR, f"{type(error).__name__}: {error}")
+            stop = _as_stop(error)
         return self._come_to_rest(stop)
 
     def find(self) -> None:
@@ -311,8 +307,7 @@ class ControlLoop:
         self._say(str(stop))
         began = time.monotonic()
         if self._expected is None:  # nothing was enabled, so that nothing needs a ramp
-            self._brake(began)
-            return stop
+            return self._brake(began, stop)
         if stop.cause.reaction is Reaction.RAMP:
             self._pulling = stop.cause is Cause.TENSION
             try:
@@ -328,11 +323,11 @@ class ControlLoop:
                 if stop.cause is Cause.FINISHED and self.safety.after == "release":
                     self._release()
                     return stop
-            except Stop as second:
+            except Exception as error:
+                second = _as_stop(error)
                 self._say(f"while stopping: {second}")
                 stop = stop if stop.cause is not Cause.FINISHED else second
-        self._brake(began)
-        return stop
+        return self._brake(began, stop)
 
     def _release(self) -> None:
         """Switch the drives off, one state down at a time."""
@@ -343,9 +338,14 @@ class ControlLoop:
             if time.monotonic() > end:
                 raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
 
-    def _brake(self, began: float) -> None:
-        """Quick stop, and look on until the drives have shown that they stand."""
+    def _brake(self, began: float, stop: Stop) -> Stop:
+        """Quick stop, and look on: the drives must show that they stand, and go on holding.
+
+        Returns:
+            The stop, with the drives that did not hold; these are the cause of a session that had ended as planned.
+        """
         self._wanted = DriveState.QUICK_STOP_ACTIVE
+        after = AfterStop(self.drives)
         for failure in self.drives.quick_stop():
             self._say(f"quick stop not sent: {failure}")
         end = time.monotonic() + self.safety.hold_s
@@ -353,21 +353,26 @@ class ControlLoop:
         while time.monotonic() < end:
             try:
                 self.cycle(Phase.BRAKED, self._hold_where_it_is())
-            except Stop as error:
+            except Exception as error:
                 if not failed:
-                    self._say(f"while braking: {error}; the drives' own guards stop them")
+                    self._say(f"while braking: {_as_stop(error)}; the drives' own guards stop them")
                 failed = True
+            for line in after.look():
+                self._say(line)
             if self.stop_time is None and all(_stands(drive) for drive in self.drives.all):
                 self.stop_time = time.monotonic() - began
-        if self.stop_time is None:
-            for drive in self.drives.all:
-                if not _stands(drive):
-                    self._say(f"{drive.name} has not shown that it stands")
+        if moving := [drive for drive in self.drives.all if not _stands(drive)]:
+            for drive in moving:
+                self._say(f"{drive.name} has not shown that it stands")
             try:  # the last word that the bus has; nodes that are lost quick-stop by object 0x6007
                 self.drives.manage(Nmt.STOP)
             except can.CanError:
                 self._say("the bus is lost: the drives' heartbeat guards stop them")
         self.pulse = None
+        if not after.found:
+            return stop
+        cause = Cause.DRIVE_STATE if stop.cause is Cause.FINISHED else stop.cause
+        return Stop(cause, "; ".join(filter(None, [stop.detail, *after.found])))
 
     def _hold_where_it_is(self) -> bool:
         """Let the command be where the drives have come to, as they no longer follow one; whether it is another now."""
@@ -378,6 +383,15 @@ class ControlLoop:
             return False
         self.command = length
         return True
+
+
+def _as_stop(error: Exception) -> Stop:
+    """The stop that an exception of any part of a session stands for."""
+    if isinstance(error, Stop):
+        return error
+    return Stop(
+        Cause.PROGRAM_ERROR, str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    )
 
 
 def _stands(drive: Drive) -> bool:

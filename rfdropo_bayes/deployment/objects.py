@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
+from typing import NamedTuple
+
+from rfdropo_bayes.errors import InputError
 
 SIMULATED_EDS = Path(__file__).with_name("simulated_drive.eds")
 """Electronic data sheet of the simulated drive; users of real drives give their own drive's."""
@@ -53,6 +57,22 @@ class Object(IntEnum):
     INTERPOLATION_TIME = 0x60C2
     FOLLOWING_ERROR = 0x60F4
     SUPPORTED_MODES = 0x6502
+    PROFILE = 0x67FF  # of an axis: 402
+
+
+_DEVICE, _AXIS, AXES = 0x6000, 0x800, 8  # first index of a device profile; indices of an axis; axes of a node at most
+PDOS_OF_AXIS = 64  # process data of the second axis follow so many numbers after those of the first
+
+
+def of_axis(index: int, axis: int) -> int:
+    """Index of an object of the first axis on another one: 0x800 for each; what is not of the profile is the node's."""
+    return index + _AXIS * (axis - 1) if index >= _DEVICE else int(index)
+
+
+def first_axis(index: int) -> tuple[int, int]:
+    """The axis that an object belongs to, and its index on the first axis; objects of the node count as the first's."""
+    axis = 1 + (index - _DEVICE) // _AXIS if index >= _DEVICE else 1
+    return axis, index - _AXIS * (axis - 1)
 
 
 PDO_INVALID = 1 << 31
@@ -72,6 +92,38 @@ EMERGENCY = struct.Struct("<HB5s")
 NMT, SYNC = 0x000, 0x080
 EMCY, TPDO1, RPDO1, RPDO2, HEARTBEAT = 0x080, 0x180, 0x200, 0x300, 0x700
 """Identifiers of the predefined connection set, to which the node is added."""
+_PREDEFINED = ((RPDO1, RPDO2, TPDO1), (0x400, 0x500, 0x280))  # of the first axis, and of the second
+_FREE = range(0x680, 0x6E0)  # CiA 301 gives them to nobody
+
+
+class Identifiers(NamedTuple):
+    """Of the frames of one axis: its set-points, its controlword alone, its status."""
+
+    set_point: int
+    command: int
+    status: int
+
+
+def identifiers(places: Sequence[tuple[int, int]]) -> list[Identifiers]:
+    """Identifiers of axes, given as (node, axis); no two of them share one.
+
+    The predefined connection set has two RPDOs for each of two axes. Those of further axes are numbers that CiA 301
+    leaves free.
+
+    Raises:
+        InputError: if there are too many axes beyond the second.
+    """
+    free, found = iter(_FREE), []
+    for node, axis in places:
+        if axis <= len(_PREDEFINED):
+            found.append(Identifiers(*(base + node for base in _PREDEFINED[axis - 1])))
+            continue
+        try:
+            found.append(Identifiers(next(free), next(free), next(free)))
+        except StopIteration:
+            many = f"more than {len(_FREE) // 3} motors are on third or further axes"
+            raise InputError(many, where="motors", remedy="spread them over nodes") from None
+    return found
 
 
 class Nmt(IntEnum):

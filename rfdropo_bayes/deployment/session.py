@@ -25,7 +25,7 @@ from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
 from rfdropo_bayes.deployment.display import session_table
-from rfdropo_bayes.deployment.drives import Drive, Drives
+from rfdropo_bayes.deployment.drives import Drives, drives_of
 from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals, file_hook
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
@@ -206,10 +206,15 @@ class _Session:
         self._stack.enter_context(real_time(threads=receivers))
         motors = self._motors()
         guards = settings.safety.guards([motor.node for motor in motors])
-        drives = [
-            Drive(self.network, motor, identity.eds, offset, identity.answer_s, identity.units, identity.unguarded)
-            for motor, offset in zip(motors, self.offsets, strict=True)
-        ]
+        drives = drives_of(
+            self.network,
+            motors,
+            self.offsets,
+            identity.eds,
+            identity.answer_s,
+            identity.units,
+            identity.unguarded,
+        )
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:
             self.found[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel), identity.check_eds)
@@ -230,7 +235,7 @@ class _Session:
         return SimulationTable(self.settings.robot, hub, table.plant, table.settings, table.own_process, address)
 
     def _leave(self) -> None:
-        with contextlib.suppress(can.CanError, OSError):
+        with contextlib.suppress(can.CanError):
             self.network.disconnect()
 
     def prepare(self, commands: CommandSource | Path | str | None) -> None:

@@ -16,7 +16,7 @@ from rfdropo_bayes.deployment.sensors import SensorTable
 from rfdropo_bayes.deployment.vendors import WITHOUT, AccelerationUnit, SpeedUnit, TorqueUnit, Units
 from rfdropo_bayes.deployment.watch import Patience
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.tables import nearest, parse_assignment, parse_table, set_entry
+from rfdropo_bayes.tables import nearest, parse_assignment, parse_table, read_toml, set_entry
 
 
 class _Table(BaseModel):
@@ -231,7 +231,7 @@ def load_deployment(path: Path | str, overrides: Sequence[str] = ()) -> Deployme
     """
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"cannot be read ({error})", where=str(path), remedy="give a readable TOML file") from None
     for assignment in overrides:

@@ -10,7 +10,7 @@ from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.cia402 import DriveState, Status
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drive, Drives
-from rfdropo_bayes.deployment.objects import NmtState
+from rfdropo_bayes.deployment.objects import NmtState, Object
 
 
 class Patience(NamedTuple):
@@ -51,7 +51,7 @@ class Watch:
         self._short = [drive.short_frames for drive in self._drives.all]
         self._drives.emergencies.clear()
         self._started = time.monotonic()
-        self._lagging: dict[int, float] = {}  # node -> since when
+        self._lagging: dict[Drive, float] = {}  # since when
 
     def check(self, tick: Tick, expected: DriveState | None, tension: bool = True) -> None:
         """Look at a cycle after its exchange.
@@ -73,7 +73,7 @@ class Watch:
             self._check_state(drive, expected)
             if expected is DriveState.OPERATION_ENABLED:
                 self._check_lag(drive, now)
-            if tension and drive.tension > drive.motor.tension_limit_n[1]:
+            if tension and drive.reading is not None and drive.tension > drive.motor.tension_limit_n[1]:
                 limit = drive.motor.tension_limit_n[1]
                 raise Stop(Cause.TENSION, f"{drive.name} pulls {drive.tension:.1f} N, more than {limit:g} N")
         self._check_deadlines(tick)
@@ -81,15 +81,16 @@ class Watch:
     def _check_emergencies(self) -> None:
         while self._drives.emergencies:
             emergency = self._drives.emergencies.popleft()
+            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not say which axis it means
             if emergency.code == 0x8611:
-                raise Stop(Cause.FOLLOWING_ERROR, f"drive {emergency.channel!r} does not follow its set-points")
+                raise Stop(Cause.FOLLOWING_ERROR, f"{drive} does not follow its set-points")
             if emergency.code:
-                raise Stop(Cause.EMERGENCY_MESSAGE, f"drive {emergency.channel!r} says 0x{emergency.code:04X}")
+                raise Stop(Cause.EMERGENCY_MESSAGE, f"{drive} says 0x{emergency.code:04X}")
 
     def _check_life(self, drive: Drive, now: float) -> None:
-        quiet = now - max(drive.heartbeat, self._started)
-        if drive.nmt not in (None, NmtState.OPERATIONAL):
-            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.nmt})")
+        quiet = now - max(drive.node.heartbeat, self._started)
+        if drive.node.nmt not in (None, NmtState.OPERATIONAL):
+            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.node.nmt})")
         if quiet > self._patience.heartbeat_s:
             raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
         if drive.unanswered > self._patience.stale_cycles:
@@ -113,8 +114,8 @@ class Watch:
             return
         lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre
         if lag <= self._patience.following_error_m:
-            self._lagging.pop(drive.motor.node, None)
-        elif now - self._lagging.setdefault(drive.motor.node, now) > self._patience.following_time_s:
+            self._lagging.pop(drive, None)
+        elif now - self._lagging.setdefault(drive, now) > self._patience.following_time_s:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} is {1e3 * lag:.1f} mm behind its set-point")
 
     def _check_deadlines(self, tick: Tick) -> None:
@@ -126,3 +127,37 @@ class Watch:
         if len(self._misses) >= self._patience.misses:
             seconds = self._patience.misses_within_s
             raise Stop(Cause.DEADLINES, f"{len(self._misses)} deadlines missed within {seconds:g} s")
+
+
+class AfterStop:
+    """Looks at drives after a quick stop, which they should hold: some enable themselves again, others let go.
+
+    Args:
+        drives: that are stopped.
+    """
+
+    def __init__(self, drives: Drives) -> None:
+        self._to_hold = [drive for drive in drives.all if drive.state in _HOLDING]
+        self._stopped: set[Drive] = set()
+        self.found: list[str] = []
+
+    def look(self) -> list[str]:
+        """What has been seen since the last look; each drive is told of once."""
+        new = [line for drive in self._to_hold if (line := self._seen(drive))]
+        self._to_hold = [drive for drive in self._to_hold if not any(line.startswith(drive.name) for line in new)]
+        self.found += new
+        return new
+
+    def _seen(self, drive: Drive) -> str:
+        state = drive.state
+        if state is DriveState.QUICK_STOP_ACTIVE:
+            self._stopped.add(drive)
+        if state is DriveState.OPERATION_ENABLED and drive in self._stopped:
+            return f"{drive.name} enabled itself again after the quick stop"
+        if state not in _HOLDING and Object.QUICK_STOP_OPTION not in drive.unguarded:  # else its owner bears that
+            words = "an unknown state" if state is None else state.words
+            return f"{drive.name} let its cable go after the quick stop: it is in {words}"
+        return ""
+
+
+_HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)

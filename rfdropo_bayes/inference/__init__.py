@@ -1,6 +1,6 @@
 """Inference methods. They see a `Problem` and nothing of the simulator behind it.
 
-Other rooms import from here, and the modules `methods` and `sbc`; a name's module is loaded when it is first used.
+Other rooms import from here, and the module `methods`; a name's module is loaded when it is first used.
 
 | to find | look in |
 |---|---|
@@ -8,7 +8,6 @@ Other rooms import from here, and the modules `methods` and `sbc`; a name's modu
 | where SMC starts, how it goes on, how its particles move | `smc.start`, `smc.sampler`, `smc.moves` |
 | where modes are searched | `modes.mode_search` |
 | RF-DROPO | `rfdropo.phi_search` |
-| plain numpyro models | `plain.plain_problem` |
 """
 
 from importlib import import_module
@@ -31,15 +30,10 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.modes.targets import Target as Target
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
-    from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro as problem_from_numpyro
     from rfdropo_bayes.inference.progress import Checkpoint as Checkpoint
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
     from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RfdropoConfig
-    from rfdropo_bayes.inference.rivals import BayesSimConfig as BayesSimConfig
-    from rfdropo_bayes.inference.rivals import NpdrConfig as NpdrConfig
-    from rfdropo_bayes.inference.rivals import UdrConfig as UdrConfig
-    from rfdropo_bayes.inference.rivals import import_sbi as import_sbi
     from rfdropo_bayes.inference.smc.bridge import BridgeConfig as BridgeConfig
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SmcConfig
     from rfdropo_bayes.inference.smc.tempering import next_step as next_step
@@ -58,14 +52,9 @@ PUBLIC = {
     "Target": "modes.targets",
     "NestedConfig": "nested",
     "NutsConfig": "nuts",
-    "problem_from_numpyro": "plain.plain_problem",
     "Progress": "progress",
     "InferenceResult": "result",
     "RfdropoConfig": "rfdropo.phi_search",
-    "BayesSimConfig": "rivals",
-    "NpdrConfig": "rivals",
-    "UdrConfig": "rivals",
-    "import_sbi": "rivals",
     "next_step": "smc.tempering",
     "BridgeConfig": "smc.bridge",
     "SmcConfig": "smc.sampler",

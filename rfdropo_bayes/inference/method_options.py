@@ -6,7 +6,10 @@ import dataclasses
 import inspect
 import re
 import textwrap
+from collections.abc import Mapping
 from typing import Any, ClassVar
+
+from rfdropo_bayes.tables import plain
 
 _ENTRY = re.compile(r" {4}([a-z0-9_]+(?:, [a-z0-9_]+)*): (.*)")
 _WIDTH = 110
@@ -52,6 +55,19 @@ class MethodOptions:
         return "\n".join([self.call, head, *lines])
 
 
+def options_table(options: Any) -> dict[str, Any]:
+    """Options as a table of an experiment file: TOML has no word for None, so that such options are left out."""
+    return _entry({field.name: getattr(options, field.name) for field in dataclasses.fields(options)})
+
+
+def _entry(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return options_table(value)
+    if isinstance(value, Mapping):
+        return {name: _entry(each) for name, each in value.items() if each is not None}
+    return [_entry(each) for each in value] if isinstance(value, list | tuple) else value
+
+
 def attributes_of(kind: type) -> dict[str, str]:
     """What the section "Attributes" of a docstring says of each name; ``a, b: text`` speaks of both."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
@@ -70,7 +86,7 @@ def attributes_of(kind: type) -> dict[str, str]:
 def settings_text(value: Any) -> str:
     """Options as the digest of a run has them: every field by name, in words that checkpoints of all versions share."""
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        return repr(value)
+        return repr(plain(value))
     fields = ", ".join(
         f"{field.name}={settings_text(getattr(value, field.name))}" for field in dataclasses.fields(value)
     )

@@ -13,14 +13,14 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, check_problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import nested, nuts, rivals
+from rfdropo_bayes.inference import nested, nuts
 from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc import start as starts
-from rfdropo_bayes.tables import nearest
+from rfdropo_bayes.tables import nearest, plain
 
 
 class Method(NamedTuple):
@@ -44,9 +44,6 @@ METHODS: dict[str, Method] = {
     "bridge": Method(bridge.BridgeConfig, bridge.run),
     "nuts": Method(nuts.NutsConfig, nuts.run),
     "nested": Method(nested.NestedConfig, nested.run),
-    "bayessim": Method(rivals.BayesSimConfig, rivals.run_bayessim),
-    "npdr": Method(rivals.NpdrConfig, rivals.run_npdr),
-    "udr": Method(rivals.UdrConfig, rivals.run_udr, posterior=False),
 }
 
 
@@ -128,6 +125,7 @@ def _build(kind: type, options: Mapping[str, Any], where: str, beside: Sequence[
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
     """Value of an option as its field wants it; TOML has lists for tuples and writes 20000 for 20000.0."""
+    value = plain(value)
     if dataclasses.is_dataclass(hint):
         if isinstance(value, hint):  # type: ignore[arg-type]
             return value

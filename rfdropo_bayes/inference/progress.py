@@ -15,6 +15,7 @@ import os
 import sys
 import time
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -145,6 +146,22 @@ def say_step(words: str, *, show: bool | None = None) -> None:
     check_interrupt()
     if show is not False:
         print(words, file=sys.stderr, flush=True)
+
+
+def say_lines(show: bool | None = None) -> Callable[[str], None]:
+    """A function that says on stderr what a run has found so far, with the seconds since now, and answers Ctrl-C.
+
+    Args:
+        show: False says nothing, see `Progress`.
+    """
+    began = time.monotonic()
+
+    def say(line: str) -> None:
+        check_interrupt()
+        if show is not False:
+            print(f"  {time.monotonic() - began:5.0f} s  {line}", file=sys.stderr, flush=True)
+
+    return say
 
 
 def clock(seconds: float) -> str:

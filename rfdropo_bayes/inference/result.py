@@ -107,13 +107,12 @@ def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
     return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
 
 
-def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None, correlation: float) -> list[Caution]:
+def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None) -> list[Caution]:
     """What the stages of all replicates say against the draws: a budget that ran out, particles that did not move.
 
     Args:
         trace: a dictionary per stage, as in the result of `smc.sampler`.
         rollouts: their budget.
-        correlation: that moves were to leave at most.
     """
     found = []
     leaps = [row for row in trace if row["budget_exhausted"] and not row.get("final")]
@@ -125,7 +124,7 @@ def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None, correlat
             f"reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
         )
         found.append(Caution(Code.BUDGET_SPENT, sentence, grave=True))
-    if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > max(STUCK, correlation):
+    if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > STUCK:
         sentence = (
             f"the last moves left the particles {stuck:.2f} correlated with where they were, so that the posterior may "
             "be too narrow: several modes, a rugged likelihood, or a shape that moves cannot follow; compare replicates"
@@ -159,6 +158,23 @@ def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
         )
         found.append(Caution(Code.REPLICATES_DISAGREE, sentence))
     return found
+
+
+def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
+    """A caution where nothing would show a lost mode: particles of one replicate end in one mode of several.
+
+    Args:
+        replicates: independent repetitions of the sampler.
+        climbs: independent searches for the optima that all replicates start around; None for starts at the prior.
+    """
+    if replicates > 1 and climbs != 1:
+        return []
+    alone = "one replicate" if replicates == 1 else "one climb to an optimum"
+    sentence = (
+        f"{alone} cannot show whether other modes of the posterior were lost: allow more rollouts, state "
+        "replicates = 4, or compare seeds"
+    )
+    return [Caution(Code.MODES_UNSEEN, sentence)]
 
 
 def exclusion_cautions(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[Caution]:

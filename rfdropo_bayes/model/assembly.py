@@ -31,6 +31,7 @@ from rfdropo_bayes.bayes.noise import (
 )
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 from rfdropo_bayes.bayes.pooling import Pooled
+from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
@@ -220,6 +221,22 @@ def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *
             if name in [each.name for each in absent]:
                 raise InputError(f"the model has no parameter {name!r}", where=where, remedy=f"{remedy}, or remove it")
         check_names([name], specs, where=where)
+
+
+def check_spec(spec: ModelSpec, simulator: AnySimulator) -> None:
+    """See that all that a model names are its parameters, and that priors can be priors of them.
+
+    Raises:
+        InputError: a parameter that the model does not have, or a prior or a value that is none of its parameter.
+    """
+    specs = model_specs(spec, simulator)
+    for key in ("priors", "per_recording", "per_group", "only_in"):
+        check_used(getattr(spec, key), spec, simulator, where=f"[model.{key}]")
+    fixed_values(spec, simulator)
+    by_name = {each.name: each for each in specs}
+    for name, table in expand_groups(spec.priors, specs).items():
+        if table:
+            prior_from_table(by_name[name], dict(table), where=f"[model.priors] {name}")
 
 
 def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:

@@ -286,37 +286,6 @@ class DesignTable(ExperimentTable):
     )
 
 
-class SeparationTable(ExperimentTable):
-    """[separation]: mechanisms that ``rfdropo audit --separate`` compares."""
-
-    mechanisms: list[str] = Field(
-        min_length=2,
-        description="that join the base model, to see which of them the recordings tell apart",
-    )
-    groups: dict[str, list[str]] = Field(
-        default_factory=dict,
-        description="sets of them that are asked for together, such as all ways to be late",
-    )
-
-    @model_validator(mode="after")
-    def _has_members(self) -> SeparationTable:
-        for name, members in self.groups.items():
-            for member in members:
-                if member not in self.mechanisms:
-                    raise InputError(
-                        f"{member!r} is none of the mechanisms",
-                        where=f"[separation.groups] {name}",
-                        remedy=f"use {', '.join(self.mechanisms)}",
-                    )
-            if name in self.mechanisms or not members:
-                raise InputError(
-                    f"{name!r} is a mechanism itself" if members else "is empty",
-                    where=f"[separation.groups] {name}",
-                    remedy="give a group a name of its own, and members",
-                )
-        return self
-
-
 class Experiment(ExperimentTable):
     """An experiment as read from its file; see `load_experiment`."""
 
@@ -352,7 +321,6 @@ class Experiment(ExperimentTable):
     audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
     design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")
     training: TrainingTable | None = Field(default=None, description="what rfdropo train learns, and how")
-    separation: SeparationTable | None = Field(default=None, description="what rfdropo audit --separate compares")
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:

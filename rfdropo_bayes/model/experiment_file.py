@@ -14,7 +14,7 @@ from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files, unwritten
-from rfdropo_bayes.tables import parse_assignment, set_entry
+from rfdropo_bayes.tables import parse_assignment, plain, read_toml, set_entry
 
 ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
@@ -40,7 +40,7 @@ def read_tables(path: Path) -> dict[str, Any]:
             f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path"
         ) from None
     try:
-        tables = tomllib.loads(text)
+        tables = read_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
     if path.name in WRITTEN_BY_RUNS and any((path.parent / name).is_file() for name in RESULTS_OF_RUNS):
@@ -63,7 +63,7 @@ def describe(tables: Mapping[str, Any]) -> str:
     """The tables as TOML text, for config.toml in the run folder."""
     import tomli_w
 
-    return tomli_w.dumps(dict(tables))
+    return tomli_w.dumps(plain(dict(tables)))
 
 
 def look_through(path: Path, overrides: Sequence[str] = ()) -> None:
@@ -120,7 +120,7 @@ def self_contained(
     placed = copy.deepcopy(dict(tables))
     if "robot" in placed and placed["robot"] not in made:
         placed["robot"] = _robot_placed(str(placed["robot"]), folder, out)
-    for table, key in (("model", "mechanisms"), ("audit", "candidates"), ("separation", "mechanisms")):
+    for table, key in (("model", "mechanisms"), ("audit", "candidates")):
         if key in placed.get(table, {}):
             placed[table][key] = [code_placed(name, folder, out) for name in placed[table][key]]
     mesh = placed.get("simulator", {}).get("tetrahedra", {})

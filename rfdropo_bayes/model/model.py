@@ -20,6 +20,7 @@ from rfdropo_bayes.model.assembly import (
     build_model,
     build_problem,
     build_simulator,
+    check_spec,
     expand_groups,
     fixed_values,
     integrator_of,
@@ -32,6 +33,7 @@ from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe
 from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
 from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.signatures import with_keywords_of
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
@@ -76,8 +78,7 @@ class Model:
         file: that it was read from, if any; a changed model has none.
 
     Raises:
-        InputError: an unknown robot, key or mechanism, or a distribution that cannot be a prior. What is wrong with a
-            prior's numbers is said when recordings are there.
+        InputError: an unknown robot, key, mechanism or parameter; or a prior that cannot be one of its parameter.
     """
 
     file: ExperimentFile | None = None
@@ -109,6 +110,7 @@ class Model:
         experiment = parse_table(Experiment, tables, where="Model")
         self.spec = spec_of(experiment, Path(folder), made, mechanisms)
         self.settings = RunSettings(title=title)
+        check_spec(self.spec, self.simulator)
 
     @classmethod
     def of(cls, spec: ModelSpec, settings: RunSettings | None = None) -> Model:
@@ -197,8 +199,9 @@ class Model:
         """The model of these recordings as a numpyro model: a callable with sample sites for all that is inferred.
 
         Raises:
-            InputError: unknown names, or priors outside the bounds.
+            InputError: unknown names, priors outside the bounds, or a process in which JAX cannot compute.
         """
+        refuse_lost_threads()
         return build_model(self.spec, self.simulator, runs)
 
     def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:

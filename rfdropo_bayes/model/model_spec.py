@@ -28,7 +28,6 @@ from rfdropo_bayes.model.experiment import (
     LawTable,
     NoiseModel,
     NoiseTable,
-    SeparationTable,
     SimulatorTable,
 )
 from rfdropo_bayes.policies.training_config import TrainingTable
@@ -161,7 +160,6 @@ class RunSettings:
     audit: AuditTable = field(default_factory=AuditTable)
     design: DesignTable = field(default_factory=DesignTable)
     training: TrainingTable | None = None
-    separation: SeparationTable | None = None
 
     @classmethod
     def of(cls, experiment: Experiment) -> RunSettings:
@@ -175,7 +173,6 @@ class RunSettings:
             audit=experiment.audit,
             design=experiment.design,
             training=experiment.training,
-            separation=experiment.separation,
         )
 
     def tables(self) -> dict[str, Any]:

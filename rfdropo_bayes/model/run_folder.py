@@ -18,6 +18,7 @@ from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import output_folder, unwritten, write_text
 from rfdropo_bayes.interrupts import interrupted, running
 from rfdropo_bayes.model.experiment_file import FILE_KEYS, ROBOT_COPY, describe, self_contained
+from rfdropo_bayes.tables import plain
 
 RUN, CONFIG, LOG, CHECKPOINTS, PAGE = "run.json", "config.toml", "log.jsonl", "checkpoints", "report.html"
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
@@ -49,16 +50,12 @@ class RunKind(NamedTuple):
 COMMANDS = {
     "calibrate": RunKind(("summary.json", "posterior.nc", PAGE), resumable=True),
     "adapt": RunKind(("summary.json", "posterior.nc", PAGE)),
-    "check": RunKind(("sbc.json", "sbc.jsonl"), resumable=True),
     "simulate": RunKind(("simulation.json",)),
     "predict": RunKind(("prediction.json", "prediction.nc", "prediction.csv")),
     "audit": RunKind(("audit.json", "extended.toml", PAGE), resumable=True),
-    "separate": RunKind(("separation.json", "separation.md", "separation.png"), resumable=True),
     "design": RunKind(("design.json", "next_commands.csv")),
     "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl", PAGE), resumable=True),
     "evaluate": RunKind(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
-    "benchmark table1": RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True, shared=True),
-    "benchmark table2": RunKind(("table2.json", "table2.md", "table2.png"), resumable=True, shared=True),
 }
 
 
@@ -204,7 +201,7 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _write(out: Path, record: Mapping[str, Any], status: str) -> None:
-    write_text(out / RUN, json.dumps({**record, "status": status}, indent=2, default=str) + "\n")
+    write_text(out / RUN, json.dumps(plain({**record, "status": status}), indent=2, default=str) + "\n")
 
 
 def _digest(path: Path) -> str:
@@ -261,7 +258,7 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
 def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError where the run began with other settings; names the first few. Recordings of the same content may
     have been moved."""
-    old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now, default=str))))
+    old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(plain(dict(now)), default=str))))
     if before.get("data") and before["data"] == now["data"]:
         for tables, name in product((old, new), MOVABLE):
             if name in tables:

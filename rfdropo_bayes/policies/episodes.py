@@ -30,6 +30,7 @@ from rfdropo_bayes.policies.tasks import (
     shown_of,
 )
 from rfdropo_bayes.robots.policy_layout import Earlier
+from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -146,6 +147,7 @@ class Episodes:
             InputError: an unknown option or parameter, values outside their bounds, no initial state after
                 `REDRAWS` draws, or a limit on tension below what cables pull in every lane without an action.
         """
+        refuse_lost_threads()
         rows = np.asarray(rows, dtype=int)
         given = [dict(option) for option in options] if options else [{} for _ in rows]
         for option in given:
@@ -179,8 +181,9 @@ class Episodes:
         """One action in every lane.
 
         Raises:
-            InputError: actions that are not finite, or no action of the layout.
+            InputError: actions that are not finite, or no action of the layout; or JAX cannot compute in this process.
         """
+        refuse_lost_threads()
         actions = np.asarray(actions)
         if not np.all(np.isfinite(actions)):
             raise InputError(

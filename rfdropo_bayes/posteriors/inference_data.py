@@ -15,6 +15,7 @@ from jaxtyping import Float
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
 from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
+from rfdropo_bayes.tables import plain
 
 with warnings.catch_warnings():  # 0.23 announces its successor on import
     warnings.simplefilter("ignore", FutureWarning)
@@ -26,7 +27,7 @@ if TYPE_CHECKING or not TREES:
 else:
     InferenceData = xr.DataTree
 
-SCHEMA = "rfdropo_bayes.posterior/1"
+SCHEMA = "rfdropo_bayes.posterior/2"
 
 Draws = Mapping[str, Float[np.ndarray, "chain draw"]]
 
@@ -38,6 +39,7 @@ def to_tree(
     posterior_predictive: xr.Dataset | None = None,
     prior_predictive: xr.Dataset | None = None,
     observed_data: xr.Dataset | None = None,
+    constant_data: xr.Dataset | None = None,
     sample_stats: xr.Dataset | None = None,
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None,
     parameters: Sequence[ParameterInfo] = (),
@@ -48,7 +50,8 @@ def to_tree(
     Args:
         posterior: draws of each parameter, physical (SI) units.
         prior: prior draws of each parameter.
-        posterior_predictive, prior_predictive, observed_data, sample_stats: groups as they shall be stored.
+        posterior_predictive, prior_predictive, observed_data, constant_data, sample_stats: groups as they shall be
+            stored.
         log_likelihood: of every data row at every draw.
         parameters: what is known of them, kept as attributes of the variables.
         attrs: attributes of the whole, numbers, strings or JSON-able objects (data hash, seed, versions, ...).
@@ -85,6 +88,7 @@ def to_tree(
         "posterior_predictive": posterior_predictive,
         "prior_predictive": prior_predictive,
         "observed_data": observed_data,
+        "constant_data": constant_data,
         "sample_stats": sample_stats,
         "log_likelihood": None,
     }
@@ -118,6 +122,7 @@ def _draws_dataset(values: Mapping[str, np.ndarray]) -> xr.Dataset:
 
 
 def _attribute(value: Any) -> str | int | float:
+    value = plain(value)
     return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
 
 

@@ -26,6 +26,7 @@ from rfdropo_bayes.posteriors.inference_data import (
 from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
 
 AXES = ("x", "y", "z")
+DRAWS = "draws"  # attribute of a prediction: how many draws are its own
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,7 @@ class PosteriorRecord:
             posterior_predictive=_predictions(self.recordings),
             prior_predictive=_prior_predictions(self.recordings),
             observed_data=_observations(self.recordings),
+            constant_data=_masks(self.recordings),
             sample_stats=_stages(self.trace, self.block_scores),
             log_likelihood=self.log_likelihood,
             parameters=self.parameters,
@@ -211,25 +213,35 @@ def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
 
 
 def _predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Recordings differ in length and may differ in draws: each has variables and dimensions of its own."""
-    data: dict[str, Any] = {}
+    """Recordings differ in length and may differ in draws, of which ArviZ knows one number."""
+    predicted = {i: np.asarray(r.predicted, dtype=np.float32) for i, r in enumerate(recordings)}
+    data = _with_draws(predicted)
     for i, r in enumerate(recordings):
-        dims = (f"time_{i}", f"marker_{i}", "axis")
-        data[f"position_{i}"] = (("chain", f"draw_{i}", *dims), np.asarray(r.predicted, dtype=np.float32)[None])
-        data[f"mean_{i}"] = (dims, r.central)
+        data[f"mean_{i}"] = ((f"time_{i}", f"marker_{i}", "axis"), r.central)
     return xr.Dataset(data, coords={"axis": list(AXES)}) if data else None
 
 
 def _prior_predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    data = {
-        f"position_{i}": (
-            ("chain", f"draw_{i}", f"time_{i}", f"marker_{i}", "axis"),
-            np.asarray(r.prior_predicted, dtype=np.float32)[None],
-        )
+    predicted = {
+        i: np.asarray(r.prior_predicted, dtype=np.float32)
         for i, r in enumerate(recordings)
         if r.prior_predicted is not None
     }
-    return xr.Dataset(data, coords={"axis": list(AXES)}) if data else None
+    return xr.Dataset(_with_draws(predicted), coords={"axis": list(AXES)}) if predicted else None
+
+
+def _with_draws(predicted: Mapping[int, Float[np.ndarray, "draw time marker 3"]]) -> dict[str, Any]:
+    """Positions with one dimension of draws; recordings with fewer have their own again behind them."""
+    most = max((len(each) for each in predicted.values()), default=0)
+    data: dict[str, Any] = {}
+    for i, each in predicted.items():
+        dims = ("chain", "draw", f"time_{i}", f"marker_{i}", "axis")
+        data[f"position_{i}"] = (dims, np.resize(each, (1, most, *each.shape[1:])), {DRAWS: len(each)})
+    return data
+
+
+def _own_draws(positions: xr.DataArray) -> Float[np.ndarray, "draw time marker 3"]:
+    return positions.values[0, : int(positions.attrs[DRAWS])]
 
 
 def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
@@ -238,13 +250,20 @@ def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | Non
     for i, r in enumerate(recordings):
         attrs = {"name": r.name, "split": r.split, "repeat_group": int(r.repeat_group), "unit": "m"}
         data[f"position_{i}"] = ((f"time_{i}", f"marker_{i}", "axis"), np.asarray(r.observed, dtype=float), attrs)
-        data[f"mask_{i}"] = ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8))
         coords |= {f"time_{i}": np.asarray(r.time, dtype=float), f"marker_{i}": list(r.marker_names)}
     return xr.Dataset(data, coords=coords, attrs={"recordings": len(recordings)}) if recordings else None
 
 
+def _masks(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
+    """Which observations are there; ArviZ looks for a prediction of everything that is observed data."""
+    data = {
+        f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8)) for i, r in enumerate(recordings)
+    }
+    return xr.Dataset(data) if data else None
+
+
 def _recordings(data: Mapping[str, xr.Dataset]) -> tuple[RecordingPrediction, ...]:
-    observed, predicted = data["observed_data"], data["posterior_predictive"]
+    observed, predicted, masks = (data[name] for name in ("observed_data", "posterior_predictive", "constant_data"))
     before = data.get("prior_predictive", xr.Dataset())
     return tuple(
         RecordingPrediction(
@@ -253,10 +272,10 @@ def _recordings(data: Mapping[str, xr.Dataset]) -> tuple[RecordingPrediction, ..
             observed[f"time_{i}"].values,
             tuple(str(name) for name in observed[f"marker_{i}"].values),
             observed[f"position_{i}"].values,
-            observed[f"mask_{i}"].values.astype(bool),
-            predicted[f"position_{i}"].values[0],
+            masks[f"mask_{i}"].values.astype(bool),
+            _own_draws(predicted[f"position_{i}"]),
             predicted[f"mean_{i}"].values,
-            before[f"position_{i}"].values[0] if f"position_{i}" in before else None,
+            _own_draws(before[f"position_{i}"]) if f"position_{i}" in before else None,
             int(observed[f"position_{i}"].attrs["repeat_group"]),
         )
         for i in range(int(observed.attrs["recordings"]))

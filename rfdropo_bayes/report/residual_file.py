@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.discrepancy.pipeline import Answer
 
 
 def residual_dataset(answer: Answer) -> xr.Dataset:

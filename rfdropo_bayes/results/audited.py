@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import xarray as xr
 
-from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.cautions import Caution, read_cautions
+from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, whole, write_json, write_text
 from rfdropo_bayes.model.experiment import Experiment
@@ -68,6 +69,11 @@ class Audit:
     def sentence(self) -> str:
         """The verdict in words that a lab can act on."""
         return str(self.content["sentence"])
+
+    @property
+    def cautions(self) -> list[Caution]:
+        """What speaks against the answer, or its recordings."""
+        return read_cautions(self.content["cautions"])
 
     @cached_property
     def findings(self) -> pd.DataFrame:
@@ -181,7 +187,10 @@ class Audit:
     def _repr_html_(self) -> str:
         table = self.findings.to_html(float_format=lambda x: f"{x:.3g}") if len(self.findings) else ""
         said = "</p><p>".join(escape(sentence) for sentence in sentences(self.sentence))
-        return f"<p><b>{escape(self.verdict.replace('_', ' '))}</b>: {said}</p>{table}"
+        cautions = "".join(f"<li>{escape(caution.sentence)}</li>" for caution in self.cautions)
+        listed = f"<ul>{cautions}</ul>" if cautions else ""
+        return f"<p><b>{escape(self.verdict.replace('_', ' '))}</b>: {said}</p>{listed}{table}"
 
     def __repr__(self) -> str:
-        return f"{self.verdict}: {self.sentence}"
+        said = [caution.sentence for caution in self.cautions]
+        return "\n".join([f"{self.verdict}: {self.sentence}", *said])

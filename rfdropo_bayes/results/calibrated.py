@@ -66,7 +66,7 @@ class Calibration:
         return cls(PosteriorRecord.load(folder / POSTERIOR), {"title": model.title}, "", model, folder)
 
     @cached_property
-    def posterior(self) -> InferenceData:
+    def idata(self) -> InferenceData:
         """Draws, prior draws, predictions and sampler statistics in ArviZ's layout."""
         return self.record.inference_data()
 

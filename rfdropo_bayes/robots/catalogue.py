@@ -9,6 +9,7 @@ from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.sections import body_tables
+from rfdropo_bayes.tables import read_toml
 
 PACKAGE = Path(__file__).resolve().parents[1]
 FOLDERS = (PACKAGE / "models" / "robots", PACKAGE.parent / "models" / "robots")
@@ -35,7 +36,7 @@ def robot_tables(path: Path) -> dict[str, Any]:
 def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
     """Tables of a robot file; those it has itself replace those of the robot that it names as its ``base``."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", where=str(path), remedy="give a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:

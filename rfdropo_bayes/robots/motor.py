@@ -20,6 +20,7 @@ class Motor(RobotTable):
 
     channel: Name = Field(description="command channel that it drives")
     node: int = Field(ge=1, le=127, description="CANopen node of the drive")
+    axis: int = Field(default=1, ge=1, le=8, description="axis of that node, for drives of several motors")
     sign: int = Field(description="+1 where counts rise as the cable is pulled, else -1")
     drum_radius_m: Positive = Field(description="radius at which the cable is wound")
     gear: Positive = Field(description="turns of the motor per turn of the drum")
@@ -55,6 +56,11 @@ class Motor(RobotTable):
         if max(abs(low), abs(high)) * self.counts_per_metre > 2**30:
             raise ValueError(f"length_limit_m of {self.channel} does not fit into 32-bit counts")
         return self
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Node and axis."""
+        return self.node, self.axis
 
     @property
     def counts_per_metre(self) -> float:

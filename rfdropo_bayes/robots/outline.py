@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -19,6 +19,8 @@ DIRECTIONS = {f"{sign}{axis}": (sign, "xyz".index(axis)) for sign in "+-" for ax
 SHAPES = ("cylinder", "cone", "tube", "disks")
 CABLES_AT = 0.75
 """Distance of cables from the axis over the body's radius, where it is not given."""
+DISKS = 10
+"""Disks of a body if their number is not given, or the next number that shares out over the segments."""
 LEAST_GUIDES, GUIDES_PER_SEGMENT = 8, 4
 """Heights of guides, and layers of a body that does not taper: their elements are within .2 % of the limit where four
 cables bend a silicone arm by up to 1.5 rad, .6 % where it is five times softer. A cone with a tip of .6 of its base's
@@ -54,7 +56,7 @@ class RobotOutline:
     shape: Literal["cylinder", "cone", "tube", "disks"] = "cylinder"
     tip_radius: float | None = None
     inner_radius: float | None = None
-    disks: int = 10
+    disks: int | None = None
     disk_thickness: float = 0.003
     segments: int = 1
     cables: int = 4
@@ -84,8 +86,11 @@ class RobotOutline:
             raise InputError("an arm has one segment and one cable at least", where=where)
         if self.pairs and self.cables % 2:
             raise InputError(f"{self.cables} cables make no pairs", where=where, remedy="give an even number")
-        if self.shape == "disks" and self.disks % self.segments:
-            raise InputError(f"{self.disks} disks do not share out over {self.segments} segments", where=where)
+        if self.shape == "disks" and self.number_of_disks % self.segments:
+            remedy = f"give a multiple of {self.segments}"
+            raise InputError(
+                f"{self.disks} disks do not share out over {self.segments} segments", where=where, remedy=remedy
+            )
         if not self.markers:
             raise InputError("no markers", where=where, remedy="give at least the tip's")
 
@@ -102,7 +107,7 @@ class RobotOutline:
         if self.shape == "disks":
             return Disks(
                 length_m=self.length,
-                disks=self.disks,
+                disks=self.number_of_disks,
                 radius_m=self.radius,
                 thickness_m=self.disk_thickness,
                 backbone_radius_m=self.inner_radius or 0.2 * self.radius,
@@ -134,10 +139,22 @@ class RobotOutline:
             return [f"{word}_{k + 1}" for k in range(count)]
         return [f"s{s + 1}_{word}_{k + 1}" for s in range(self.segments) for k in range(count)]
 
+    def cable_names(self) -> list[str]:
+        """Of all segments, base to tip."""
+        if self.segments == 1:
+            return [f"cable_{k + 1}" for k in range(self.cables)]
+        return [f"s{s + 1}_cable_{k + 1}" for s in range(self.segments) for k in range(self.cables)]
 
-def not_given(answers: Collection[str]) -> frozenset[str]:
-    """Names of the answers of a `RobotOutline` that are taken as defaults."""
-    return frozenset(field.name for field in fields(RobotOutline) if field.name not in answers) - {"assumed"}
+    @property
+    def number_of_disks(self) -> int:
+        """As given, or the first number from `DISKS` on that shares out over the segments."""
+        return self.segments * -(-DISKS // self.segments) if self.disks is None else self.disks
+
+
+def not_given(answers: Mapping[str, Any]) -> frozenset[str]:
+    """Names of the answers of a `RobotOutline` that are taken as defaults, and that its shape needs."""
+    needless = {"assumed"} if answers.get("shape") == "disks" else {"assumed", "disks"}
+    return frozenset(field.name for field in fields(RobotOutline) if field.name not in answers) - needless
 
 
 def robot_text(outline: RobotOutline) -> str:
@@ -176,7 +193,7 @@ def _head(o: RobotOutline) -> list[str]:
         "",
         "# Shapes one after the other from the clamp to the tip: cylinder, cone, tube, disks. In their place six lists",
         "# of areas and moments may stand, for sections of any form.",
-        "[[body.section]]" + _mark(o, "shape", "length", "radius", "tip_radius"),
+        "[[body.section]]" + _mark(o, "shape", "length", "radius", "tip_radius", "disks"),
         *(f"{key} = {_toml(value)}" for key, value in section.items()),
         "",
     ]
@@ -210,15 +227,15 @@ def _cables(o: RobotOutline) -> list[str]:
         "# Cables at their azimuth, from +x towards +y, through guides up to where they end."
         + _mark(o, "cables", "cable_radius")
     ]
+    names = o.cable_names()
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
         azimuth = 360.0 / o.cables * (cable + segment / o.segments)
         end = o.length * (segment + 1) / o.segments
         inside = heights <= end + 1e-9
-        name = f"cable_{cable + 1}" if o.segments == 1 else f"s{segment + 1}_cable_{cable + 1}"
         lines += [
             "[[cables]]",
-            f'name = "{name}"',
+            f'name = "{names[row]}"',
             f"azimuth_deg = {azimuth:g}",
             "anchor_z_m = 0.0",
             f"anchor_radius_m = {at_base:.6g}",

@@ -168,9 +168,14 @@ class Robot(RobotTable):
         driven = tuple(motor.channel for motor in self.motors)
         if driven and driven != self.channels.names:
             raise ValueError(f"motors drive {', '.join(driven)}; the channels are {', '.join(self.channels.names)}")
-        nodes = [motor.node for motor in self.motors]
-        if len(set(nodes)) != len(nodes):
-            raise ValueError("two motors share a node")
+        at: dict[tuple[int, int], str] = {}
+        for motor in self.motors:
+            if motor.place in at:
+                raise ValueError(
+                    f"two motors share a node and an axis: {at[motor.place]} and {motor.channel} are on axis "
+                    f"{motor.axis} of node {motor.node}"
+                )
+            at[motor.place] = motor.channel
 
     def _check_inside(self) -> None:
         station = np.array(self.body.station_m)
@@ -235,7 +240,7 @@ class Robot(RobotTable):
         return parse_table(cls, outlined_tables(outlined), where="outline")
 
     def __repr__(self) -> str:
-        long = 1e3 * (self.body.station_m[-1] - self.body.station_m[0])
+        long = 1e3 * self.length
         commands = f"{len(self.channel_names)} commands [{self.command_unit}] ({', '.join(self.channel_names)})"
         markers = f"markers {', '.join(marker.name for marker in self.markers)}"
         return f"<Robot {self.name}: {long:.4g} mm long, {len(self.cables)} cables, {commands}, {markers}>"
@@ -325,6 +330,11 @@ class Robot(RobotTable):
     def guides(self) -> list[Float[np.ndarray, "guide 3"]]:
         """Guide points of each cable in the undeformed body [m]; cables may have different numbers of them."""
         return [cable.guides() for cable in self.cables]
+
+    @property
+    def length(self) -> float:
+        """Of the body along its axis [m]."""
+        return float(self.body.station_m[-1] - self.body.station_m[0])
 
     def drive_limits(self) -> Float[np.ndarray, "cable 2"]:
         """Least and greatest of what drives each cable and chamber: displacement [m], pull > 0, tension [N] or pressure

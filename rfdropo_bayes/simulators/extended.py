@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.robots import Travel
+from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
@@ -121,8 +122,9 @@ class ExtendedSimulator:
         """All values by name; those left out are nominal.
 
         Raises:
-            InputError: a name that is not a parameter of this simulator.
+            InputError: a name that is not a parameter of this simulator, or a process in which JAX cannot compute.
         """
+        refuse_lost_threads()
         check_names(parameters, self.parameters, where="rollout")
         return {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
 

@@ -58,6 +58,7 @@ from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
+from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
 DRAWS = 100
 MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
@@ -369,16 +370,15 @@ def run_adaptation(
     return adapt(fit, found[0], out=out, **options)
 
 
-def fitted_model(run: Path, experiment: Path | None = None, overrides: Sequence[str] | None = None) -> Model:
-    """The model of a run's folder, or of the experiment file where the folder holds a posterior alone.
+def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
+    """The model of a run's folder.
 
     Raises:
         InputError: no file says which model.
     """
-    path = run / CONFIG if experiment is None else experiment
-    if not path.is_file():
-        raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
-    return Model.read(path, overrides)
+    if not (run / CONFIG).is_file():
+        raise InputError(f"holds no {CONFIG}", where=str(run), remedy="name the folder of a calibration")
+    return Model.read(run / CONFIG, overrides)
 
 
 def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:
@@ -531,7 +531,8 @@ def _record(
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
     predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
     record = PosteriorRecord(infos, draws, {**prior, **drawn}, tuple(predictions), attrs=attributes)
-    return with_ratios(record, problem.names)
+    doubts = cautions_after(asked.fit.record, asked.model, [asked.head, *asked.tested])
+    return with_doubts(with_ratios(record, problem.names), doubts)
 
 
 def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:

@@ -8,6 +8,7 @@ from typing import Any
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.runtime import refuse_lost_threads
 
 
 def given_model(given: Any, where: str) -> Model:
@@ -18,8 +19,9 @@ def given_model(given: Any, where: str) -> Model:
         where: the verb that was called.
 
     Raises:
-        InputError: something else was given.
+        InputError: something else was given, or JAX cannot compute in this process.
     """
+    refuse_lost_threads()
     if isinstance(given, Model):
         return given
     named = f"{str(given)!r}" if isinstance(given, str | Path) else f"a {type(given).__name__}"
@@ -33,8 +35,9 @@ def given_fit(given: Any, where: str) -> Calibration:
     """A calibration.
 
     Raises:
-        InputError: something else was given.
+        InputError: something else was given, or JAX cannot compute in this process.
     """
+    refuse_lost_threads()
     if isinstance(given, Calibration):
         return given
     named = f"{str(given)!r}" if isinstance(given, str | Path) else f"a {type(given).__name__}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,27 +11,29 @@ from typing import Any
 import jax
 import numpy as np
 
-from rfdropo_bayes.audit.audit_problem import AuditProblem
-from rfdropo_bayes.audit.audit_record import next_experiment, record
-from rfdropo_bayes.audit.candidates import Candidate
-from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.audit.deadline import Deadline
-from rfdropo_bayes.audit.differences import Groups, with_differences
-from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
-from rfdropo_bayes.audit.fit import widening
-from rfdropo_bayes.audit.fixed_quantities import OwnParameter, with_fixed_quantities
-from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
-from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.law_words import law_tables
-from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.audit.pipeline import audit as ask
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
+from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
+from rfdropo_bayes.discrepancy.candidates import Candidate
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.deadline import Deadline
+from rfdropo_bayes.discrepancy.differences import Groups, with_differences
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Rules
+from rfdropo_bayes.discrepancy.fit import widening
+from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, with_fixed_quantities
+from rfdropo_bayes.discrepancy.forward import Lanes, RoutedLanes
+from rfdropo_bayes.discrepancy.journal import Journal
+from rfdropo_bayes.discrepancy.law_words import law_tables
+from rfdropo_bayes.discrepancy.pipeline import Answer
+from rfdropo_bayes.discrepancy.pipeline import audit as ask
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import source_of
@@ -67,6 +69,8 @@ from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.between import Between, confine_laws, extend_groups, find_groups, groups_at_hand
+from rfdropo_bayes.verbs.motion_direction import Paths
+from rfdropo_bayes.verbs.recording_doubts import cautions_of_audit
 
 Workshop = dict[str, Lanes]
 
@@ -81,13 +85,13 @@ def audit(
     *,
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
-    base: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     noise: Mapping[str, float] | None = None,
     out: Path | str | None = None,
     resume: bool = False,
     overwrite: bool = False,
     workshop: Workshop | None = None,
-    report: Callable[[str], None] = lambda line: None,
+    show: bool | None = None,
     between: Between | None = None,
     **keys: Any,
 ) -> Audit:
@@ -99,14 +103,14 @@ def audit(
         runs: recordings that are fitted and screened.
         test: unseen recordings, which measure the gain.
         seed: of all that is random, 0 where no file says. The same seed gives the same answer.
-        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
         noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
             nothing was repeated.
         out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
         resume: go on from what an interrupted audit has left in ``out``.
         overwrite: start anew whatever ``out`` holds.
         workshop: see `build_problem`.
-        report: called with a line of words now and then.
+        show: whether to say now and then what is done, as in `calibrate`.
         between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
             Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
             What both lack is named, too.
@@ -124,20 +128,21 @@ def audit(
         groups = groups_at_hand(spec.groups, runs, test)
     else:
         groups, runs, test = find_groups(between, spec.groups, runs, test)
-    start = start_values(base)
+    start = start_values(fit)
     problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
     tables = model.record({"title": model.title, "seed": chosen}, {})
+    doubts = cautions_of_audit(model, [*runs, *test], nominal_paths(problem))
 
     def found(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
-        answer = ask(problem, report, journal, deadline)
+        answer = ask(problem, say_lines(show), journal, deadline)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
-        return _audited(answer, model, tables, data, out)
+        return _audited(answer, model, tables, data, out, doubts)
 
     if out is None:
         return found(None)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
-    given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": chosen}
+    given: dict[str, Any] = {"from": fit.folder if isinstance(fit, Calibration) else fit, "seed": chosen}
     if groups is not None and groups.compared:
         given |= {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
@@ -147,10 +152,31 @@ def audit(
     return answered
 
 
-def _audited(answer: Answer, model: Model, tables: Mapping[str, Any], data_sha256: str, out: Path | None) -> Audit:
-    """What an audit found as an object, with its page."""
+def nominal_paths(problem: AuditProblem) -> list[Paths]:
+    """The fitted recordings beside the nominal model; empty where an object is pushed, or a rollout ends badly."""
+    if "object_pose" in problem.lanes.fields:
+        return []
+    recordings = problem.model.recordings.of(range(len(problem.trajectories)))
+    values = {**problem.coordinates.nominal, **problem.coordinates.fixed}
+    theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
+    found, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
+    valid = np.asarray(recordings.line.valid)
+    paths = zip(found["position"], recordings.position, valid, strict=True)
+    return [] if np.any(status) else [Paths(*each) for each in paths]
+
+
+def _audited(
+    answer: Answer,
+    model: Model,
+    tables: Mapping[str, Any],
+    data_sha256: str,
+    out: Path | None,
+    doubts: Sequence[Caution],
+) -> Audit:
+    """What an audit found as an object, with its page; ``doubts`` are those of its recordings."""
     versions, following = software_versions(), next_experiment(answer)
-    content = record(answer, versions=versions, data_sha256=data_sha256, next_experiment=following)
+    given: dict[str, Any] = {"versions": versions, "data_sha256": data_sha256, "next_experiment": following}
+    content = record(answer, **given, doubts=doubts)
     seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
     page = render_audit(seen, content, model.title, describe(tables), shape)
     extended = extended_tables(dict(tables), answer, model.folder, out, model.texts())
@@ -432,11 +458,11 @@ def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stack
     return Stacked(tuple(parts))
 
 
-def start_values(base: Calibration | Path | None) -> dict[str, float] | None:
+def start_values(fit: Calibration | Path | None) -> dict[str, float] | None:
     """Posterior means of an earlier calibration, or of its folder."""
-    if base is None:
+    if fit is None:
         return None
-    content = base.content if isinstance(base, Calibration) else read_summary(Path(base) / SUMMARY)
+    content = fit.content if isinstance(fit, Calibration) else read_summary(Path(fit) / SUMMARY)
     return {name: float(row["mean"]) for name, row in content["parameters"].items()}
 
 

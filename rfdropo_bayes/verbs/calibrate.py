@@ -18,6 +18,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
+from rfdropo_bayes.inference.method_options import options_table
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
@@ -61,6 +62,7 @@ from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
+from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
@@ -78,7 +80,7 @@ def calibrate(
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
     out: Path | str | None = None,
-    start: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
     show: bool | None = None,
@@ -92,7 +94,7 @@ def calibrate(
         test: recordings that no fit sees; the report says how well they are predicted.
         seed: of all that is random, 0 where no file says. The same seed gives the same draws.
         out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
-        start: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
+        fit: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
             recordings: climbs start from its optimum and draws. What is inferred, and from which data, does not change.
         resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
         overwrite: start anew whatever ``out`` holds.
@@ -106,20 +108,19 @@ def calibrate(
     table = model.settings.inference
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
-    problem = model.problem(runs, earlier_draws(start, name))
-    options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
-    said = {"method": name, **options}
+    problem = model.problem(runs, earlier_draws(fit, name))
+    said = {"method": name, **options_table(config)}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
         {"seed": seed, "inference": None if method is None else said},
     )
-    fit = partial(_fit, Fitting(model, problem, config, runs, test, chosen))
+    work = partial(_fit, Fitting(model, problem, config, runs, test, chosen))
     if out is None:
-        return fit(None, describe(tables), resume=False, show=show)
+        return work(None, describe(tables), resume=False, show=show)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
-    settings |= {"options": {"from": start.folder if isinstance(start, Calibration) else start}, "texts": model.texts()}
+    settings |= {"options": {"from": fit.folder if isinstance(fit, Calibration) else fit}, "texts": model.texts()}
     with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
-        found = fit(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
+        found = work(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
         say_step("the fit is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
         found.save(folder)
     return found
@@ -148,11 +149,12 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     problem = problem.holding(result.held)
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
+    record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
     facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
-def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None:
+def earlier_draws(fit: Calibration | Path | None, method: str) -> Batch | None:
     """What an earlier calibration, or its folder, says of where climbs may start; None without one.
 
     Its optimum where it has one, the first of the rows, and as often its draws: of many parameters that rollouts do not
@@ -161,7 +163,7 @@ def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None
     Raises:
         InputError: a folder that holds no posterior, or a method that does not climb.
     """
-    if start is None:
+    if fit is None:
         return None
     if method not in CLIMBING:
         raise InputError(
@@ -169,11 +171,11 @@ def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
         )
-    if isinstance(start, Calibration):
-        record, content = start.record, start.content
+    if isinstance(fit, Calibration):
+        record, content = fit.record, fit.content
     else:
-        record = PosteriorRecord.load(Path(start) / POSTERIOR)
-        content = read_summary(Path(start) / SUMMARY) if (Path(start) / SUMMARY).is_file() else {}
+        record = PosteriorRecord.load(Path(fit) / POSTERIOR)
+        content = read_summary(Path(fit) / SUMMARY) if (Path(fit) / SUMMARY).is_file() else {}
     draws = thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
     optimum = content.get("optimum") or {}
     if not set(draws) <= set(optimum):
@@ -331,8 +333,10 @@ def gather_facts(
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
     slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
-    undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
-    strange = [] if robot is None else implausible_fit(robot, problem.model.fixed, record)
+    strange = recorded_doubts(record)
+    if robot is not None:
+        strange += robot.unstated(run.name for run in (*fitted, *tested))
+        strange += implausible_fit(robot, problem.model.fixed, record)
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -345,7 +349,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        cautions=[*result.cautions, *unmatched, *undriven, *strange, *residual_cautions(checks, problem.model.noise)],
+        cautions=[*strange, *result.cautions, *unmatched, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),

@@ -10,7 +10,6 @@ from typing import Literal, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import (
@@ -22,6 +21,7 @@ from rfdropo_bayes.data import (
 )
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.data.thinning import looked_at, thinning_note
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json
 from rfdropo_bayes.groups import unmatched
@@ -42,15 +42,17 @@ from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
-from rfdropo_bayes.verbs.motion_direction import direction_doubt, measure_direction
+from rfdropo_bayes.verbs.motion_check import measure_motion
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
-from rfdropo_bayes.verbs.placement import NEAR, far_from_rest, placement_hints
+from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
+from rfdropo_bayes.verbs.recording_doubts import asked_pulls, cables_beyond, recording_cautions, shortened
 
 MILLIMETRES = 1e3
+LONG = 60.0
+"""Recordings of more seconds make whoever checks them wait for minutes."""
 IRREGULAR = 1.5
 """A gap longer than so many median sample times is said."""
-MOST_NAMES = 12
 
 Result = TypeVar("Result")
 
@@ -119,26 +121,30 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
             found.lines += _unlike(own, first)
             first = first or own
     named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
+    columns = None if experiment.data is None else experiment.data.columns
+    cautions = recording_cautions(robot, [*recordings["fit"], *recordings["test"]], columns)
+    found.doubts += [caution.sentence for caution in cautions]
     if isinstance(robot, Robot):
-        _say_placement(found, experiment, robot, [*recordings["fit"], *recordings["test"]])
         found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
-    _say_copies(found, [*recordings["fit"], *recordings["test"]])
     if experiment.data is not None and experiment.data.fit and not experiment.data.test:
         found.notes.append(
             "no recording is kept for a test: nothing will say how well a fit predicts motions that it has not seen; "
             "name one under test in [data]"
         )
     found.doubts += [
-        f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {_names(named)}"
+        f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {shortened(named)}"
         for group, entry in unmatched(named, experiment.model.groups)
         if named
     ]
     _say_model(found, experiment, folder, recordings["fit"])
+    notes = [thinning_note(trajectory) for trajectory in (*recordings["fit"], *recordings["test"])]
+    found.notes += [note for note in notes if note is not None]
     if ahead and recordings["fit"] and not found.problems:
+        fewer = [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
-            _say_motion(found, experiment, folder, recordings["fit"])
-        _say_ahead(found, experiment, folder, recordings["fit"])
+            _say_motion(found, experiment, folder, fewer)
+        _say_ahead(found, experiment, folder, fewer)
     if any(recordings.values()):
         out = output_folder(out)
     rest = robot_shape(robot) if isinstance(robot, Robot) else None
@@ -159,14 +165,17 @@ def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequen
     spec = spec_of(experiment, folder)
     found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
-    direction = _try(found, partial(measure_direction, spec, runs))
-    doubt = None if direction is None else direction_doubt(direction, None if columns is None else columns.axes)
-    found.doubts += [] if doubt is None else [doubt]
+    compared = _try(found, partial(measure_motion, spec, runs, columns))
+    if compared is not None:
+        found.lines.append(("motion", compared.words))
+        found.doubts += [caution.sentence for caution in compared.cautions]
 
 
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
     """What a fit could determine; a model that cannot be simulated is no problem of its description."""
-    say_step("simulating draws of the prior, to say what a fit could determine")
+    seconds = sum(float(run.time[-1]) for run in runs)
+    patience = "; this takes minutes, and --quick leaves it out" if seconds > LONG else ""
+    say_step(f"simulating {seconds:.3g} s under draws of the prior, to say what a fit could determine{patience}")
     try:
         found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
     except InputError as error:
@@ -224,7 +233,6 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
     gaps = np.diff(trajectory.time)
     step = sample_time(trajectory.time)
     rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
-    found.doubts += [f"{trajectory.name}: {note}" for note in trajectory.notes]
     if gaps.max() > IRREGULAR * step:
         rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
     lines = [(f"{role}: {trajectory.name}", rows)]
@@ -249,20 +257,14 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
 def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
     shared = _try(found, lambda: shared_markers([trajectory], robot.marker_names))
     if shared is None:
-        yield f"markers {_names(trajectory.marker_names)}: NONE is the robot's"
+        yield f"markers {shortened(trajectory.marker_names)}: NONE is the robot's"
         return
     unknown = [name for name in trajectory.marker_names if name not in shared]
     unseen = [name for name in robot.marker_names if name not in shared]
-    words = f"markers {_names(shared)}: as the robot's"
+    words = f"markers {shortened(shared)}: as the robot's"
     if unknown:
-        words += f"; {_names(unknown)}: not the robot's, left out"
-    if unknown and unseen:
-        found.doubts.append(
-            f"{trajectory.name}: {_names(unknown)} of the recording is no marker of the robot, and {_names(unseen)} of "
-            "the robot is not in the recording: where both are the same point, give it one name, in markers under "
-            "[data.columns] or in the robot file"
-        )
-    yield words + (f"; the robot's {_names(unseen)}: not measured" if unseen else "")
+        words += f"; {shortened(unknown)}: not the robot's, left out"
+    yield words + (f"; the robot's {shortened(unseen)}: not measured" if unseen else "")
     usable = trajectory.position[trajectory.position_mask]
     if len(usable):
         ranges = ", ".join(
@@ -281,16 +283,6 @@ def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator
     yield f"first row, distance from the undeformed robot in mm: {distances}"
 
 
-def _say_placement(found: Check, experiment: Experiment, robot: Robot, trajectories: Sequence[Trajectory]) -> None:
-    """First rows far from the undeformed robot, with a cause; recordings alike share one note."""
-    columns = None if experiment.data is None else experiment.data.columns
-    shared: dict[str, list[str]] = {}
-    for trajectory in trajectories:
-        for hint in placement_hints(robot, trajectory, columns):
-            shared.setdefault(hint, []).append(trajectory.name)
-    found.doubts += [f"{_names(names)}: {hint}" for hint, names in shared.items()]
-
-
 def _masks(trajectory: Trajectory) -> str:
     masked, every = int((~trajectory.position_mask).sum()), trajectory.position_mask.size
     if not masked:
@@ -302,64 +294,25 @@ def _masks(trajectory: Trajectory) -> str:
 
 def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
     names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
-    yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
+    yield f"{len(names)} commands in {unit}: {shortened(names)}; from {command.min():.4g} to {command.max():.4g}"
     yield f"command before the first row: {trajectory.first_command}"
     problems = len(found.problems)
     _try(found, lambda: check_channels(trajectory, robot.channel_names, robot.command_unit))
     if len(found.problems) > problems:
         return
     if tuple(names) != robot.channel_names:
-        yield f"the robot calls them {_names(robot.channel_names)}, in this order"
+        yield f"the robot calls them {shortened(robot.channel_names)}, in this order"
     if not isinstance(robot, Robot):
         return
     travel = _try(found, partial(robot.travel, trajectory.name, trajectory.initial_command))
     if travel is not None:
         yield from _travel(travel, robot)
-        command = travel.follow(trajectory.initial_command, command)
-    _say_unasked(found, trajectory, robot)
-    _say_reach(found, trajectory.name, robot, command @ np.asarray(robot.channel_matrix({})).T)
-
-
-def _say_unasked(found: Check, trajectory: Trajectory, robot: Robot) -> None:
-    """Markers that go on moving while no command changes: a step into the recording has come to rest by its middle."""
-    if np.ptp(trajectory.command, axis=0).any():
-        return
-    middle = len(trajectory.time) // 2
-    late = np.where(trajectory.position_mask[middle:, :, None], trajectory.position[middle:], np.nan)
-    seen = late[:, np.isfinite(late).any(axis=(0, 2))]
-    way = float((np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0)).max(initial=0.0))
-    if way > NEAR * (robot.body.station_m[-1] - robot.body.station_m[0]):
-        found.doubts.append(
-            f"{trajectory.name}: no command changes, and in the second half of the recording a marker still moves by "
-            f"{MILLIMETRES * way:.3g} mm: look at the columns of the commands"
-        )
-
-
-SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
-"""Factor and unit in which what drives a cable or a chamber is shown."""
-
-
-def _say_reach(found: Check, name: str, robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> None:
-    """Cables and chambers that are asked for more than they are allowed, or for more than a body has."""
-    low, high = asked.min(axis=0), asked.max(axis=0)
-    least, most = np.array(robot.drive_limits()).T
-    beyond = np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
-    if not len(beyond):
-        return
-    factor, unit = SHOWN[robot.actuators[0].unit]
-    words = ", ".join(
-        f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
-        f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
-        for k in beyond
-    )
-    length = robot.body.station_m[-1] - robot.body.station_m[0]
-    if unit == "mm" and high.max() > length:
-        found.doubts.append(
-            f"{name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: {words}: look at "
-            "command_unit, at counts_per_turn, and at spool_radius and gain of the robot file"
-        )
-        return
-    found.notes.append(f"{name}: drives are held at the limits of the robot file where commands ask for more: {words}")
+    asked = asked_pulls(robot, trajectory)
+    doubted = asked is None or (robot.actuators[0].unit == "m" and asked.max() > robot.length)
+    beyond = "" if asked is None or doubted else cables_beyond(robot, asked)
+    if beyond:
+        held = "drives are held at the limits of the robot file if commands ask for more"
+        found.notes.append(f"{trajectory.name}: {held}: {beyond}")
 
 
 def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
@@ -370,32 +323,19 @@ def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
         if np.isfinite(low) or np.isfinite(high):
             alike.setdefault(f"{low:.4g} to {high:.4g} {robot.command_unit}, beyond: {word}", []).append(name)
     for text, names in alike.items():
-        yield f"drives of {_names(names)}: {text}"
+        yield f"drives of {shortened(names)}: {text}"
 
 
 def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
     groups = [group for group in group_repeats(trajectories) if len(group) > 1]
     for group in groups:
-        found.lines.append(("repeats", _names([trajectories[index].name for index in group])))
+        found.lines.append(("repeats", shortened([trajectories[index].name for index in group])))
     floor = _try(found, lambda: noise_floor(trajectories)) if groups else None
     if floor:
         words = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in floor.items())
         found.lines.append(("noise", f"spread of the repeats in mm: {words}"))
     elif trajectories:
         found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
-
-
-def _say_copies(found: Check, trajectories: Sequence[Trajectory]) -> None:
-    """Recordings of the same content: noise never repeats, so that one of them is a copy."""
-    alike: dict[str, list[str]] = {}
-    for trajectory in trajectories:
-        alike.setdefault(trajectory.sha256, []).append(trajectory.name)
-    found.doubts += [
-        f"{_names(names)} are the same to the last digit: a copy is no second measurement, and tests nothing; "
-        "list one of them"
-        for names in alike.values()
-        if len(names) > 1
-    ]
 
 
 def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
@@ -451,10 +391,3 @@ def _see_candidates(spec: ModelSpec, table: AuditTable) -> None:
     """
     names = candidate_names(spec, table)
     mechanisms_named(names, spec.robot, folder=spec.folder, where="[audit] candidates")
-
-
-def _names(names: Sequence[str]) -> str:
-    """Names with commas; of many the first and the last."""
-    if len(names) <= MOST_NAMES:
-        return ", ".join(names)
-    return f"{', '.join(names[:3])}, ..., {names[-1]} ({len(names)})"

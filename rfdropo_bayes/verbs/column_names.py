@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
-from rfdropo_bayes.data import lerobot, motive_csv, named_columns, rosbag
+from rfdropo_bayes.data import lerobot, motive_csv, named_arrays, named_columns, rosbag
+from rfdropo_bayes.data.csv_layout import is_value
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.mapped_formats import recognised_format
-from rfdropo_bayes.data.sample_times import pace
 from rfdropo_bayes.data.streams import side_by_side
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.verbs.column_units import (
+    ANGLES,
+    UNITS,
+    WORD,
+    Unit,
+    angle_unit,
+    command_time_unit,
+    command_unit,
+    length_unit,
+    time_unit,
+    told_time_units,
+    told_unit,
+)
 
 TIME = re.compile(
     r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
@@ -28,11 +42,25 @@ MEASURED = re.compile(
 SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)
 """Where any columns are called so, they alone are commands."""
 COMMAND = re.compile(
-    r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm]_?\d", re.IGNORECASE
+    r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
+    re.IGNORECASE,
 )
-ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
-NO_PLACE = re.compile(r"orient|quat|rotat|euler|angular|twist|veloc|accel|gyro|magnet|wrench|torque|force", re.I)
+NO_COMMAND = re.compile(
+    r"(?<![a-z])(ids?|idx|index|frames?|seq|rows?|numbers?|nr|trial|episode|run|phase|pattern|label|flags?|status|mode|"
+    r"roll|pitch|yaw|r[xyz]|q[xyzw]|quat\w*|euler|rot|orientation)(?![a-z])",
+    re.IGNORECASE,
+)
+"""Columns that count or name rows, or tell an orientation."""
+BESIDE = re.compile(r"current|temp|volt|power|torque|battery|error", re.IGNORECASE)
+"""Readings of a motor beside its command; commands if there is nothing else."""
+NO_PLACE = re.compile(
+    r"orient|quat|rotat|euler|angular|twist|veloc|accel|gyro|magnet|wrench|torque|force|"
+    r"(?<![a-z])(rot|rpy|vel|acc|imu|omega|tau|mag)(?![a-z])",
+    re.IGNORECASE,
+)
 """Columns in x, y and z that are no positions."""
+DERIVED = re.compile(r"(?<![a-z])[vwq][_. ]?\*", re.IGNORECASE)
+"""The same under a single letter: velocities and quaternions, if there are positions beside them."""
 RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
 BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
 """Solved poses of bodies: where there are any, the markers that they were solved from are not used as well."""
@@ -43,26 +71,12 @@ STRUCTURE = re.compile(
     r"optitrack|vicon|qualisys|natnet|observation|state)"
 )
 """Words that formats put around the name of a marker."""
-WORD = re.compile(r"[a-z0-9]+")
-UNITS = {unit: unit for unit in ("mm", "cm", "m", "deg", "rad")} | dict.fromkeys(
-    ("count", "counts", "cnt", "cnts", "tick", "ticks", "pulse", "pulses", "steps", "qc"), named_columns.COUNTS
-)
-"""Words in the name of a column, and the unit they tell."""
-ANGLES = ("rad", "deg", named_columns.COUNTS)
-TIME_UNITS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "usec", "micros", "microseconds", "µs", "μs"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
-}
-"""Words in the name of a column of times, and the unit they tell."""
-SHORTEST = {"ns": 0.9e6, "us": 0.9e3, "ms": 0.9}
-"""A millisecond, the shortest time between rows, in each unit, a tenth off for jitter: rows come more often than once
-in a second, so that a figure which is a second in one unit is a millisecond in the next."""
 LOOKED_AT = 2000
 """Rows that sizes are taken from."""
-MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
-"""A soft arm moves by less than so many metres, and its drives turn by less than so many radians."""
+MOST_SHOWN = 12
+"""Columns that an error names; and rows from which a pattern of values is told."""
+UNIT_LENGTH = 1e-3
+"""By how much the length of a quaternion may differ from one."""
 
 
 class Guess(NamedTuple):
@@ -79,6 +93,12 @@ class Guess(NamedTuple):
         left: columns that are nothing of these.
         format: of the file, one of `mapped_formats.MAPPED`.
         command_time, command_time_unit: column and unit of the commands' own times; None without one.
+        units: of columns in other units than command_unit or position_unit.
+        names, command_names: of all columns of files without names, as they were given.
+        sample_time: time from row to row [s], as it was given; None for rows with times, or without any.
+        evidence: why a unit was guessed, by its key in [data.columns]; no entry for a unit that the file tells.
+        start: where each marker is first seen, as the file has it.
+        sent: commands of the first rows; seen: positions of the markers in the first rows, both as the file has them.
     """
 
     time: str | None
@@ -90,12 +110,20 @@ class Guess(NamedTuple):
     markers: list[str]
     tensions: list[str]
     motor_angles: list[str]
+    motor_angle_unit: str
     left: list[str]
-    format: str = named_columns.FORMAT
-    command_time: str | None = None
-    command_time_unit: str = "s"
-    motor_angle_unit: str = "rad"
+    format: str
+    command_time: str | None
+    command_time_unit: str
+    units: Mapping[str, str]
+    names: list[str] | None
+    command_names: list[str] | None
+    evidence: Mapping[str, str]
+    start: Float[np.ndarray, "marker 3"]
+    sent: Float[np.ndarray, "command channel"]
+    seen: Float[np.ndarray, "row marker 3"]
     counts_per_turn: float | None = None
+    sample_time: float | None = None
 
     @property
     def counts(self) -> bool:
@@ -103,63 +131,122 @@ class Guess(NamedTuple):
         return named_columns.COUNTS in (self.command_unit, self.motor_angle_unit if self.motor_angles else "")
 
 
-def guess_columns(path: Path, sent: Path | None = None) -> Guess:
+def guess_columns(
+    path: Path,
+    sent: Path | None = None,
+    names: Sequence[str] | None = None,
+    command_names: Sequence[str] | None = None,
+) -> Guess:
     """Guess what the columns of a recording are.
 
     Args:
-        path: a CSV, an export of Motive's, a bag or a LeRobotDataset.
+        path: a CSV, an export of Motive's, a bag, a LeRobotDataset, or a file of arrays.
         sent: a CSV with the commands, where they have a file of their own.
+        names: of the columns of a CSV without names; command_names: the same for the commands' file.
 
     Raises:
         InputError: a file that cannot be read, or in which no positions or commands are found.
     """
     format = recognised_format(path)
-    whole, unit = _measured(format, path)
-    table = whole.numeric().head(LOOKED_AT)
-    names = [str(name) for name in table.columns]
+    own = format == named_columns.FORMAT or format in named_arrays.FORMATS
+    whole, unit = _measured(format, path, names)
+    table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
-    triples = _markers(_triples([name for name in names if name != time]))
+    columns = [str(name) for name in table.columns if name != time]
+    triples, tensions, angles, free = _parts(columns, format)
     positions = list(triples.values())
-    rest = [name for name in names if name != time and not any(name in triple for triple in positions)]
+    source, sending, clock = table, whole, None
+    if sent is not None:
+        sending = CsvTable(sent, (), names=command_names, machine_written=False)
+        source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
+        free = [str(name) for name in source.columns if name != clock]
+    commands = _commands(source, free, any_name=own or sent is not None)
+    _check_found(path, format, columns, positions, commands)
+    tensions = tensions if len(tensions) == len(commands) else []
+    units = {
+        "command_unit": command_unit(sending, source, commands),
+        "position_unit": (Unit(unit) if unit else told_unit(whole, names_of(positions), named_columns.METRES))
+        or length_unit(table[names_of(positions)]),
+        "time_unit": Unit("s")
+        if format == rosbag.FORMAT
+        else time_unit(whole, time, table[names_of(positions)].to_numpy()),
+    }
+    units["command_time_unit"] = command_time_unit(sending, clock, _seconds(whole, time, units["time_unit"].unit))
+    angles, units["motor_angle_unit"] = _measured_angles(
+        whole, table, angles if len(angles) == len(commands) else [], units["command_unit"].unit
+    )
+    used = {*commands, *names_of(positions), *tensions, *angles}
+    return Guess(
+        time=time,
+        commands=commands,
+        positions=positions,
+        markers=_marker_names(list(triples), None if own else STRUCTURE),
+        tensions=tensions,
+        motor_angles=angles,
+        left=[name for name in columns if name not in used],
+        format=format,
+        command_time=clock,
+        units={**units["command_unit"].others, **units["position_unit"].others},
+        names=None if names is None else list(names),
+        command_names=None if command_names is None else list(command_names),
+        evidence={key: unit.evidence for key, unit in units.items() if unit.evidence},
+        start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
+        sent=source[commands].to_numpy(dtype=float),
+        seen=table[names_of(positions)].to_numpy(dtype=float).reshape(len(table), -1, 3),
+        **{key: unit.unit for key, unit in units.items()},
+    )
+
+
+def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[str], list[str], list[str]]:
+    """Columns in x, y and z of each marker, of forces, of measured angles, and those that may be commands."""
+    places = _array_triples(columns) if format in named_arrays.FORMATS else _triples(columns)
+    rest = [name for name in columns if SENT.search(name) or not any(name in triple for triple in places.values())]
     tensions = [name for name in rest if FORCE.search(name)]
     angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
-    source, sending, clock, free = table, whole, None, [name for name in rest if name not in (*tensions, *angles)]
-    if sent is not None:
-        sending = CsvTable(sent, (), machine_written=False)
-        source, clock = sending.numeric().head(LOOKED_AT), _clock_of(sending)
-        commands = _commands([str(name) for name in source.columns if name != clock], any_name=True)
-    else:
-        commands = _commands(free, any_name=format == named_columns.FORMAT)
+    return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *angles)]
+
+
+def _check_found(path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]) -> None:
     for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
         if not found:
+            shown = ", ".join(columns[:MOST_SHOWN]) + (", ..." if len(columns) > MOST_SHOWN else "")
             raise InputError(
-                f"found no {what} among the columns {', '.join(names)}",
+                f"found no {what} among the columns {shown}",
                 where=str(path),
                 remedy="give the CSV of the commands with --commands"
                 if format == motive_csv.FORMAT and positions
                 else "leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
             )
-    unit_sent = _command_unit(source, commands)
-    angles = angles if len(angles) == len(commands) else []
-    unit_measured = (_written_unit(angles, ANGLES) or _angle_unit(table, angles)) if angles else "rad"
-    if unit_measured == named_columns.COUNTS and unit_sent not in ANGLES:
-        angles, unit_measured = [], "rad"  # nothing would use them, and their size is not known
-    return Guess(
-        time,
-        "s" if format == rosbag.FORMAT else _time_unit(whole, time),
-        commands,
-        unit_sent,
-        positions,
-        unit or _written_unit(names_of(positions), named_columns.METRES) or _length_unit(table[names_of(positions)]),
-        _marker_names(list(triples), None if format == named_columns.FORMAT else STRUCTURE),
-        tensions if len(tensions) == len(commands) else [],
-        angles,
-        [name for name in free if name not in commands],
-        format,
-        clock,
-        _time_unit(sending, clock),
-        unit_measured,
-    )
+
+
+def _measured_angles(whole: CsvTable, table: pd.DataFrame, angles: list[str], sent: str) -> tuple[list[str], Unit]:
+    """Columns of measured angles that are of use beside commands in the unit ``sent``, and their unit."""
+    if not angles:
+        return [], Unit("rad")
+    unit = told_unit(whole, angles, ANGLES) or angle_unit(table, angles)
+    if unit.others or (unit.unit == named_columns.COUNTS and sent not in ANGLES):
+        return [], Unit("rad")  # nothing would use them, and their size is not known
+    return angles, unit
+
+
+def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers: Sequence[str]) -> list[str] | None:
+    """Names for the columns of a file without names: times, commands, and x, y and z of each marker.
+
+    None if the columns are not as many.
+
+    Args:
+        rows: the cells of its first rows.
+        commands: their number, if it is known.
+        markers: their names.
+    """
+    width, places = len(rows[0]), [f"{marker}_{axis}" for marker in markers for axis in "xyz"]
+    rest = width - len(places)
+    stamps = pd.to_numeric(pd.Series([row[0] for row in rows]), errors="coerce")
+    clock = rest > 1 and (bool(stamps.diff().iloc[1] > 0.0) or (stamps.isna().all() and is_value(rows[0][0])))
+    clock = clock if commands is None else rest == commands + 1
+    if not places or rest < 1 + clock or (commands is not None and rest != commands + clock):
+        return None
+    return [*(["t"] if clock else []), *(f"c{k + 1}" for k in range(rest - clock)), *places]
 
 
 def lost_positions(recordings: list[Path], guess: Guess) -> dict[str, int]:
@@ -168,13 +255,13 @@ def lost_positions(recordings: list[Path], guess: Guess) -> dict[str, int]:
         return {}
     counts = {}
     for path in recordings:
-        frame = CsvTable(path, (), machine_written=False).frame
+        frame = CsvTable(path, (), names=guess.names, machine_written=False).frame
         known = [name for name in names_of(guess.positions) if name in frame]
         counts[path.name] = int(frame[known].isna().to_numpy().sum())
     return {name: count for name, count in counts.items() if count}
 
 
-def _measured(format: str, path: Path) -> tuple[CsvTable, str | None]:
+def _measured(format: str, path: Path, names: Sequence[str] | None) -> tuple[CsvTable, str | None]:
     """The table of a recording, and the unit of lengths where the file tells it."""
     if format == rosbag.FORMAT:
         return CsvTable.of_frame(side_by_side(rosbag.read_streams(path)), str(path), ()), "m"
@@ -184,33 +271,60 @@ def _measured(format: str, path: Path) -> tuple[CsvTable, str | None]:
     if format == motive_csv.FORMAT:
         file = motive_csv.read_motive(path)
         return file.table, file.length_unit
-    return CsvTable(path, (), machine_written=False), None
+    if format in named_arrays.FORMATS:
+        return CsvTable.of_frame(named_arrays.read_arrays(path), str(path), ()), None
+    return CsvTable(path, (), names=names, machine_written=False), None
 
 
 def _clock_of(table: CsvTable) -> str | None:
     """The first column that is called a time and holds times; else the first in a unit of time that always rises."""
     names = [str(name) for name in table.frame.columns]
     called = next((name for name in names if TIME.search(name) and _holds_times(table, name)), None)
-    return called or next((name for name in names if _told_time_units(name) and _rises(table, name)), None)
+    return called or next((name for name in names if told_time_units(table, name) and _rises(table, name)), None)
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
     """Those of the columns in x, y and z that are places of markers."""
-    places = {common: names for common, names in triples.items() if not NO_PLACE.search(common)}
+    places = {
+        common: names for common, names in triples.items() if not (NO_PLACE.search(common) or SENT.search(common))
+    }
     for chosen in (BODY, MARKER):
         found = {common: names for common, names in places.items() if chosen.search(common)}
         if found:
             return found
-    return places
+    return {common: names for common, names in places.items() if not DERIVED.search(common)} or places
 
 
-def _commands(names: list[str], *, any_name: bool) -> list[str]:
+def _commands(table: pd.DataFrame, names: list[str], *, any_name: bool) -> list[str]:
     """Those of the columns that are commands; where none is called so, all of them in files of one's own."""
+    told = [name for name in names if SENT.search(name)]
+    names = told or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
+    turns = {name for four in _quaternions(table, names) for name in four}
+    names = [name for name in names if name not in turns]
+    called = [name for name in names if COMMAND.search(name)]
     return (
         [name for name in names if SENT.search(name) and not RATE.search(name)]
-        or [name for name in names if COMMAND.search(name)]
+        or [name for name in called if not BESIDE.search(name) and not RATE.search(name)]
+        or called
         or (names if any_name else [])
     )
+
+
+def _counts_rows(values: pd.Series) -> bool:
+    """Whether a column goes up by one from every row to the next."""
+    return len(values) > MOST_SHOWN and bool((values.diff().iloc[1:] == 1.0).all())
+
+
+def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
+    """Four columns side by side that are of unit length in all rows, and not at rest on an axis."""
+    found = []
+    for first in range(len(names) - 3):
+        four = names[first : first + 4]
+        values = table[four].to_numpy(dtype=float)
+        seen = values[np.isfinite(values).all(axis=1)]
+        if len(seen) > MOST_SHOWN and np.all(np.abs(np.linalg.norm(seen, axis=1) - 1.0) < UNIT_LENGTH):
+            found += [four] if (np.abs(seen).max(axis=1) < 1.0).any() else []
+    return found
 
 
 def names_of(positions: list[list[str]]) -> list[str]:
@@ -228,6 +342,21 @@ def _triples(names: list[str]) -> dict[str, list[str]]:
     return {common: [axes[a] for a in "xyz"] for common, axes in found.items() if set(axes) == set("xyz")}
 
 
+def _array_triples(names: list[str]) -> dict[str, list[str]]:
+    """Arrays of three columns for each marker that are not called commands or readings."""
+    arrays: dict[str, list[str]] = {}
+    for name in names:
+        arrays.setdefault(name.partition("[")[0], []).append(name)
+    found = _triples(names)
+    for array, columns in arrays.items():
+        other = any(pattern.search(f"{array}[") for pattern in (COMMAND, SENT, FORCE, MEASURED, NO_COMMAND))
+        if len(columns) % 3 or other or any(name in triple for triple in found.values() for name in columns):
+            continue
+        for k in range(0, len(columns), 3):
+            found[f"{array}[{k // 3}]*" if len(columns) > 3 else f"{array}*".lower()] = columns[k : k + 3]
+    return found
+
+
 def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list[str]:
     """Names that robot files allow, made of what the columns of each marker have in common, without some words."""
     names = []
@@ -238,16 +367,6 @@ def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list
     return names if len(set(names)) == len(names) else [f"m{k}" for k in range(1, len(names) + 1)]
 
 
-def _written_unit(names: list[str], known: Collection[str] = frozenset(UNITS.values())) -> str | None:
-    """The unit, one of ``known``, that all of some columns carry in their names, such as ``x1_mm`` or ``tip x [m]``."""
-    told = [{UNITS[word] for word in WORD.findall(name.lower()) if UNITS.get(word) in known} for name in names]
-    return told[0].pop() if told and all(len(each) == 1 and each == told[0] for each in told) else None
-
-
-def _length_unit(table: pd.DataFrame) -> str:
-    return "mm" if float(np.nanmax(np.abs(table.to_numpy()))) > MILLIMETRES_ABOVE else "m"
-
-
 def _holds_times(table: CsvTable, name: str) -> bool:
     try:
         ticks = table.stamps(name, "s").ticks
@@ -256,39 +375,15 @@ def _holds_times(table: CsvTable, name: str) -> bool:
     return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date of the day alone is none
 
 
+def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
+    """How long a recording lasts [s]; zero where that is not known."""
+    if time is None or time not in table:
+        return 0.0
+    stamps = table.stamps(time, unit)
+    return float(stamps.ticks[-1] - stamps.ticks[0]) / stamps.per_second
+
+
 def _rises(table: CsvTable, name: str) -> bool:
     """Whether a column grows from every row to the next."""
-    numbers = table.numeric()
+    numbers = table.numeric(LOOKED_AT)
     return len(numbers) > 1 and name in numbers and bool((numbers[name].diff().iloc[1:] > 0.0).all())
-
-
-def _told_time_units(name: str) -> set[str]:
-    """Units of time that words in a column's name tell."""
-    return {TIME_UNITS[word] for word in re.findall(r"[^\W_]+", name.lower()) if word in TIME_UNITS}
-
-
-def _time_unit(table: CsvTable, time: str | None) -> str:
-    """The unit that the name of a column tells, or else the time from row to row."""
-    if time is None or len(table) < 2:
-        return "s"
-    stamps = table.stamps(time, "s")
-    told = _told_time_units(time)
-    if stamps.dated or len(told) == 1:
-        return "s" if stamps.dated else told.pop()
-    interval = pace(stamps.since(stamps, str(table.path)))
-    return next((unit for unit, shortest in SHORTEST.items() if interval >= shortest), "s")
-
-
-def _command_unit(table: pd.DataFrame, commands: list[str]) -> str:
-    written = _written_unit(commands)
-    if written or not commands:
-        return written or "mm"
-    largest = float(np.nanmax(np.abs(table[commands].to_numpy())))
-    if all(ANGLE.search(name) for name in commands):
-        return _angle_unit(table, commands)
-    return "mm" if largest > 0.2 else "m"
-
-
-def _angle_unit(table: pd.DataFrame, names: list[str]) -> str:
-    """The unit of angles by their size."""
-    return "deg" if float(np.nanmax(np.abs(table[names].to_numpy()))) > DEGREES_ABOVE else "rad"

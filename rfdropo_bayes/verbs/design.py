@@ -15,19 +15,20 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.audit_problem import AuditProblem
-from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
-from rfdropo_bayes.audit.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
-from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
-from rfdropo_bayes.audit.fit import Fit, FitTarget
-from rfdropo_bayes.audit.inadequacy import seen_under
-from rfdropo_bayes.audit.law_search import Refit, law_search
-from rfdropo_bayes.audit.pipeline import base_model
-from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
+from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime
+from rfdropo_bayes.discrepancy.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, ExtensionSearch
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.inadequacy import seen_under
+from rfdropo_bayes.discrepancy.law_search import Refit, law_search
+from rfdropo_bayes.discrepancy.pipeline import base_model
+from rfdropo_bayes.discrepancy.screen import Screen
+from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.results.calibrated import Calibration
@@ -68,12 +69,12 @@ def design(
     model: Model,
     runs: Sequence[Trajectory] | None = None,
     *,
-    base: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     seed: int | None = None,
     minutes: float | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
-    report: Callable[[str], None] = lambda line: None,
+    show: bool | None = None,
 ) -> Design:
     """Propose the commands that best separate the leading explanations of what a model lacks: candidates of the
     library, and laws at ports that the recordings do not tell apart.
@@ -86,22 +87,22 @@ def design(
     Args:
         model: what is simulated and inferred.
         runs: recordings; those of the model's experiment by default.
-        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
         seed: of all that is random; that of the model's experiment by default.
         minutes: bound of the whole run; that of the model's experiment, 10 by default.
         out: folder that gets design.json and next_commands.csv; None writes nothing.
         overwrite: start anew whatever ``out`` holds.
-        report: called with a line of words now and then.
+        show: whether to say now and then what is done, as in `calibrate`.
 
     Raises:
         InputError: bad input, or a base model that was not fitted in the time.
     """
     model = given_model(model, "design")
     runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
-    work = partial(_design, model, runs, base, chosen, minutes, report)
+    work = partial(_design, model, runs, fit, chosen, minutes, say_lines(show))
     if out is None:
         return work()
-    options = {"base": base.folder if isinstance(base, Calibration) else base, "seed": chosen}
+    options = {"from": fit.folder if isinstance(fit, Calibration) else fit, "seed": chosen}
     settings: dict[str, Any] = {
         "tables": model.tables(),
         "folder": model.folder,
@@ -118,14 +119,14 @@ def design(
 def _design(
     model: Model,
     runs: Sequence[Trajectory],
-    base: Calibration | Path | None,
+    fit: Calibration | Path | None,
     seed: int,
     minutes: float | None,
     report: Callable[[str], None],
 ) -> Design:
     """See `design`."""
     settings = model.settings
-    problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(base))
+    problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(fit))
     clock = Clock(settings.design.minutes if minutes is None else minutes)
     rng = np.random.default_rng(problem.seed)
     clock.share = 1.0

@@ -20,6 +20,7 @@ from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, actio
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, group_of, whole
+from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.prediction.day import physical_of_normal
@@ -66,7 +67,7 @@ def design_day(
     seed: int | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
-    report: Callable[[str], None] = lambda line: None,
+    show: bool | None = None,
 ) -> Design:
     """Propose the shortest commands whose recording determines what a day changes.
 
@@ -84,17 +85,17 @@ def design_day(
         seed: of the proposals; that of the model's experiment by default.
         out: folder that gets design.json and next_commands.csv; None writes nothing.
         overwrite: start anew whatever ``out`` holds.
-        report: called with a line of words now and then.
+        show: whether to say now and then what is done, as in `calibrate`.
 
     Raises:
         InputError: nothing of the model differs between days, or no recording is of the group.
     """
     model = model_of(given_fit(fit, "design_day"))
     runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
-    work = partial(_design_day, fit, runs, seconds, group, chosen, report)
+    work = partial(_design_day, fit, runs, seconds, group, chosen, say_lines(show))
     if out is None:
         return work()
-    options = {"base": fit.folder, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
+    options = {"from": fit.folder, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
     settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes(runs)}
     settings |= {"texts": model.texts()}
     with run_folder(Path(out), "design", **settings, options=options, overwrite=overwrite) as folder:

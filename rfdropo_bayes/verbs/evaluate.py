@@ -56,7 +56,7 @@ def evaluate(
     policies: Sequence[Path],
     out: Path | str,
     *,
-    posterior: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     episodes: int = 200,
     lanes: int = 64,
     seed: int = 0,
@@ -68,7 +68,7 @@ def evaluate(
 
     Args:
         model: that is simulated.
-        posterior: whose draws the episodes' parameters are, or its folder.
+        fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws.
         policies: policy.onnx, or folders that hold one; named after their folders, with those above
             where two folders are called the same.
         out: folder to write to: evaluation.json, evaluation.md, episodes.csv, success.png, and a GIF of each policy's
@@ -94,7 +94,7 @@ def evaluate(
     unwatched = _drop_limit(inherited) if not model.robot.cable_names and "tension_limit" not in keys else []
     model = with_training(model, {**inherited, **keys})
     table, task, simulator = training_of(model)
-    randomisation = randomisation_of(table, model.spec, simulator, posterior)
+    randomisation = randomisation_of(table, model.spec, simulator, fit)
     loaded = dict(zip(_names(policies), opened, strict=True))
     chosen = {"episodes": episodes, "seed": seed}
     record: dict[str, Any] = {

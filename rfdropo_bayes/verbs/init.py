@@ -7,18 +7,22 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
-from rfdropo_bayes.data.named_columns import COUNTS
+from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.outline import RobotOutline, robot_text
-from rfdropo_bayes.verbs.column_names import Guess, guess_columns, lost_positions
+from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_text
+from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
+from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.placement import frame_lines
 from rfdropo_bayes.verbs.slow_motion import slow_motion
+from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 PRIORS = (
     ("young_modulus", "how stiff"),
@@ -28,6 +32,7 @@ PRIORS = (
 )
 
 
+NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
 """Formats that come from motion capture, which loses markers now and then."""
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
@@ -77,12 +82,14 @@ def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]
     return files
 
 
-def guess_units(path: Path, commands: Path | None, command_unit: str | None, position_unit: str | None) -> Guess:
-    """What the columns of a recording are; units that are given take the place of guessed ones."""
-    guess = guess_columns(path, commands)
-    return guess._replace(
-        command_unit=command_unit or guess.command_unit, position_unit=position_unit or guess.position_unit
-    )
+def with_given(guess: Guess, **given: Any) -> Guess:
+    """A guess in which what is given takes the place of what was guessed: units, and the time from row to row [s]."""
+    given = {key: value for key, value in given.items() if value is not None}
+    evidence = {key: words for key, words in guess.evidence.items() if key not in given}
+    of_others = {"command_unit": guess.commands, "position_unit": names_of(guess.positions)}
+    settled = [name for key, names in of_others.items() if key in given for name in names]
+    units = {name: unit for name, unit in guess.units.items() if name not in settled}
+    return guess._replace(**given, evidence=evidence, units=units)
 
 
 def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
@@ -102,6 +109,30 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
     return guess._replace(counts_per_turn=counts, command_unit=unit)
 
 
+def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
+    """A guess with what the robot says of it: units of positions and commands, and no tensions of motors that move two
+    cables."""
+    if outline.pairs and guess.tensions:
+        guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
+    if "markers" in outline.assumed:
+        return guess
+    unit = unit_of_places(guess.start, outline.markers) if "position_unit" in guess.evidence else None
+    if unit is not None:
+        guess = guess._replace(position_unit=unit.unit, evidence={**guess.evidence, "position_unit": unit.evidence})
+    return _moved(guess, outline) if "command_unit" in guess.evidence and not guess.units else guess
+
+
+def _moved(guess: Guess, outline: RobotOutline) -> Guess:
+    """A guess with the unit of the commands that bends the robot as far as its markers moved."""
+    robot = parse_table(Robot, outlined_tables(outline), where="outline")
+    if len(guess.commands) != len(robot.channel_names) or len(guess.positions) != len(outline.markers):
+        return guess
+    seen = METRES[guess.position_unit] * guess.seen
+    guessed = Unit(guess.command_unit, evidence=guess.evidence["command_unit"])
+    unit = unit_of_motion(robot, guess.sent, seen, outline.markers, guessed)
+    return guess._replace(command_unit=unit.unit, evidence={**guess.evidence, "command_unit": unit.evidence})
+
+
 def write_first_files(
     folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess | None
 ) -> tuple[Path, Path]:
@@ -112,7 +143,7 @@ def write_first_files(
         outline: the robot.
         recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset.
         commands: the file of commands of each, where they have any.
-        guess: what their columns are; None without recordings, when random commands are simulated instead.
+        guess: what their columns are, see `of_robot`; None without recordings, when random commands are simulated.
 
     Raises:
         InputError: files of these names are there already, or the folder cannot be written to.
@@ -133,13 +164,21 @@ def write_first_files(
     if guess is None:
         write(_random_commands(outline))
         return robot, experiment
-    tables = partial(data_tables, folder, outline.markers, recordings, commands, guess, outline.gravity)
+    tables = partial(
+        data_tables,
+        folder,
+        outline.markers,
+        recordings,
+        commands,
+        guess,
+        outline.gravity,
+        cables=outline.cable_names(),
+    )
     plain = write(tables())
     first = _first_recording(plain, folder)
-    if first is not None:
-        frame, slow = _frame(plain, made, first), slow_motion(made, first)
-        if frame or slow:
-            write(tables(frame=frame), slow)
+    frame, slow = _frame(plain, made, guess), None if first is None else slow_motion(made, first)
+    if frame or slow:
+        write(tables(frame=frame), slow)
     return robot, experiment
 
 
@@ -153,7 +192,7 @@ def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
         return None
 
 
-def _frame(experiment: Experiment, robot: Robot, first: Trajectory) -> list[str]:
+def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
     """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
 
     Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
@@ -161,9 +200,9 @@ def _frame(experiment: Experiment, robot: Robot, first: Trajectory) -> list[str]
     if experiment.data is None or experiment.data.columns is None:
         return []
     columns = experiment.data.columns
-    found = frame_lines(robot, first, columns)
+    found = frame_lines(robot, guess.start, columns)
     turned = found and found[0] != f"axes = {quoted(columns.axes)}"
-    return [] if turned and experiment.data.format == motive_csv.FORMAT else found
+    return [] if turned and guess.format == motive_csv.FORMAT else found
 
 
 def _head(name: str) -> list[str]:
@@ -191,9 +230,9 @@ def _entries(folder: Path, recordings: list[Path], commands: list[Path], guess: 
 
 def assumed_of_columns(guess: Guess) -> list[str]:
     """What the tables of `data_tables` assume or leave out, and a recording does not tell; a sentence each."""
-    said = []
-    if guess.time is None:
-        said.append("sample_time = 0.05: no column was recognised as times")
+    said = [f'{key} = "{getattr(guess, key)}": {words}' for key, words in guess.evidence.items()]
+    if guess.time is None and guess.sample_time is None:
+        said.append(f'time = "{ROWS}": {NO_TIMES}')
     if guess.command_time is not None:
         said.append("command_offset = 0.0: the clocks of commands and observations begin together")
     if guess.left:
@@ -209,10 +248,12 @@ def data_tables(
     guess: Guess,
     gravity: str = "",
     frame: Sequence[str] = (),
+    cables: Sequence[str] = (),
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
-    ``frame`` are the lines of axes and origin, where the first row tells them.
+    ``frame`` are the lines of axes and origin, where the first row tells them; ``cables`` the robot's, one for each
+    command, if tensions of them were measured.
     """
     entries = _entries(folder, recordings, commands, guess)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
@@ -224,8 +265,9 @@ def data_tables(
     if guess.format == motive_csv.FORMAT:
         axes, assumed = AXES.get(gravity, axes), "  # ASSUMED: Motive's y axis points up"
     optional = [f"tensions = {quoted(guess.tensions)}"] if guess.tensions else []
+    optional = [f"cables = {quoted(list(cables))}"] * bool(optional and cables) + optional
     if guess.motor_angles:
-        optional += [f"motor_angles = {quoted(guess.motor_angles)}", f'motor_angle_unit = "{guess.motor_angle_unit}"']
+        optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
     found = [f"{line}  # ASSUMED: found from the first row" for line in frame]
     left = [f"# not used: {', '.join(guess.left)}"] if guess.left else []
@@ -238,15 +280,18 @@ def data_tables(
         "",
         "# Guessed from the names and sizes of the columns: look them over.",
         "[data.columns]",
+        *([] if guess.names is None else [f"names = {quoted(guess.names)}  # of all columns: the file has none"]),
+        *([] if guess.command_names is None else [f"command_names = {quoted(guess.command_names)}"]),
         *_clock(guess),
         f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order",
-        f'command_unit = "{guess.command_unit}"',
+        _unit_line(guess, "command_unit"),
         *counts,
+        *_other_units(guess),
         *_command_clock(guess),
         "positions = [",
         *(f"    {quoted(triple)}," for triple in guess.positions),
         "]",
-        f'position_unit = "{guess.position_unit}"',
+        _unit_line(guess, "position_unit"),
         f"markers = {quoted(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
         *(found or [f"axes = {quoted(axes)}{assumed}"]),
@@ -256,13 +301,28 @@ def data_tables(
     ]
 
 
+def _unit_line(guess: Guess, key: str) -> str:
+    """The line of a unit, with the evidence of one that was guessed."""
+    evidence = guess.evidence.get(key)
+    return f'{key} = "{getattr(guess, key)}"' + (f"  # ASSUMED: {evidence}" if evidence else "")
+
+
+def _other_units(guess: Guess) -> list[str]:
+    if not guess.units:
+        return []
+    told = ", ".join(f"{quoted(name)} = {quoted(unit)}" for name, unit in guess.units.items())
+    return [f"units = {{{told}}}  # of columns in other units than command_unit or position_unit"]
+
+
 def _clock(guess: Guess) -> list[str]:
     """The times of the observations."""
+    if guess.sample_time is not None:
+        return [f"sample_time = {guess.sample_time:g}  # seconds from row to row"]
     if guess.time is None:
-        return ["sample_time = 0.05  # ASSUMED: seconds from row to row"]
+        return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:
         return ['time = "header"  # stamps where messages have them; "log": the times at which they were received']
-    return [f"time = {quoted(guess.time)}", f'time_unit = "{guess.time_unit}"']
+    return [f"time = {quoted(guess.time)}", _unit_line(guess, "time_unit")]
 
 
 def _command_clock(guess: Guess) -> list[str]:
@@ -271,7 +331,7 @@ def _command_clock(guess: Guess) -> list[str]:
         return []
     return [
         f"command_time = {quoted(guess.command_time)}",
-        f'command_time_unit = "{guess.command_time_unit}"',
+        _unit_line(guess, "command_time_unit"),
         "# ASSUMED: both clocks begin together. Else: what the observations' clock shows [s] when this one shows zero.",
         "command_offset = 0.0",
     ]

@@ -10,14 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import DataSpec, load_recordings
+from rfdropo_bayes.data.named_columns import ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.simulators.adapters import first_tables
 from rfdropo_bayes.tables import parse_table
-from rfdropo_bayes.verbs.column_names import ANGLES, Guess
-from rfdropo_bayes.verbs.init import data_tables, quoted
+from rfdropo_bayes.verbs.column_names import Guess
+from rfdropo_bayes.verbs.column_units import ANGLES
+from rfdropo_bayes.verbs.init import data_tables, quoted, with_given
 
 OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}
 """Units that a recording may have of what a simulator takes in each of these."""
@@ -53,7 +55,7 @@ def write_model_experiment(
     name = os.path.relpath(model, folder)
     box: Any = find_robot(name, folder, tables)
     if guess is not None and guess.command_unit not in OF_CABLE.get(box.command_unit, ()):
-        guess = guess._replace(command_unit=box.command_unit)
+        guess = with_given(guess, command_unit=box.command_unit)
     text = [
         "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
         f"title = {quoted(model.stem)}",
@@ -79,7 +81,11 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
         "markers": guess.markers,
     }
     columns |= {} if guess.counts_per_turn is None else {"counts_per_turn": guess.counts_per_turn}
-    columns |= {"sample_time": 0.05} if guess.time is None else {"time": guess.time, "time_unit": guess.time_unit}
+    columns |= {"units": dict(guess.units), "names": guess.names, "command_names": guess.command_names}
+    if guess.sample_time is None:
+        columns |= {"time": guess.time or ROWS, "time_unit": guess.time_unit}
+    else:
+        columns["sample_time"] = guess.sample_time
     entry = str(recordings[0]) if not commands else {"observations": str(recordings[0]), "commands": str(commands[0])}
     table = {"format": guess.format, "fit": [entry], "columns": columns, "missing": "mask"}
     try:

@@ -55,14 +55,15 @@ of a trunk whose tip rests at 184 mm, so that an arm of 166 to 224 mm ends 7 to 
 
 @with_keys_of(TrainingTable)
 def make_vec(
-    task: str, model: Model, *, posterior: Calibration | Path | None = None, n: int = 64, **keys: Any
+    task: str, model: Model, *, fit: Calibration | Path | None = None, n: int = 64, **keys: Any
 ) -> TrunkVecEnv:
     """Environments of a task, side by side, for Stable-Baselines3.
 
     Args:
         task: "TrunkReach-v0" or "TrunkPush-v0".
         model: that is simulated; its fixed values hold.
-        posterior: whose draws the episodes' parameters are, or its folder; nominal values without.
+        fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws;
+            nominal values without.
         n: how many environments.
         keys: further keys of an experiment file's [training], such as ``observation`` or ``period``.
 
@@ -71,7 +72,7 @@ def make_vec(
     """
     model = with_training(model, {"task": task, **keys})
     table, chosen, simulator = training_of(model)
-    randomisation = randomisation_of(table, model.spec, simulator, posterior)
+    randomisation = randomisation_of(table, model.spec, simulator, fit)
     return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, episode_settings(table)))
 
 
@@ -145,7 +146,7 @@ def randomisation_of(
     table: TrainingTable,
     spec: ModelSpec,
     simulator: AnySimulator,
-    posterior: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
 ) -> Randomisation:
     """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
 
@@ -156,23 +157,23 @@ def randomisation_of(
             value of a parameter that is randomised; or a posterior that was fitted with another integrator.
     """
     stated = table.randomisation if "randomisation" in table.model_fields_set else None
-    if posterior is not None and stated not in (None, "posterior"):
+    if fit is not None and stated not in (None, "posterior"):
         raise InputError(
-            f"a posterior was given, and randomisation = {stated!r}",
+            f"a calibration was given, and randomisation = {stated!r}",
             where="[training]",
             remedy='leave one of them out, or set randomisation = "posterior"',
         )
     absent = () if "cube_mass" in {spec.name for spec in simulator.parameters} else OBJECT
     held = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
     parts: list[Randomisation] = [Point(physical_values(held, simulator))]
-    if isinstance(posterior, Calibration):
-        fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
-        check_fitted_integrator(fitted, simulator.integrator, where="posterior")
-        rows = drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot)
-        _check_parameters(posterior.record, simulator, where="posterior")
-        parts.append(_beside_held(_on_its_day(rows, posterior.record, simulator), posterior.record.attrs, simulator))
-    elif posterior is not None:
-        parts.append(_of_run(Path(posterior), simulator))
+    if isinstance(fit, Calibration):
+        fitted = fitted_integrator(fit.record.attrs, fit.folder)
+        check_fitted_integrator(fitted, simulator.integrator, where="fit")
+        rows = drawn_rows(fit.record, simulator.parameters, robot=simulator.robot)
+        _check_parameters(fit.record, simulator, where="fit")
+        parts.append(_beside_held(_on_its_day(rows, fit.record, simulator), fit.record.attrs, simulator))
+    elif fit is not None:
+        parts.append(_of_run(Path(fit), simulator))
     elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, spec.folder))
     both = sorted(set(parts[0].names) & {name for part in parts[1:] for name in part.names})

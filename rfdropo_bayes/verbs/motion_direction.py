@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.data import Trajectory, shared_markers
 from rfdropo_bayes.data.named_columns import axes_matrix, axes_words
-from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.verbs.numerical_error import longest_of, nominal_markers
 
 AGREEING = 0.8
 """Least agreement of a turn that is said. Nominal models of the arm, SOFA's trunk and the paper's trunk agree with
@@ -21,7 +18,6 @@ robots made in the right frame, under parameters of the prior, 2 are said to be 
 TURNED = np.pi / 4.0
 QUARTER = np.pi / 12.0
 """A turn as near to a number of quarters is written as ``axes``."""
-MOST = 5
 
 
 class Direction(NamedTuple):
@@ -30,12 +26,19 @@ class Direction(NamedTuple):
     Attributes:
         turn: angle [rad] about +z from the simulated motion to the measured one.
         agreement: correlation of both after that turn, 0 to 1.
-        mirrored: the same after a mirror and any turn.
+        mirrored: the same after a mirror, y to -y, and a turn.
+        mirror_turn: the angle [rad] of the latter.
     """
 
     turn: float
     agreement: float
     mirrored: float
+    mirror_turn: float = 0.0
+
+    @property
+    def straight(self) -> float:
+        """Correlation of both motions as they are, -1 to 1."""
+        return self.agreement * float(np.cos(self.turn))
 
 
 class Paths(NamedTuple):
@@ -44,27 +47,6 @@ class Paths(NamedTuple):
     nominal: Float[np.ndarray, "time marker 3"]
     measured: Float[np.ndarray, "time marker 3"]
     mask: Bool[np.ndarray, "time marker"]
-
-
-def measure_direction(spec: ModelSpec, recordings: Sequence[Trajectory]) -> Direction:
-    """Compare the motion across the body, about its mean, with that of the nominal model.
-
-    Args:
-        spec: of a robot; values are nominal or fixed.
-        recordings: in the frame of the base; the first `MOST` of them count.
-
-    Raises:
-        InputError: commands that do not fit, or a rollout that did not end well.
-    """
-    longest = longest_of(spec.simulator.body == "rod")
-    return direction_of(_paths(spec, recording, longest) for recording in recordings[:MOST])
-
-
-def _paths(spec: ModelSpec, recording: Trajectory, longest: float) -> Paths:
-    nominal = nominal_markers(spec, recording, longest)
-    names = shared_markers([recording], spec.robot.marker_names)
-    index, rows = [recording.marker_names.index(name) for name in names], len(nominal)
-    return Paths(nominal, recording.position[:rows, index], recording.position_mask[:rows, index])
 
 
 def direction_of(recordings: Iterable[Paths]) -> Direction:
@@ -83,7 +65,8 @@ def direction_of(recordings: Iterable[Paths]) -> Direction:
     scale = np.sqrt(simulated * measured)
     if scale == 0.0:
         return Direction(0.0, 0.0, 0.0)
-    return Direction(float(np.angle(turned)), float(abs(turned) / scale), float(abs(mirrored) / scale))
+    turn, mirror_turn = float(np.angle(turned)), float(np.angle(mirrored))
+    return Direction(turn, float(abs(turned) / scale), float(abs(mirrored) / scale), mirror_turn)
 
 
 def _across(position: np.ndarray) -> np.ndarray:
@@ -108,19 +91,34 @@ def direction_doubt(found: Direction, axes: tuple[str, str, str] | None) -> str 
     if found.agreement < AGREEING <= found.mirrored:
         return (
             f"the markers move as in a mirror (agreement {found.mirrored:.2f}, without the mirror "
-            f"{found.agreement:.2f}): look at the order of the commands and at azimuth_deg of the cables, which counts "
-            "from +x towards +y"
+            f"{found.agreement:.2f}): {_mirror_remedy(found.mirror_turn, axes)}"
         )
     return None
 
 
+def _mirror_remedy(turn: float, axes: tuple[str, str, str] | None) -> str:
+    """What would undo a mirror: the frame is left-handed, or the commands run the other way round."""
+    order = "look at the order of the commands and at azimuth_deg of the cables, which counts from +x towards +y"
+    if axes is None or not _by_quarters(turn):
+        return f"the frame is left-handed, or {order}"
+    c, s = np.round(np.cos(turn)), np.round(np.sin(turn))
+    back = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, 1.0]])
+    return f"if the frame is left-handed, axes = {axes_words(back @ axes_matrix(axes))} in [data.columns]; else {order}"
+
+
+def _by_quarters(turn: float) -> bool:
+    """Whether an angle is about a number of quarter turns."""
+    quarter = 0.5 * np.pi
+    return bool(abs(turn - quarter * round(turn / quarter)) <= QUARTER)
+
+
 def _remedy(turn: float, axes: tuple[str, str, str] | None) -> str:
     """What would turn the motion back."""
-    quarters = round(turn / (0.5 * np.pi))
     azimuth = f"add {np.degrees(turn) % 360.0:.0f} to azimuth_deg of every cable"
-    if axes is None or abs(turn - 0.5 * np.pi * quarters) > QUARTER:
+    if axes is None or not _by_quarters(turn):
         return f"{azimuth}, or turn the recordings' frame"
-    c, s = np.round(np.cos(0.5 * np.pi * quarters)), np.round(np.sin(0.5 * np.pi * quarters))
+    c, s = np.round(np.cos(turn)), np.round(np.sin(turn))
     back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     words = f"axes = {axes_words(back @ axes_matrix(axes))} in [data.columns] would turn them back, or {azimuth}"
-    return words + ("; so would commands of the other sign: pull is positive" if abs(quarters) == 2 else "")
+    opposite = c == -1.0
+    return words + ("; so would commands of the other sign: pull is positive" if opposite else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import pdist, squareform
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.named_columns import METRES, CsvColumns, axes_matrix, axes_words
+from rfdropo_bayes.data.named_columns import METRES, CsvColumns, axes_matrix, axes_words, in_base, marker_names
 from rfdropo_bayes.robots import Robot
 
 FAR = 0.4
@@ -32,14 +33,16 @@ class Start(NamedTuple):
 
 def start_of(robot: Robot, trajectory: Trajectory) -> Start:
     """The undeformed robot's markers, and where the first row has them."""
-    chosen = [
-        (index, trajectory.marker_names.index(name))
-        for index, name in enumerate(robot.marker_names)
-        if name in trajectory.marker_names
-    ]
-    seen = [(i, j) for i, j in chosen if trajectory.position_mask[0, j]]
+    first = np.where(trajectory.position_mask[0, :, None], trajectory.position[0], np.nan)
+    return _start(robot, trajectory.marker_names, first)
+
+
+def _start(robot: Robot, markers: Sequence[str], first: Float[np.ndarray, "marker 3"]) -> Start:
+    """The same of markers that are at ``first`` [m], not a number where they are not seen."""
+    chosen = [(index, list(markers).index(name)) for index, name in enumerate(robot.marker_names) if name in markers]
+    seen = [(i, j) for i, j in chosen if np.isfinite(first[j]).all()]
     rest = robot.marker_points()[[i for i, _ in seen]]
-    return Start(tuple(robot.marker_names[i] for i, _ in seen), rest, trajectory.position[0, [j for _, j in seen]])
+    return Start(tuple(robot.marker_names[i] for i, _ in seen), rest, first[[j for _, j in seen]])
 
 
 def far_from_rest(robot: Robot, trajectory: Trajectory) -> dict[str, float] | None:
@@ -93,7 +96,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
         columns: the table by which it was read. A hint says what to write in its place.
     """
     start = start_of(robot, trajectory)
-    length = robot.body.station_m[-1] - robot.body.station_m[0]
+    length = robot.length
     if not start.names:
         return []
     hints = _stretched(start)
@@ -106,17 +109,17 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     return [*hints, f"{head}; {found or 'look at axes, origin, units, the order of markers and their point_m'}"]
 
 
-def frame_lines(robot: Robot, trajectory: Trajectory, columns: CsvColumns) -> list[str]:
+def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: CsvColumns) -> list[str]:
     """Lines of [data.columns], axes and origin, that bring a first row to the undeformed robot.
 
     None where it is near already, or where no frame brings it near.
 
     Args:
         robot: with the undeformed markers.
-        trajectory: the recording, as ``columns`` read it.
-        columns: the table by which it was read.
+        first: where each marker of ``columns`` is first seen, as the file has it.
+        columns: the table by which the file is read.
     """
-    start, length = start_of(robot, trajectory), robot.body.station_m[-1] - robot.body.station_m[0]
+    start, length = _start(robot, marker_names(columns), in_base(first, columns)), robot.length
     if not start.names or _rms(start.first - start.rest) <= FAR * length:
         return []
     found, read = _frame(start, length), Read.by(columns)

@@ -59,6 +59,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, of_unseen_days
+from rfdropo_bayes.verbs.recording_doubts import cautions_after
 
 DRAWS = 200
 SCHEMA_VERSION = 1
@@ -128,7 +129,7 @@ def predict(
     bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
     group = bands.attrs["group"] = group_of(unseen.name, groups)
     known = {p.recording for p in space.parameters if p.added_to}
-    cautions = match_cautions(found)
+    cautions = cautions_after(record, model, [unseen]) + match_cautions(found)
     if isinstance(simulator, RobotSimulator):
         cautions += simulator.robot.unstated([unseen.name])
     said = [day_sentence(error) for error in slow.values() if not error.shown and group not in known]
@@ -201,7 +202,6 @@ def run_prediction(
     out: Path,
     *,
     start: str | None = None,
-    rows: tuple[int, int] | None = None,
     episode: int | None = None,
     seed: int | None = None,
     group: str | None = None,
@@ -218,7 +218,6 @@ def run_prediction(
         posterior: folder of its calibration.
         commands, start: see `data.load_unseen`.
         out: folder to write to.
-        rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
         episode: of a LeRobotDataset.
         seed: of the draws; that of the experiment by default.
         group: see `predict`.
@@ -232,10 +231,10 @@ def run_prediction(
     if read.data is None:
         raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN), episode)
+    unseen = load_unseen(read.data, folder, commands, start, begun=record.attrs.get(BEGUN), episode=episode)
     fit = Calibration(record, {}, "", model, Path(posterior))
     found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
-    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "seed": seed}
     options |= {"group": group, "episode": episode}
     settings: dict[str, Any] = {
         "tables": model.tables(),
@@ -293,7 +292,7 @@ def _markers(
     if known is None:
         raise InputError(
             "the posterior does not hold the noise of the positions",
-            where="--posterior",
+            where="--from",
             remedy="predict with the experiment that was calibrated",
         )
     recalled = Autoregression.from_dict(known)
@@ -334,7 +333,7 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec], of_gr
     if missing:
         raise InputError(
             f"the posterior holds {missing[0]!r}, which the experiment's model lacks",
-            where="--posterior",
+            where="--from",
             remedy="predict with the experiment that was calibrated, mechanisms included",
         )
     recordings = sorted({recording for names in scopes.values() for recording in names})

@@ -24,8 +24,8 @@ def read(
     Args:
         files: names and patterns, relative to $RFDROPO_DATA or ``folder``; an entry may also be a dictionary with
             ``observations``, ``commands``, ``rows`` and ``episodes``.
-        format: csv, motive-csv, rosbag, lerobot, netcdf, asl-csv, optitrack-csv or sofa-csv.
-        columns: for the first four, what each column is, as in an experiment file's [data.columns].
+        format: csv, motive-csv, rosbag, lerobot, mat, npz, netcdf, asl-csv, optitrack-csv or sofa-csv.
+        columns: for the first six, what each column is, as in an experiment file's [data.columns].
         folder: that names are relative to.
         keys: further keys of [data], such as ``resample``, ``missing`` or ``initial_command``.
 

@@ -18,17 +18,15 @@ from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, share
 from rfdropo_bayes.data.given_recordings import given_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
-from rfdropo_bayes.model.assembly import AnySimulator, physical_values, robot_of
+from rfdropo_bayes.model.assembly import AnySimulator, physical_values
 from rfdropo_bayes.model.experiment import CommandsTable, NoiseTable
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.arguments import given_model
-from rfdropo_bayes.verbs.motion_balance import append_balance
 from rfdropo_bayes.verbs.random_commands import random_walk
 
 # Number that the first marker's column carries in each source.
@@ -106,12 +104,11 @@ def _rollouts(
         yield Simulated(source, markers, np.asarray(observation.position)[:, chosen], pose, result, commands)
 
 
-def simulate_all(model: Model, out: Path, *, balance: bool = False, overwrite: bool = False) -> dict[str, Any]:
+def simulate_all(model: Model, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """Simulate into a folder each recording of a model's experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
-    column names), called ``trajectory`` where there is only one recording. With ``balance``, forces and energies follow
-    in a group of that name in the NetCDF file.
+    column names), called ``trajectory`` where there is only one recording.
 
     Returns:
         per recording: result code, files, and the error against the measurement [mm]; and that over all recordings.
@@ -120,17 +117,15 @@ def simulate_all(model: Model, out: Path, *, balance: bool = False, overwrite: b
     Raises:
         InputError: bad input, a folder that holds a run, or a rollout that did not end well.
     """
-    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "options": {"balance": balance}}
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder}
     settings |= {"texts": model.texts()}
     with run_folder(Path(out), "simulate", **settings, overwrite=overwrite) as out:
-        return _simulate_into(out, model, balance)
+        return _simulate_into(out, model)
 
 
-def _simulate_into(out: Path, model: Model, balance: bool) -> dict[str, Any]:
+def _simulate_into(out: Path, model: Model) -> dict[str, Any]:
     """See `simulate_all`."""
     simulator, measured = model.simulator, model.settings.data is not None
-    if balance:
-        robot_of(model.spec)
     values = physical_values(model.spec, simulator)
     sources = _sources(model)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
@@ -148,9 +143,6 @@ def _simulate_into(out: Path, model: Model, balance: bool) -> dict[str, Any]:
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if measured else None,
         }
-        if isinstance(simulator, RobotSimulator) and balance:
-            written = append_balance(simulator, values, found.commands, source.time, out / f"{stem}.nc")
-            report["recordings"][source.name]["balance"] = written
         if pose is not None and source.object_pose is not None:
             report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
     report["error_mm"] = _errors(distances) if measured else None

@@ -58,7 +58,7 @@ def train(
     model: Model,
     out: Path | str,
     *,
-    posterior: Calibration | Path | None = None,
+    fit: Calibration | Path | None = None,
     seed: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -72,7 +72,7 @@ def train(
         model: that is simulated; its fixed values hold.
         out: folder to write to: report.html, policy.onnx, card.md, summary.json, curve.png, episodes.jsonl,
             TensorBoard's files and checkpoints.
-        posterior: whose draws the episodes' parameters are, or its folder.
+        fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws.
         seed: of all that is random; that of the model's experiment by default.
         resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
         show: progress on the terminal, as in `calibrate`.
@@ -91,8 +91,8 @@ def train(
     tables = model.record({"seed": model.settings.seed}, {"seed": seed})
     seed = model.settings.seed if seed is None else seed
     table, task, simulator = training_of(model)
-    randomisation = randomisation_of(table, model.spec, simulator, posterior)
-    cautions = _cautions(table, posterior, model.folder, show)
+    randomisation = randomisation_of(table, model.spec, simulator, fit)
+    cautions = _cautions(table, fit, model.folder, show)
     settings = episode_settings(table)
     known = {"randomisation": randomisation.sha256, "simulator": simulator.description["content_sha256"]}
 
@@ -134,11 +134,9 @@ def train(
     return summary
 
 
-def _cautions(
-    table: TrainingTable, posterior: Calibration | Path | None, folder: Path, show: bool | None
-) -> list[Caution]:
+def _cautions(table: TrainingTable, fit: Calibration | Path | None, folder: Path, show: bool | None) -> list[Caution]:
     """What earlier results say against the posterior, or phi, that parameters come from; said on stderr, too."""
-    source = posterior
+    source = fit
     if source is None and table.source is not None and table.randomisation in ("posterior", "phi"):
         source = source_of(table.source, folder)
     found = None if source is None else posterior_caution(source, table.width)

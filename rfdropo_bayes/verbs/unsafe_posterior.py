@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rfdropo_bayes.audit.verdict import NEGLIGIBLE, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.cautions import Caution, Code
+from rfdropo_bayes.discrepancy.verdict import NEGLIGIBLE, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import read_tables
 from rfdropo_bayes.model.run_folder import RUN

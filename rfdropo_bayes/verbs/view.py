@@ -25,11 +25,12 @@ from rfdropo_bayes.verbs.simulate import simulate
 
 PREDICTED = "mean"  # variable of a prediction's file
 SLENDER = 0.01  # half width of a line through markers over the extent of their motion
+RATE = 20  # frames per second of an animation, in real time
 STILLS, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
 def run_view(
-    source: Path, out: Path, overrides: list[str], recording: str | None, rate: int, robot: Path | None = None
+    source: Path, out: Path, overrides: list[str], recording: str | None, robot: Path | None = None
 ) -> list[Path]:
     """Draw a motion.
 
@@ -39,7 +40,6 @@ def run_view(
         out: .png, .svg or .pdf for several instants in one picture, .gif or .mp4 for an animation, a name that ends in
             .vtk for a folder of surfaces, any other name for a folder of frames.
         recording: which recording of the experiment, where it has several.
-        rate: frames per second, in real time.
         robot: file of the robot, where a NetCDF file has none beside it and the package does not know its name.
 
     Returns:
@@ -52,7 +52,7 @@ def run_view(
     if out.suffix == ".vtk":
         return save_vtk(motion, out)
     if out.suffix == "":
-        return save_frames(motion, out, rate)
+        return save_frames(motion, out, RATE)
     if out.suffix not in STILLS + ANIMATIONS:
         known = ", ".join((*STILLS, *ANIMATIONS, ".vtk"))
         raise InputError(f"unknown format {out.suffix!r}", where=str(out), remedy=f"use {known}, or a folder")
@@ -60,7 +60,7 @@ def run_view(
     if out.suffix in STILLS:
         save_still(motion, out)
     else:
-        save_animation(motion, out, rate)
+        save_animation(motion, out, RATE)
     return [out]
 
 

@@ -74,6 +74,6 @@ def test_no_two_documented_runs_share_a_folder():
             continue
         stem = Path(options["experiment"]).stem
         title = experiment_name(Path(options["experiment"]))
-        folder = options["out"] or Path("reports") / (title if name == "calibrate" else f"{title}_{name}")
+        folder = options["out"] or Path("runs") / (title if name == "calibrate" else f"{title}_{name}")
         runs.setdefault(str(folder), set()).add((name, stem, tuple(options.get("between") or ())))
     assert {folder: found for folder, found in runs.items() if len(found) > 1 and folder.startswith("reports/")} == {}

@@ -48,7 +48,7 @@ def test_a_page_that_is_gone_is_an_error_with_the_command_to_run(tmp_path, monke
     assert f"rfdropo audit '{out / 'config.toml'}' --out" in error
 
 
-@pytest.mark.parametrize("command", ["predict", "design", "evaluate", "simulate", "separate", "benchmark table1"])
+@pytest.mark.parametrize("command", ["predict", "design", "evaluate", "simulate"])
 def test_a_run_without_a_page_has_its_results_named(command, tmp_path, monkeypatch, capsys):
     results = COMMANDS[command].results
     out = folder_of(tmp_path, command, *results)

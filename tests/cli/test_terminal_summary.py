@@ -20,9 +20,10 @@ ROW = {"mean": 1.0, "sd": 0.1, "q05": 0.9, "q95": 1.1, "unit": "[m]"}
 def test_an_audit_is_shown_as_it_is(capsys):
     finding = {"mechanism": "play", "parameters": {"play@[red]": ROW}}
     found = {"verdict": "explained", "sentence": WORDS, "findings": [finding], "next_experiment": {"sentence": WORDS}}
-    show_audit({**found, "adopted": ["play"]}, FOLDER, quiet=False, as_json=False)
+    cautions = [{"code": "recording_doubtful", "sentence": WORDS, "grave": False}]
+    show_audit({**found, "adopted": ["play"], "cautions": cautions}, FOLDER, quiet=False, as_json=False)
     shown = capsys.readouterr().out
-    assert shown.count(WORDS) == 2
+    assert shown.count(WORDS) == 3
     assert shown.count(str(FOLDER)) == 3
     assert "then: rfdropo calibrate 'runs [red] :bomb:/extended.toml' --out OUT" in shown
     assert "play@[red]" in shown
@@ -47,7 +48,7 @@ def test_a_calibration_is_shown_as_it_is(capsys):
 
 @pytest.mark.parametrize(
     ("verdict", "words"),
-    [("safe", "predict fit --commands FILE --out OUT"), ("unsafe", "audit 'own arm.toml' --base fit --out OUT")],
+    [("safe", "predict fit --commands FILE --out OUT"), ("unsafe", "audit 'own arm.toml' --from fit --out OUT")],
 )
 def test_a_calibration_says_what_to_type_next(capsys, verdict, words):
     content = {"headline": [], "details": {}, "parameters": {"modulus": ROW}, "method": "laplace"}
@@ -57,7 +58,7 @@ def test_a_calibration_says_what_to_type_next(capsys, verdict, words):
 
 
 def test_an_audit_that_adopts_nothing_has_no_model_to_fit(capsys):
-    found = {"verdict": "unexplained", "sentence": "", "findings": [], "adopted": []}
+    found = {"verdict": "unexplained", "sentence": "", "findings": [], "adopted": [], "cautions": []}
     show_audit({**found, "next_experiment": {"sentence": ""}}, FOLDER, quiet=False, as_json=False)
     assert "then:" not in capsys.readouterr().out
 

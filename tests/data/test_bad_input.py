@@ -192,7 +192,7 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
             {"format": "csv", "columns": COLUMNS | {"position_unit": "metre"}},
             "position_unit = 'metre': Input should be 'm', 'cm' or 'mm'",
         ),
-        ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "y"]}}, "right-handed"),
+        ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "-z"]}}, "x, y and z once each"),
         ({"format": "csv", "columns": COLUMNS | {"time": "t"}}, "either time"),
         ({"format": "csv", "columns": COLUMNS | {"markers": ["a", "b"]}}, "markers has 2 entries where 1 are needed"),
     ],

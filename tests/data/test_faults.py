@@ -207,3 +207,12 @@ def test_a_marker_that_is_at_the_origin_stays():
     faults = find_faults(time, position)
     assert faults.mask.all()
     assert "marker 1 is exactly at 0, 0, 0 in 1500 rows, first in row 0: taken as it stands" in faults.notes[0]
+
+
+def test_a_recording_whose_rows_are_a_thousand_times_too_near_is_doubtful():
+    """Rows a second apart that are read as milliseconds: what moves within a second looks like jumps."""
+    held = 0.02 * np.repeat(np.random.default_rng(0).normal(size=(60, 1, 3)), 3, axis=0)
+    place = held + np.random.default_rng(1).normal(0.0, 2e-4, (180, 1, 3))
+    assert not any("are masked" in note for note in find_faults(1.0 * np.arange(180), place).notes)
+    faults = find_faults(1e-3 * np.arange(180), place, names=["tip"])
+    assert any("positions of tip are masked" in note and "the unit of times" in note for note in faults.notes)

@@ -6,6 +6,7 @@ import inspect
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 import xarray as xr
 
@@ -273,3 +274,13 @@ def test_a_table_with_two_columns_of_one_name_is_refused():
 def test_a_new_grid_far_finer_than_the_rows_is_refused():
     with pytest.raises(InputError, match=r"would be 1\.9e.* rows of 20"):
         arrays(time=1e9 * TIME).resample(0.01)
+
+
+def test_tables_of_other_libraries_are_taken():
+    columns = {"time": "t", "commands": ["u"], "command_unit": "mm", "position_unit": "mm"}
+    columns |= {"positions": [["x", "y", "z"]]}
+    frame = pd.DataFrame({"t": [0.0, 0.5, 1.0], "u": [1.0, 2.0, 2.0], "x": [9.0, 8.0, 7.0], "y": 0.0, "z": 100.0})
+    found = Trajectory.from_pandas(pa.Table.from_pandas(frame), columns)
+    np.testing.assert_array_equal(found.position, Trajectory.from_pandas(frame, columns).position)
+    with pytest.raises(InputError, match="a dict is no table; give a DataFrame"):
+        Trajectory.from_pandas({"t": [0.0]}, columns)

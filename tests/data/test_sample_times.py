@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults, read_plain_csv
 from rfdropo_bayes.data.held_readings import hold_time
-from rfdropo_bayes.data.sample_times import check_times, clock_notes, read_stamps, sample_time
+from rfdropo_bayes.data.sample_times import check_times, clock_notes, read_stamps, rounded_notes, sample_time
 from rfdropo_bayes.errors import InputError
 
 STEP = 0.01  # [s]
@@ -230,3 +232,24 @@ def test_a_fine_clock_takes_no_more_memory_than_a_coarse_one():
     """Rows a nanosecond apart: a quarter of a second of them would be 250 million columns."""
     time, place = 1e-9 * np.arange(400), swinging(400)
     assert find_faults(time, place).mask.shape == (400, 1)
+
+
+@pytest.mark.parametrize("kind", ["array", "file"])
+def test_stamps_of_single_precision_are_noted_once_they_are_coarse(kind, tmp_path):
+    """After 20 hours single precision goes in steps of 7.8 ms."""
+    for hours, step, noted in ((0.0, 0.02, False), (20.0, 0.02, True), (20.0, 1.0, False)):
+        single = (3600.0 * hours + step * np.arange(200)).astype(np.float32)
+        if kind == "file":
+            pd.DataFrame({"t": single.astype(float)}).to_csv(tmp_path / "run.csv", index=False)
+            single = pd.read_csv(tmp_path / "run.csv")["t"].to_numpy()
+        stamps = read_stamps(single, where="run")
+        notes = rounded_notes(stamps, stamps.since(stamps, "run"))
+        assert [note.partition(":")[0] for note in notes] == ["times have single precision"] * noted
+        if noted:
+            assert "in steps of 7.81 ms, and rows come every" in notes[0]
+            assert re.search(r"sample_time = 0\.0(2|199\d) in", notes[0])
+
+
+def test_stamps_of_double_precision_jitter_unsaid():
+    stamps = read_stamps(72000.0 + 0.02 * np.arange(200) + np.random.default_rng(0).normal(0.0, 1e-3, 200), where="run")
+    assert rounded_notes(stamps, stamps.since(stamps, "run")) == []

@@ -162,14 +162,14 @@ def test_a_data_sheet_of_another_drive_is_refused(rig, tmp_path: Path, old: str,
 def test_no_data_sheet_and_no_answer_are_told_apart(rig, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no readable data sheet"):
         rig.drives(eds=str(tmp_path / "none.eds"))
-    rig.simulated.drives[2].crashed = True
+    rig.simulated.nodes[3].crashed = True
     with pytest.raises(InputError, match=r"'down' \(node 3\), object 0x1000:0: cannot be read"):
         rig.drives().all[2].check(Identity())
 
 
 @pytest.mark.parametrize(("answer", "heard"), [(0.05, False), (2.0, True)])
 def test_a_slow_drive_is_waited_for_as_long_as_said(rig, monkeypatch, answer: float, heard: bool) -> None:
-    slow = rig.simulated.drives[0]
+    slow = rig.simulated.nodes[1]
     receive = slow.receive
     monkeypatch.setattr(slow, "receive", lambda *frame: (time.sleep(0.2), receive(*frame)))
     drive = rig.drives(answer=answer).all[0]
@@ -181,13 +181,13 @@ def test_a_slow_drive_is_waited_for_as_long_as_said(rig, monkeypatch, answer: fl
 
 
 def test_a_torque_that_would_falsify_tensions_is_refused(rig) -> None:
-    rig.simulated.drives[0].local.data_store[Object.RATED_TORQUE][0] = (500).to_bytes(4, "little")
+    rig.simulated.nodes[1].local.data_store[Object.RATED_TORQUE][0] = (500).to_bytes(4, "little")
     with pytest.raises(InputError, match="rated torque is 500"):
         rig.drives().all[0].check(Identity())
 
 
 def test_a_drive_that_keeps_another_value_is_refused(rig) -> None:
-    simulated = rig.simulated.drives[0]
+    simulated = rig.simulated.nodes[1]
     read = simulated._read
     simulated.local._read_callbacks[:] = [
         lambda index, subindex, od: 77 if index == Object.POSITION_LIMIT else read(index, subindex, od)
@@ -199,10 +199,10 @@ def test_a_drive_that_keeps_another_value_is_refused(rig) -> None:
 def test_emergencies_and_heartbeats_are_taken_in(rig) -> None:
     drives = rig.drives(Guards(drive_heartbeat_s=0.02, master_timeout_s=5.0))
     drives.configure(0.01, lambda text: None)
-    until(lambda: all(drive.nmt == 5 for drive in drives.all))
+    until(lambda: all(drive.node.nmt == 5 for drive in drives.all))
     drives.all[1].write(Object.SIMULATED_FAULT, 4, read_back=False)
     until(lambda: len(drives.emergencies) > 0)
-    assert drives.emergencies[0].channel == "left"
+    assert drives.emergencies[0].channels == ("left",)
     assert drives.emergencies[0].code == 0x2310
 
 
@@ -221,3 +221,9 @@ def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig
     heard(left, bytearray(objects.EMERGENCY.pack(0x2310, 1, b"")), 0.0)
     with pytest.raises(Stop, match="drive 'left' says 0x2310"):
         watch.check(tick, None)
+
+
+def test_a_drive_whose_first_status_is_late_is_waited_for(rig) -> None:
+    """A loaded machine has no answer yet in the first cycle; nobody may read a tension of it."""
+    drives = rig.drives()
+    Watch(drives, Patience()).check(Tick(1, 0.0, 0.0, 0), None)

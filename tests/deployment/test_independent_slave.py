@@ -17,7 +17,7 @@ from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.deployment.bus import LoggedNetwork
 from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, controlword_towards
-from rfdropo_bayes.deployment.drives import Drive, Drives, Guards, Identity
+from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, drives_of
 from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
@@ -55,8 +55,9 @@ def drives(program: Path, robot: Robot, tcp_hub: str) -> Iterator[Drives]:
         assert process.stdout.readline() == "ready\n"
         network = LoggedNetwork(HubBus(tcp_hub))
         motor = robot.motors[0].model_copy(update={"rated_torque_n_m": 0.1})
-        drive = Drive(network, motor, str(objects.SIMULATED_EDS), 0.0)
-        yield Drives(network, [drive], Guards(master_timeout_s=5.0))
+        yield Drives(
+            network, drives_of(network, [motor], [0.0], str(objects.SIMULATED_EDS)), Guards(master_timeout_s=5.0)
+        )
         network.disconnect()
         process.kill()
 
@@ -151,12 +152,12 @@ def test_emergencies_faults_and_their_reset(drives: Drives) -> None:
 def test_heartbeats_and_network_management(drives: Drives) -> None:
     (drive,) = drives.all
     drives.configure(0.01, lambda text: None)
-    assert drive.nmt == NmtState.OPERATIONAL
+    assert drive.node.nmt == NmtState.OPERATIONAL
     drives.manage(Nmt.PRE_OPERATIONAL)
-    until(lambda: drive.nmt == NmtState.PRE_OPERATIONAL)
+    until(lambda: drive.node.nmt == NmtState.PRE_OPERATIONAL)
     assert not drives.exchange(0.2)  # no process data in this state
     drives.manage(Nmt.START)
-    until(lambda: drive.nmt == NmtState.OPERATIONAL)
+    until(lambda: drive.node.nmt == NmtState.OPERATIONAL)
     assert drives.exchange(1.0)
-    before = drive.heartbeat
-    until(lambda: drive.heartbeat > before)
+    before = drive.node.heartbeat
+    until(lambda: drive.node.heartbeat > before)

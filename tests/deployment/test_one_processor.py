@@ -39,7 +39,7 @@ from pathlib import Path
 import psutil
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
-from rfdropo_bayes.deployment.drives import Drive
+from rfdropo_bayes.deployment.drives import drives_of
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.robots import Robot
 
@@ -48,7 +48,7 @@ plant, own_process = sys.argv[1], sys.argv[2] == "own"
 hub = BusTable(interface="hub", channel="127.0.0.1:0")
 with simulated_drives(SimulationTable("motor_arm", hub, plant, own_process=own_process)) as found:
     network = LoggedNetwork(open_bus(found))
-    drive = Drive(network, Robot.load("motor_arm").motors[0], str(objects.SIMULATED_EDS), 0.0, 10.0)
+    (drive,) = drives_of(network, Robot.load("motor_arm").motors[:1], [0.0], str(objects.SIMULATED_EDS), 10.0)
     print("type", drive.read(objects.Object.DEVICE_TYPE), flush=True)
     network.disconnect()
     for process in psutil.Process().children(recursive=True):  # as a task manager does

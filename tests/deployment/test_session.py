@@ -36,12 +36,9 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
 
+from .conftest import PATIENT
 from .policies import linear_policy
 
-# A loaded machine without real-time scheduling is no robot: these tests ask what happens, not how punctually.
-PATIENT = SafetyTable(
-    settle_s=0.1, misses=50, stale_cycles=30, heartbeat_s=1.0, hold_s=0.2, following_error_m=0.02, start_rate_m_s=0.02
-)
 SLOW = DrivesTable(answer_s=2.0)
 
 

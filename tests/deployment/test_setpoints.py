@@ -45,6 +45,17 @@ def test_a_goal_is_reached_and_not_overshot(robot: Robot) -> None:
     assert np.all(np.abs(path) <= np.abs(goal) + 1e-12)
 
 
+def test_a_goal_is_not_overshot_by_motors_that_take_many_cycles_to_stop(robot: Robot) -> None:
+    """With 0.1 m/s2 the last half of 20 mm is there to stop on, and the way takes 2 sqrt(20 mm / 0.1 m/s2)."""
+    motors = [motor.model_copy(update={"acceleration_limit_m_s2": 0.1}) for motor in robot.motors]
+    made, goal = SetPoints(motors, PERIOD, np.zeros(4)), np.array([0.02, -0.02, 0.0, 0.02])
+    path = np.array([made.towards(goal).copy() for _ in range(120)])
+    assert np.all(np.abs(path) <= np.abs(goal) + 1e-12)
+    shortest = 2.0 * np.sqrt(0.02 / 0.1)
+    reached = PERIOD * (1 + np.argmax(np.abs(path[:, 0] - goal[0]) < 1e-5))
+    assert reached == pytest.approx(shortest, abs=5 * PERIOD)
+
+
 def test_the_way_takes_as_long_as_a_trapezoid(robot: Robot) -> None:
     """distance / rate + rate / acceleration, to two cycles."""
     made, goal = points(robot), np.full(4, 0.02)

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from rfdropo_bayes.deployment import objects
-from rfdropo_bayes.deployment.bench.simulated_drive import SimulatedDrive, SimulatedFault
+from rfdropo_bayes.deployment.bench.simulated_node import SimulatedFault, SimulatedNode
 from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, Status, state_of
 from rfdropo_bayes.deployment.objects import EmergencyCode, Nmt, NmtState, Object
 
@@ -20,18 +20,19 @@ class Bench:
 
     def __init__(self) -> None:
         self.sent: list[tuple[int, bytes]] = []
-        self.drive = SimulatedDrive(NODE, lambda identifier, data: self.sent.append((identifier, bytes(data))))
+        self.node = SimulatedNode(NODE, lambda identifier, data: self.sent.append((identifier, bytes(data))))
+        (self.drive,) = self.node.drives
         self.now = 0.0
         self.wait(0.05)
 
     def wait(self, seconds: float) -> None:
         for _ in range(max(1, round(seconds / 0.002))):
             self.now += 0.002
-            self.drive.tick(self.now)
+            self.node.tick(self.now)
 
     def take(self, identifier: int, data: bytes) -> list[tuple[int, bytes]]:
         self.sent.clear()
-        self.drive.receive(identifier, data, self.now)
+        self.node.receive(identifier, data, self.now)
         return list(self.sent)
 
     def sdo(self, index: int, subindex: int = 0, value: int | None = None, size: int = 4) -> int:
@@ -73,7 +74,7 @@ def bench() -> Bench:
 
 def test_it_boots_and_says_so(bench: Bench) -> None:
     assert (objects.HEARTBEAT + NODE, bytes([NmtState.BOOT_UP])) in bench.sent
-    assert bench.drive.nmt is NmtState.PRE_OPERATIONAL
+    assert bench.node.nmt is NmtState.PRE_OPERATIONAL
 
 
 def test_identity_and_types_are_those_of_the_data_sheet(bench: Bench) -> None:
@@ -128,7 +129,7 @@ def test_no_pdo_before_operational_and_no_sdo_when_stopped(bench: Bench) -> None
 
 def test_commands_to_other_nodes_are_left_alone(bench: Bench) -> None:
     bench.take(objects.NMT, bytes([Nmt.START, NODE + 1]))
-    assert bench.drive.nmt is NmtState.PRE_OPERATIONAL
+    assert bench.node.nmt is NmtState.PRE_OPERATIONAL
 
 
 def test_set_points_are_applied_on_sync_alone(bench: Bench) -> None:
@@ -371,7 +372,7 @@ def test_a_lost_heartbeat_does_what_the_error_behaviour_says(bench: Bench, behav
     bench.enable()
     bench.take(objects.HEARTBEAT + 127, b"\x05")
     bench.wait(0.1)
-    assert bench.drive.nmt is state
+    assert bench.node.nmt is state
     if state is not NmtState.STOPPED:
         assert bench.sdo(Object.ERROR_FIELD, 1) == EmergencyCode.HEARTBEAT_LOST
         assert bench.sdo(Object.ERROR_FIELD, 0, 0, 1) == 0

@@ -14,7 +14,7 @@ from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import open_bus
 from rfdropo_bayes.deployment.causes import Cause
-from rfdropo_bayes.deployment.drives import Drive, Drives, Guards, Identity
+from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, drives_of
 from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
@@ -88,7 +88,8 @@ def rigs(hub: str) -> Iterator[Callable[..., Rig]]:
 
 def masters(rig: Rig, eds: str, units: Units = STANDARD, unguarded: tuple[int, ...] = ()) -> Drives:
     """The master's side."""
-    made = [Drive(rig.network, m, eds, m.offset_counts, 1.0, units, unguarded) for m in rig.robot.motors]
+    offsets = [motor.offset_counts for motor in rig.robot.motors]
+    made = drives_of(rig.network, rig.robot.motors, offsets, eds, 1.0, units, unguarded)
     return Drives(rig.network, made, Guards(master_timeout_s=5.0))
 
 

@@ -87,9 +87,7 @@ def rubbing(seed: int, batch: int = BATCH) -> fem.BodyEffects:
 
 
 @functools.cache
-def engine(
-    integrator: str = "euler", threads: int = 1, precision: str = "float64", clamped: int = 1
-) -> NativeRod:
+def engine(integrator: str = "euler", threads: int = 1, precision: str = "float64", clamped: int = 1) -> NativeRod:
     """The engine of the uneven rod."""
     made = {"threads": threads, "precision": precision, "integrator": integrator}
     return NativeRod(*uneven_rod(clamped), TIME_STEP, **made)

@@ -67,10 +67,11 @@ def strains(shape: Shape, length: np.ndarray, e: int) -> tuple[np.ndarray, np.nd
     levers = [hat(chord) @ (np.eye(3) + sign * g) / 2.0 for sign in (1.0, -1.0)]
     none = np.zeros((3, 3))
     rows = np.block([[-np.eye(3), levers[0], np.eye(3), levers[1]], [none, -w, none, w]])
-    change = np.kron(np.eye(2), middle.T) @ rows / h
-    strain[2] += h**2 / 24.0 * strain[3:5] @ strain[3:5]  # an arc is longer than its chord
-    change[2] += h**2 / 12.0 * strain[3:5] @ change[3:5]
-    return strain, change
+    rows = np.kron(np.eye(2), middle.T) @ rows / h
+    # An arc is longer than its chord.
+    rows[2] += h**2 / 12.0 * strain[3:5] @ rows[3:5]
+    strain[2] += h**2 / 24.0 * strain[3:5] @ strain[3:5]
+    return strain, rows
 
 
 def stiffness(body: Any, material: Any, e: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall
 from rfdropo_bayes.fem.native.rod_engine import NativeRod
-from rfdropo_bayes.fem.pushing import PushGeometry, rod_spheres, push_scene
+from rfdropo_bayes.fem.pushing import PushGeometry, push_scene, rod_spheres
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 
 BATCH, STEPS, TIME_STEP, LENGTH, ELEMENTS, SIDE, PLATE = 11, 60, 0.01, 0.12, 6, 0.03, -0.055

@@ -66,7 +66,6 @@ def test_forces_of_the_rod_written_down_anew_are_the_derivatives_of_its_energy()
 
 
 def test_a_body_at_rest_is_in_balance():
-    system, _ = uneven_rod()
     material, start = materials(3), 2.0 * displacements(4)[:, 0]
     found = engine().rollout(material, np.zeros((1, 3)), start=start, steps=0)
     assert found.imbalance.max() < 1e-8
@@ -129,7 +128,7 @@ def test_a_bar_swings_at_its_first_frequency():
 
 
 def test_coupled_bending_twists_the_tip():
-    """A small load at the tip: its rotations are the compliance of the section times the moment's integral, F L^2 / 2."""
+    """A small load at the tip turns it by the compliance of the section times the integral of the moment, F L^2 / 2."""
     force, twist = 1e-3 * STIFFNESS / LENGTH**2, 0.3
     law = fem.BodyEffects(bending=fem.BendingLaw(0.0, 0.2, 0.1, twist, -0.1))
     rest = NativeRod(*bar(), TIME_STEP, threads=1, integrator="quasi-static")
@@ -149,9 +148,7 @@ def test_fibres_stiffen_or_soften_with_stretch():
     force = YOUNG * area * (stretch - 1.5 * c * stretch**2)
     law = fem.BodyEffects(bending=fem.BendingLaw(c))
     rest = NativeRod(*bar(), TIME_STEP, threads=1, integrator="quasi-static")
-    found = rest.rollout(
-        bar_material(effects=law), np.zeros((1, 1, 0)), loads=pushed(np.array([0.0, 0.0, force]), 2)
-    )
+    found = rest.rollout(bar_material(effects=law), np.zeros((1, 1, 0)), loads=pushed(np.array([0.0, 0.0, force]), 2))
     assert found.position[0, -1, 0, 2] / LENGTH - 1.0 == pytest.approx(stretch, rel=1e-6)
 
 

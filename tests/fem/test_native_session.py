@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.fem.native_cases import BATCH, STEPS, all_effects, displacements, engine, materials, rows_of, rubbing
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.native.rod_session import RodSession
 from rfdropo_bayes.fem.section_loads import SectionLoads
+from tests.fem.native_cases import BATCH, STEPS, all_effects, displacements, engine, materials, rows_of, rubbing
 
 PERIOD, LANES = 2, 11
 PLAIN = fem.BodyEffects()

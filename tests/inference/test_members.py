@@ -56,7 +56,7 @@ def test_a_problem_that_lacks_a_member_is_refused_by_name(problem, said):
 def test_a_method_looks_through_its_problem_first():
     problem = alone(LinearGaussian(), "fingerprint", "prior_ends", "status_names", "residuals")
     with pytest.raises(InputError, match="has 'residuals' but lacks"):
-        methods.run(problem, "udr", {}, KEY)
+        methods.run(problem, "smc", {}, KEY)
 
 
 def test_what_has_the_defaults_lacks_nothing():

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import jax
 import pytest
+import tomli_w
 
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.method_options import options_table
 
 from .toys import Decay, Spring
 
-# Those that need an optional package, no rollouts or a gradient have tests of their own.
-OTHERS = ("bayessim", "npdr", "udr", "nuts", "nested")
+# Those that need a gradient or a trace have tests of their own.
+OTHERS = ("nuts", "nested")
 
 
 @pytest.mark.parametrize(
@@ -42,6 +46,23 @@ def test_options_come_as_toml_has_them():
     assert config.search == {"a": (1.0, 2.0)}
     assert methods.make_config("bridge", {"climb": {"starts": 3}}).climb.starts == 3
     assert methods.make_config("smc", {"rollouts": None}).rollouts is None
+
+
+@pytest.mark.parametrize("method", methods.METHODS)
+def test_options_of_every_method_are_written_as_toml_and_read_again(method):
+    """Nested options hold None, which TOML has no word for."""
+    config = methods.method_named(method).config()
+    written = tomli_w.dumps(options_table(config))
+    assert methods.make_config(method, tomllib.loads(written)) == config
+
+
+def test_what_nested_options_say_stays():
+    config = methods.make_config("bridge", {"climb": {"starts": 3}, "rollouts": 4000})
+    table = options_table(config)
+    assert (table["climb"]["starts"], table["rollouts"]) == (3, 4000.0)
+    assert None not in [*table.values(), *table["climb"].values()]
+    ranges = methods.make_config("rfdropo", {"search": {"a": [1, 2]}})
+    assert options_table(ranges)["search"] == {"a": [1.0, 2.0]}
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.result import prior_cautions, replicate_cautions, stage_cautions
+from rfdropo_bayes.inference.result import prior_cautions, replicate_cautions, stage_cautions, unseen_modes
 
 from .toys import LinearGaussian, Ratio
 
@@ -118,10 +118,20 @@ def test_replicates_that_disagree_are_named():
     assert apart.sentence.startswith("replicates disagree about b (R-hat 1.")
 
 
+@pytest.mark.parametrize(
+    ("replicates", "climbs", "alone"),
+    [(1, None, "one replicate"), (1, 4, "one replicate"), (4, 1, "one climb"), (2, None, None), (2, 2, None)],
+)
+def test_what_cannot_show_a_lost_mode_says_so(replicates, climbs, alone):
+    found = unseen_modes(replicates, climbs)
+    assert [caution.code for caution in found] == ([Code.MODES_UNSEEN] if alone else [])
+    assert not alone or found[0].sentence.startswith(alone)
+
+
 def test_stages_say_that_particles_stayed_and_where_a_budget_ran_out():
     """A run of one row, as from around optima, has no row to name."""
     moved = {"budget_exhausted": False, "progress": 1.0, "ess": 0.6, "correlation": 0.2}
-    settings = 3743.15, 0.3
+    settings = (3743.15,)
     assert stage_cautions([moved, moved | {"final": True}], *settings) == []
     (stuck,) = stage_cautions([moved | {"correlation": 0.9}, moved | {"correlation": 0.97, "final": True}], *settings)
     assert stuck.sentence.startswith("the last moves left the particles 0.97 correlated")

@@ -13,13 +13,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import numpyro
-import numpyro.distributions as dist
 import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro
 from rfdropo_bayes.inference.progress import Progress
 
 from .toys import Decay, Spring
@@ -96,29 +93,6 @@ def test_resumed_after_a_kill_at_any_stage(method, options, tmp_path):
             methods.run(problem, method, options, KEY, checkpoint_dir=folder, progress=Mortal(stages))
         resumed = methods.run(problem, method, options, KEY, checkpoint_dir=folder, resume=True)
         same(whole, resumed)
-
-
-def line(x, y):
-    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
-    numpyro.sample("y", dist.Normal(slope * x, 0.5), obs=y)
-
-
-@pytest.mark.slow
-def test_a_plain_model_goes_on_in_either_of_its_passes(tmp_path):
-    x = np.linspace(0.0, 1.0, 12)
-    y = 2.0 * x + 0.5 * np.random.default_rng(1).standard_normal(12)
-    problem, counting = problem_from_numpyro(line, (x, y)), Counting()
-    options = {"particles": 60, "replicates": 2}
-    whole = methods.run(problem, "smc", options, KEY, progress=counting)
-    passes = []
-    for stages in (1, counting.count // 2, counting.count - 2):
-        folder = tmp_path / str(stages)
-        with pytest.raises(Killed):
-            methods.run(problem, "smc", options, KEY, checkpoint_dir=folder, progress=Mortal(stages))
-        passes.append((folder / "refined").exists())
-        same(whole, methods.run(problem, "smc", options, KEY, checkpoint_dir=folder, resume=True))
-    assert passes[0] is False
-    assert passes[-1] is True
 
 
 def test_a_finished_run_is_only_read(tmp_path):

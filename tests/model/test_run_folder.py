@@ -83,12 +83,6 @@ def test_a_folder_in_which_another_program_is_running_is_refused_until_that_has_
     finish(tmp_path, overwrite=True)
 
 
-def test_programs_of_one_study_share_its_folder(tmp_path):
-    with run_folder(tmp_path, "benchmark table2"), run_folder(tmp_path, "benchmark table2", resume=True):
-        pass
-    assert json.loads((tmp_path / "run.json").read_text())["status"] == "done"
-
-
 def test_results_without_a_record_are_not_replaced_either(tmp_path):
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InputError, match="holds a finished run"):
@@ -233,11 +227,10 @@ def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkey
         ["calibrate", "none.toml"],
         ["audit", "none.toml"],
         ["design", "none.toml"],
-        ["audit", "none.toml", "--separate"],
         ["simulate", "none.toml"],
-        ["predict", str(DEMO), "--posterior", "none", "--commands", "x.nc", "--out", "next"],
+        ["predict", str(DEMO), "--from", "none", "--commands", "x.nc", "--out", "next"],
         ["calibrate", str(DEMO), "--set", 'data.fit=["none.nc"]'],
-        ["audit", str(DEMO), "--base", "none"],
+        ["audit", str(DEMO), "--from", "none"],
         ["report", "none"],
         ["export", "none", "--phi"],
     ],

@@ -175,8 +175,8 @@ def test_a_training_is_reproducible_and_goes_on_after_a_kill(tmp_path) -> None:
             gamma=0.9,
             resume=True,
         )
-    other = train(Points, TABLE.model_copy(update={"critic": "observation"}), tmp_path / "other", seed=3, gamma=0.9)
-    assert [row["reward"] for row in other.curve] != [row["reward"] for row in whole.curve]
+    other = train(Points, short.model_copy(update={"critic": "observation"}), tmp_path / "other", seed=3, gamma=0.9)
+    assert other.curve[0]["reward"] != whole.curve[0]["reward"]
     assert whole.curve[-1]["distance_median"] < 0.2
 
 

@@ -95,11 +95,11 @@ def test_the_page_says_how_often_the_policy_succeeds():
 def test_the_page_tells_of_tensions_and_of_what_speaks_against_the_posterior():
     seen = played()
     pulls = [replace(each, tension=100.0 + each.case, stopped=each.case > 50) for each in seen.episodes]
-    caution = {"code": "unsafe_posterior", "sentence": "reports/fit is not safe", "grave": False}
+    caution = {"code": "unsafe_posterior", "sentence": "runs/fit is not safe", "grave": False}
     page = render_policy({**SUMMARY, "cautions": [caution]}, seen._replace(episodes=pulls), "My arm", "")
     assert "at most 150 N in half of the episodes, 199 N in all; the limit of 150 N stopped 49 of them" in page
     assert page.count('<td class="n">stopped</td>') == 8  # the worst episodes
-    assert "<strong>Warning:</strong> reports/fit is not safe." in page
+    assert "<strong>Warning:</strong> runs/fit is not safe." in page
     assert "Warning" not in render_policy(SUMMARY, seen, "My arm", "")
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
+import arviz
 import numpy as np
 import pytest
 import xarray as xr
@@ -89,6 +91,28 @@ def test_everything_survives_the_disk(record: PosteriorRecord, tmp_path: Path) -
     assert back.trace == ({"horizon": 3.0, "ess": 0.5}, {"horizon": 7.0, "ess": 0.6, "final": 1.0})
     assert back.block_scores == ({"first_row": 1.0, "last_row": 3.0, "log_score": 4.0},)
     np.testing.assert_array_equal(back.log_likelihood, record.log_likelihood)
+
+
+def test_arviz_scores_what_is_written_and_finds_a_prediction_of_all_that_is_observed(
+    record: PosteriorRecord, tmp_path: Path
+) -> None:
+    """Recordings of unlike length and number of draws, one of them without prior predictions."""
+    record.save(tmp_path / "posterior.nc")
+    read = arviz.from_netcdf(tmp_path / "posterior.nc")
+    for name, observed in read.observed_data.data_vars.items():
+        assert read.posterior_predictive[name].dims == ("chain", "draw", *observed.dims)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # these draws are no posterior
+        assert np.isfinite(arviz.loo(read).elpd_loo)
+
+
+@pytest.mark.slow
+def test_arviz_plots_predictions(record: PosteriorRecord, tmp_path: Path) -> None:
+    record.save(tmp_path / "posterior.nc")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ArviZ calls what matplotlib has deprecated
+        axes = arviz.plot_ppc(arviz.from_netcdf(tmp_path / "posterior.nc"), num_pp_samples=4, random_seed=0)
+    assert len(np.ravel(axes)) == len(record.recordings)
 
 
 def test_derived_quantities_follow_their_draws(record: PosteriorRecord) -> None:

@@ -16,7 +16,6 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
-
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 TIME_STEP, PLATE = 0.01, -0.075

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.studies.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study, summarise
-from rfdropo_bayes.studies.hidden_effects import Hidden
+from studies.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study, summarise
+from studies.hidden_effects import Hidden
 
 CONTENT = {
     "verdict": "equivalent",

@@ -13,10 +13,10 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import read_tables
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.policies.tasks import TASKS, layout_of
-from rfdropo_bayes.studies import table2
-from rfdropo_bayes.studies.fresh_laws import BOUC_WEN_WAY, LAWS, Crosstalk, HystereticCable, LaggingCable, SlippingCable
-from rfdropo_bayes.studies.fresh_targets import KINDS, RECORDINGS, draw_flaws, make_target
-from rfdropo_bayes.studies.table2 import ROWS, Study, Table2Size
+from studies import table2
+from studies.fresh_laws import BOUC_WEN_WAY, LAWS, Crosstalk, HystereticCable, LaggingCable, SlippingCable
+from studies.fresh_targets import KINDS, RECORDINGS, draw_flaws, make_target
+from studies.table2 import ROWS, Study, Table2Size
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

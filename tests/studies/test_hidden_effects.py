@@ -1,7 +1,7 @@
 """Data sets with an effect hidden in them: the audit sees the files only, and must find what is there.
 
 Seeds are fixed. Under another seed each of these would fail now and then: a null data set is called discrepant in 1 %
-of cases by construction; how often a hidden effect is missed, `rfdropo benchmark audit` measures.
+of cases by construction; how often a hidden effect is missed, `python -m studies audit` measures.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import pytest
 
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.studies.hidden_effects import Setting, hide
 from rfdropo_bayes.verbs.audit import audit
+from studies.hidden_effects import Setting, hide
 
 # Friction runs on the slower engine; it has its own test.
 FRICTION = ("coulomb_friction", "capstan_friction")

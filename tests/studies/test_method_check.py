@@ -1,4 +1,4 @@
-"""``rfdropo calibrate --check sbc`` on the layered arm."""
+"""``python -m studies sbc`` on the layered arm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.studies.method_check import run_check
+from studies.method_check import run_check
 
 EXPERIMENT = Path(__file__).resolve().parents[2] / "benchmarks" / "sbc.toml"
 
@@ -24,7 +24,7 @@ def test_an_unknown_check_is_named(tmp_path):
 @pytest.mark.slow
 def test_the_arm_is_calibrated(tmp_path):
     """30 data sets: an adjusted p below 0.01 has a chance of 1 %, the coverage leaves its band with 1 %; fixed seed."""
-    found = run_check(Model.read(EXPERIMENT), tmp_path, "sbc", datasets=30)
+    found = run_check(Model.read(EXPERIMENT), tmp_path, datasets=30)
     assert found["passed"], found["sentence"]
     noise = {"observation_noise", "lasting_noise", "noise_correlation_time"}
     body = {"young_modulus", "trunk_mass", "rayleigh_stiffness"}
@@ -32,14 +32,14 @@ def test_the_arm_is_calibrated(tmp_path):
     spread = [row["contraction"] for name, row in found["quantities"].items() if name != "log_likelihood"]
     assert min(spread) < 0.3
     assert json.loads((tmp_path / "sbc.json").read_text())["passed"]
-    again = run_check(Model.read(EXPERIMENT), tmp_path, "sbc", datasets=30, resume=True)
+    again = run_check(Model.read(EXPERIMENT), tmp_path, datasets=30, resume=True)
     assert again["quantities"] == found["quantities"]
 
 
 @pytest.mark.slow
 def test_simulated_data_fit_their_own_truth():
     """Whitened residuals of a data set at its truth are standard normal: mean square 1 to five standard errors."""
-    from rfdropo_bayes.studies.method_check import simulate_data_set
+    from studies.method_check import simulate_data_set
 
     model = Model.read(EXPERIMENT)
     problem = model.problem(model.recordings("fit"))

@@ -10,9 +10,9 @@ import pytest
 import rfdropo_bayes as rb
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.experiment import CommandsTable
-from rfdropo_bayes.studies.engine_study import CLOSE, TRUTHS, as_table, run_engine_study, size_of
-from rfdropo_bayes.studies.hidden_effects import Setting, blank_recordings
-from rfdropo_bayes.studies.mujoco_truth import CABLE, ENGINE_EFFECTS, MuJoCoArm, arm_xml, write_arm
+from studies.engine_study import CLOSE, TRUTHS, as_table, run_engine_study, size_of
+from studies.hidden_effects import Setting, blank_recordings
+from studies.mujoco_truth import CABLE, ENGINE_EFFECTS, MuJoCoArm, arm_xml, write_arm
 
 pytest.importorskip("mujoco")
 

@@ -12,8 +12,8 @@ import pytest
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.studies.hidden_effects import Setting, hide
 from rfdropo_bayes.verbs.audit import audit
+from studies.hidden_effects import Setting, hide
 
 SHOP: dict = {}
 COARSE = {"refine": 1, "time_step": 0.01}

@@ -9,10 +9,10 @@ import pytest
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.model.experiment import CommandsTable
-from rfdropo_bayes.studies.engine_study import TRUTHS
-from rfdropo_bayes.studies.hidden_effects import Setting, blank_recordings
-from rfdropo_bayes.studies.mujoco_truth import CABLE
-from rfdropo_bayes.studies.pyelastica_truth import ElasticaArm
+from studies.engine_study import TRUTHS
+from studies.hidden_effects import Setting, blank_recordings
+from studies.mujoco_truth import CABLE
+from studies.pyelastica_truth import ElasticaArm
 
 from .test_mujoco_truth import recording_of
 

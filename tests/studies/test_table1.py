@@ -12,10 +12,10 @@ import pytest
 
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.studies import table1
-from rfdropo_bayes.studies.comparison import fit, misleads, scores
-from rfdropo_bayes.studies.fits import run_fits
-from rfdropo_bayes.studies.table1 import (
+from studies import table1
+from studies.comparison import fit, misleads, scores
+from studies.fits import run_fits
+from studies.table1 import (
     Table1Size,
     ahead_of_ours,
     as_markdown,
@@ -26,7 +26,7 @@ from rfdropo_bayes.studies.table1 import (
     run_table1,
     summarise,
 )
-from rfdropo_bayes.studies.virtual_tasks import TASKS, draw_truth, excited, task_problem
+from studies.virtual_tasks import TASKS, draw_truth, excited, task_problem
 from tests.scripts import script
 
 STUCK = Caution(Code.PARTICLES_STUCK, "the last moves left the particles where they were", grave=True).as_dict()
@@ -261,11 +261,11 @@ def test_what_another_row_does_better_is_said():
 
 def test_a_run_writes_its_files(tmp_path, monkeypatch):
     monkeypatch.setattr(table1, "fit", lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "inside_90": [True]})
-    run_table1(tmp_path, Table1Size(1, 1), rows=["prior", "ours"], command="rfdropo benchmark table1")
+    run_table1(tmp_path, Table1Size(1, 1), rows=["prior", "ours"], command="python -m studies table1")
     content = json.loads((tmp_path / "table1.json").read_text())
     assert {cell["row"] for cell in content["cells"]} == {"prior", "ours"}
     assert (tmp_path / "table1.png").stat().st_size > 5000
-    assert "rfdropo benchmark table1" in (tmp_path / "table1.md").read_text()
+    assert "python -m studies table1" in (tmp_path / "table1.md").read_text()
     assert content["not_done"] == 0
     monkeypatch.setattr(table1, "fit", None)  # nothing is done where only what is done is wanted
     partly = run_table1(tmp_path, Table1Size(2, 1), rows=["prior", "ours"], only_done=True)

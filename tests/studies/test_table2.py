@@ -14,8 +14,9 @@ from scipy.stats import binomtest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.model.experiment_file import describe, read_tables
-from rfdropo_bayes.studies import table2
-from rfdropo_bayes.studies.table2 import ROWS, WITHOUT_CUBE, Study, Table2Size, claims, list_jobs, run_table2, summarise
+from rfdropo_bayes.model.run_folder import run_folder
+from studies import table2
+from studies.table2 import ROWS, WITHOUT_CUBE, Study, Table2Size, claims, list_jobs, run_table2, summarise
 
 VIRTUAL = Path(__file__).resolve().parents[2] / "experiments" / "virtual"
 PUSH, REACH, TRUTH, AUDIT = (VIRTUAL / f"{name}.toml" for name in ("push", "reach", "truth", "audit"))
@@ -209,3 +210,9 @@ def test_a_small_study_from_recording_to_table_goes_on_where_it_stopped(tmp_path
     assert [row["row"] for row in second["rows"]] == ["no randomisation", "oracle"]
     assert policy.stat().st_mtime == before
     assert second["cells"][0] == first["cells"][0]
+
+
+def test_programs_of_one_study_share_its_folder(tmp_path):
+    with run_folder(tmp_path, "table2"), run_folder(tmp_path, "table2", resume=True):
+        pass
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "done"

@@ -13,8 +13,8 @@ from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.studies.hidden_effects import Setting, experiment_tables
-from rfdropo_bayes.studies.unknown_effects import EFFECTS, EffectSimulator, Scene
+from studies.hidden_effects import Setting, experiment_tables
+from studies.unknown_effects import EFFECTS, EffectSimulator, Scene
 
 
 def simulator_of(name: str):

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfdropo_bayes.audit.candidates import Candidate
-from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.discrepancy.candidates import Candidate
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.differences import Groups, with_differences
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.audit import extended_tables, sized_priors

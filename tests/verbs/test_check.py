@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,13 @@ from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.check import Check, run_check
-from rfdropo_bayes.verbs.motion_direction import Direction, direction_doubt, measure_direction
-from rfdropo_bayes.verbs.numerical_error import NumericalError, measure_numerical_error, numerical_error_lines
+from rfdropo_bayes.verbs.motion_direction import Direction, Paths, direction_doubt, direction_of
+from rfdropo_bayes.verbs.numerical_error import (
+    NumericalError,
+    measure_numerical_error,
+    nominal_markers,
+    numerical_error_lines,
+)
 from rfdropo_bayes.verbs.placement import placement_hints
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
@@ -167,16 +173,21 @@ def test_a_first_row_with_one_marker_says_so():
     assert "m1 alone is seen in it" in hint
 
 
-def turned(matrix: np.ndarray) -> tuple[Direction, Trajectory]:
-    """The direction of a recording of the demo whose positions were turned or mirrored."""
+@cache
+def demo_motion() -> Paths:
+    """The demo beside its nominal model."""
     demo = Trajectory.load(DEMO)
-    dataset = demo.dataset.copy(deep=True)
-    dataset["position"] = dataset["position"].copy(data=demo.position @ matrix.T)
-    return measure_direction(demo_spec("sdirk2"), [Trajectory(dataset)]), demo
+    return Paths(nominal_markers(demo_spec("sdirk2"), demo, 20.0), demo.position, demo.position_mask)
+
+
+def turned(matrix: np.ndarray) -> Direction:
+    """The direction of a recording of the demo whose positions were turned or mirrored."""
+    motion = demo_motion()
+    return direction_of([motion._replace(measured=motion.measured @ matrix.T)])
 
 
 def test_a_recording_in_its_frame_moves_as_commanded():
-    found, _ = turned(np.eye(3))
+    found = turned(np.eye(3))
     assert abs(np.degrees(found.turn)) < 6.0
     assert found.agreement > 0.9
     assert direction_doubt(found, ("x", "y", "z")) is None
@@ -185,7 +196,7 @@ def test_a_recording_in_its_frame_moves_as_commanded():
 @pytest.mark.parametrize("axes", [("y", "-x", "z"), ("-x", "-y", "z")])
 def test_a_frame_turned_about_the_body_is_named_with_the_axes_that_mend_it(axes):
     """The file has the base's motion in a frame of its own; the named axes read it right."""
-    found, _ = turned(axes_matrix(axes))
+    found = turned(axes_matrix(axes))
     doubt = direction_doubt(found, ("x", "y", "z"))
     assert doubt is not None
     named = tuple(word.strip(' "') for word in doubt.split("axes = [")[1].split("]")[0].split(","))
@@ -196,15 +207,24 @@ def test_a_frame_turned_about_the_body_is_named_with_the_axes_that_mend_it(axes)
 def test_a_turn_between_quarters_names_the_cables_and_a_mirror_is_told_apart():
     angle = np.radians(60.0)
     c, s = np.cos(angle), np.sin(angle)
-    found, _ = turned(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+    found = turned(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
     doubt = direction_doubt(found, ("x", "y", "z"))
     assert doubt is not None
     assert "axes =" not in doubt
     assert abs(float(doubt.split("add ")[1].split()[0]) - 60.0) < 6.0
-    mirror, _ = turned(np.diag([-1.0, 1.0, 1.0]))
+    mirror = turned(np.diag([-1.0, 1.0, 1.0]))
     doubt = direction_doubt(mirror, None)
     assert doubt is not None
     assert "as in a mirror" in doubt
+
+
+@pytest.mark.parametrize("axes", [("-x", "y", "z"), ("x", "-y", "z"), ("y", "x", "z"), ("-y", "-x", "z")])
+def test_a_left_handed_frame_is_named_with_the_axes_that_mend_it(axes):
+    doubt = direction_doubt(turned(axes_matrix(axes)), ("x", "y", "z"))
+    assert doubt is not None
+    assert "as in a mirror" in doubt
+    named = tuple(word.strip(' "') for word in doubt.split("axes = [")[1].split("]")[0].split(","))
+    assert axes_matrix(named) @ axes_matrix(axes) == pytest.approx(np.eye(3))
 
 
 @pytest.mark.parametrize("axes", [(2, 0, 1), (1, 2, 0)])
@@ -241,7 +261,9 @@ def test_recordings_alike_share_a_note(tmp_path):
     assert any(note.startswith("run, again: the first row is ") for note in found.doubts)
 
 
-@pytest.mark.parametrize(("factor", "doubtful"), [(1.0, False), (10.0, False), (100.0, True)])
+@pytest.mark.parametrize(
+    ("factor", "doubtful"), [pytest.param(1.0, False, marks=pytest.mark.slow), (10.0, False), (100.0, True)]
+)
 def test_pulls_longer_than_the_body_are_doubtful_and_those_beyond_a_limit_a_note(tmp_path, factor, doubtful):
     """Commands in another unit than the file says; a line for each recording, whatever its cables."""
     checked(tmp_path)

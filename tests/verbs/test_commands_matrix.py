@@ -54,7 +54,6 @@ high = 0.03
 sample_time = 0.05
 recordings = ["run_1", "run_2"]
 """
-SEPARATION = '\n[separation]\nmechanisms = ["actuator_lag", "command_delay"]\n'
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def rfdropo(*words: object, overrides: list[str] | None = None) -> str:
 
 def demo(folder: Path) -> Bench:
     path = folder / "demo.toml"
-    path.write_text(re.sub(r"\[inference\].*", "", DEMO.read_text(), flags=re.DOTALL) + SEPARATION)
+    path.write_text(re.sub(r"\[inference\].*", "", DEMO.read_text(), flags=re.DOTALL))
     data = [
         f'data.{role}=[{{observations="{DEMO.parent}/demo/demo_{k}.nc", rows=[0, {ROWS}]}}]'
         for role, k in (("fit", 1), ("test", 3))
@@ -113,7 +112,6 @@ def own(folder: Path) -> Bench:
     for k in (1, 2):
         moved = Trajectory.load(next((folder / "truth").glob(f"*run_{k}.nc"))).position
         write(f"run_{k}.csv", 1e3 * moved + 0.5 * rng.standard_normal(moved.shape))
-    experiment.write_text(experiment.read_text() + SEPARATION)
     return Bench(experiment, QUICK, folder / "run", folder / "run_2.csv")
 
 
@@ -124,7 +122,7 @@ def mesh(folder: Path, bar: Path) -> Bench:
     made.write_text(re.sub(r"\[data\].*?(?=\[model)", "", text, flags=re.DOTALL) + MESH_COMMANDS)
     rfdropo("simulate", made, "--out", folder, overrides=["young_modulus=3.6e6"])
     path = folder / "mesh.toml"
-    path.write_text(text + SEPARATION)
+    path.write_text(text)
     return Bench(path, QUICK, folder / "run", folder / "run_2.nc")
 
 
@@ -142,7 +140,7 @@ def bench(request, tmp_path_factory, bar_mesh) -> Bench:
 def test_every_command_is_in_the_matrix() -> None:
     """Those of a calibration; lists, training and motors have tests of their own."""
     source = Path(__file__).read_text()
-    elsewhere = {"robots", "mechanisms", "formats", "methods", "benchmark", "reference"}
+    elsewhere = {"robots", "mechanisms", "formats", "methods", "reference"}
     elsewhere |= {"train", "evaluate", "drives", "deploy", "doctor", "home"}
     names = {command.name or command.callback.__name__ for command in app.registered_commands}
     assert {name for name in names - elsewhere if f'"{name}"' not in source} == set()
@@ -191,7 +189,7 @@ def test_predict_says_where_new_commands_lead(bench, tmp_path) -> None:
         *(
             "predict",
             bench.experiment,
-            "--posterior",
+            "--from",
             bench.run,
             "--commands",
             bench.unseen,
@@ -257,7 +255,7 @@ def test_two_groups_of_recordings_are_compared(bench, tmp_path) -> None:
 @pytest.mark.parametrize("bench", ["demo"], indirect=True)
 def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
     rfdropo(
-        *("design", bench.experiment, "--base", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
+        *("design", bench.experiment, "--from", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
         overrides=[*bench.overrides, "model.per_group.young_modulus=1e5"],
     )
     proposed = pd.read_csv(tmp_path / "day" / "next_commands.csv")
@@ -265,12 +263,3 @@ def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
     assert np.isfinite(proposed.to_numpy()).all()
     assert proposed.shape[1] == 5  # time and the four cables
     assert json.loads((tmp_path / "day" / "design.json").read_text())["sentence"]
-
-
-@pytest.mark.slow
-def test_separate_says_what_the_recordings_tell_apart(bench, tmp_path) -> None:
-    rfdropo(
-        *("audit", bench.experiment, "--separate", "--base", bench.run, "--out", tmp_path / "apart"),
-        overrides=bench.overrides,
-    )
-    assert (tmp_path / "apart" / "separation.md").exists()

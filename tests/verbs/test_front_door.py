@@ -19,6 +19,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.method_options import attributes_of, settings_text
+from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.model.experiment import AuditTable, ModelTable
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.verbs.predict import fitted_parts
@@ -61,12 +62,70 @@ def test_the_import_is_light():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
 
+def test_type_checkers_read_the_same_names():
+    """From imports that are never run: the table of the names as Python has it stands beside them."""
+    source = (REPOSITORY / "rfdropo_bayes" / "__init__.py").read_text()
+    imports = re.findall(r"^    from rfdropo_bayes\.(\S+) import (\w+) as (\w+)$", source, re.MULTILINE)
+    told = {name: module if known == name else f"{module}:{known}" for module, known, name in imports}
+    assert told == rb._HOMES
+
+
+def test_no_room_has_the_name_of_a_verb():
+    """Else an import of the room would hide the verb."""
+    rooms = {path.name for path in (REPOSITORY / "rfdropo_bayes").iterdir() if path.is_dir()}
+    assert not rooms & set(rb.__all__)
+
+
+@pytest.mark.slow
+def test_a_wrong_call_is_refused_before_it_is_run(tmp_path):
+    """mypy knows what the names are: what a call takes and what it gives."""
+    calls = {
+        "rb.calibrate(1, 2, bogus=3)": 'Unexpected keyword argument "bogus"',
+        "rb.calibrate('trunk')": 'Argument 1 to "calibrate"',
+        "rb.SMC(rollout=3)": 'Unexpected keyword argument "rollout"',
+        "rb.calibrat(1)": 'Module has no attribute "calibrat"',
+        "rb.audit(rb.Model('trunk_sofa')).sentense": 'has no attribute "sentense"',
+        "rb.calibrate(rb.Model('trunk_sofa')).idata": "",
+    }
+    file = tmp_path / "calls.py"
+    file.write_text("import rfdropo_bayes as rb\n" + "\n".join(calls))
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--follow-imports=silent",
+        "--cache-dir",
+        str(tmp_path / "cache"),
+        str(file),
+    ]
+    told = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False).stdout
+    for line, message in enumerate(calls.values(), start=2):
+        said = [each for each in told.splitlines() if each.startswith(f"{file}:{line}:")]
+        assert bool(said) == bool(message), told
+        assert not message or message in said[0] + said[-1]
+
+
 def test_every_name_leads_somewhere():
     for name in rb.__all__:
         assert getattr(rb, name) is not None
-    assert callable(rb.audit)  # and not the room of that name
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         rb.calibrat  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"priors": {"young_modulos": {}}}, "did you mean 'young_modulus'"),
+        ({"priors": {"young_modulus": {"distribution": "LogNormall"}}}, "did you mean 'LogNormal'"),
+        ({"priors": {"young_modulus": {"distribution": "LogNormal", "mediann": 3.0}}}, "did you mean 'median'"),
+        ({"fixed": {"trunk_maß": 0.1}}, r"\[model.fixed\]: unknown parameter"),
+        ({"per_recording": {"ofset": "all"}}, r"\[model.per_recording\]: unknown parameter 'ofset'"),
+        ({"fixed": {"actuator_lag": 0.1}}, "add 'actuator_lag' to \\[model\\] mechanisms"),
+    ],
+)
+def test_a_misspelt_parameter_or_prior_is_refused_where_it_is_written(wrong, said):
+    with pytest.raises(rb.InputError, match=said):
+        rb.Model("smooth_arm", **wrong)
 
 
 def test_what_is_no_model_is_told_so():
@@ -169,7 +228,7 @@ def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
     assert "<img" in shown
     assert fit.report(tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
     back = rb.load(fit.folder)
-    np.testing.assert_array_equal(back.posterior.posterior["gain"], fit.posterior.posterior["gain"])
+    np.testing.assert_array_equal(back.idata.posterior["gain"], fit.idata.posterior["gain"])
     with pytest.raises(InputError, match=r"has no model: .*'lag'.*rb.load\(folder, model=model\)"):
         fitted_parts(back)  # no file describes a function
     back = rb.load(fit.folder, model=fit.model)
@@ -243,24 +302,24 @@ def test_a_mistyped_key_names_the_nearest(tmp_path):
         rb.read("run.csv", "csv", {}, folder=tmp_path, resampel=0.1)
 
 
-@pytest.mark.parametrize("name", sorted(rb._METHODS))
+@pytest.mark.parametrize("name", sorted(method.config.called for method in METHODS.values()))
 def test_the_options_of_a_method_say_what_they_are(name):
     """The first line is the call that makes them; a line for each option says its value and its meaning."""
     kind = getattr(rb, name)
-    assert kind.called == name
     shown = repr(kind())
     assert shown.splitlines()[0] == kind().call == f"rb.{name}()"
     told = attributes_of(kind)
     for field in dataclasses.fields(kind):
         assert re.search(rf"^  {field.name} .*{re.escape(told[field.name].split()[0])}", shown, re.MULTILINE)
-    changed = kind(draws=123)
-    assert changed.call == f"rb.{name}(draws=123)"
+    size = "live" if name == "Nested" else "draws"
+    changed = kind(**{size: 123})
+    assert changed.call == f"rb.{name}({size}=123)"
     assert eval(changed.call) == changed
 
 
 def test_the_options_inside_options_are_a_call_too():
     chosen = rb.Bridge(climb=rb.Laplace(starts=2), particles=50)
     assert chosen.call == "rb.Bridge(climb=rb.Laplace(starts=2), particles=50)"
-    assert "climb        rb.Laplace(starts=2)  " in repr(chosen)
-    assert settings_text(rb.UDR(draws=5)) == "UdrConfig(draws=5)"  # checkpoints of earlier versions know it so
+    assert "climb       rb.Laplace(starts=2)  " in repr(chosen)
+    assert settings_text(rb.NUTS(draws=5)) == "NutsConfig(draws=5)"  # checkpoints of earlier versions know it so
     assert settings_text(chosen).startswith("BridgeConfig(climb=LaplaceConfig(starts=2, screen=64, ")

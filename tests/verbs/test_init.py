@@ -14,7 +14,7 @@ from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment import load_experiment, matching
 from rfdropo_bayes.model.model_spec import find_robot
-from rfdropo_bayes.verbs.column_names import guess_columns
+from rfdropo_bayes.verbs.column_names import guess_columns, suggested_names
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -96,7 +96,7 @@ def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     status, told = init(monkeypatch, capsys, "arm", "--recording", "Prüfung *.csv")
     assert status == 0
-    assert "look over in the experiment file: sample_time = 0.05: no column was recognised as times" in told
+    assert 'look over in the experiment file: time = "rows": no column was recognised as times' in told
     assert "columns that are not used: nummer" in told
     text = (tmp_path / "arm" / "experiment.toml").read_text(encoding="utf-8")
     assert '"../Prüfung 1.csv"' in text
@@ -276,3 +276,111 @@ def test_the_frame_of_a_laboratory_is_found_from_the_first_row(tmp_path, monkeyp
     assert experiment.data.columns.axes[2] == "-y"
     np.testing.assert_allclose(read.position[0, :, 2], 1e-3 * MARKERS, atol=0.01)
     np.testing.assert_allclose(read.position[0, :, :2], 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"ID": np.arange(ROWS), "marker_id": 7},
+        {"roll": 0.1 * np.sin(TIME), "pitch": 0.2, "yaw": -0.3},
+        {"tip_roll_angle": 0.1, "tip_pitch_angle": 0.2, "tip_yaw_angle": -0.3},
+        {"counter": 5 + np.arange(ROWS)},
+        dict(zip(("q0", "q1", "q2", "q3"), (np.cos(TIME), np.sin(TIME), 0.0, 0.0), strict=True)),
+        {f"rot_{axis}": 0.1 * np.sin(TIME) for axis in "xyz"},
+        {f"v_{axis}": 0.1 * np.sin(TIME) for axis in "xyz"},
+        {f"motor{k}_current": 0.1 * np.sin(TIME) for k in range(1, 5)},
+    ],
+)
+@pytest.mark.parametrize("command", ["motor{0}", "u{0}", "north{0}"])
+def test_numbers_and_orientations_are_no_commands(tmp_path, others, command):
+    run = table("t", "{marker}_{axis}", command)
+    for name, value in others.items():
+        run[name] = value
+    run.to_csv(tmp_path / "run.csv", index=False)
+    if "current" in "".join(others) and command == "north{0}":
+        return  # the currents alone are called after motors
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.commands == [command.format(k) for k in range(1, 5)]
+    assert guess.markers == ["low", "tip"]
+
+
+def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}", "u{0}")
+    run.to_csv(tmp_path / "run.csv", index=False, header=False)
+    monkeypatch.chdir(tmp_path)
+    words = ("--recording", "run.csv", "--length-mm", "200", "--cables", "4", "--markers", "low=100,tip=200")
+    status, told = init(monkeypatch, capsys, "arm", *words)
+    assert status == 2
+    suggested = "t,c1,c2,c3,c4,low_x,low_y,low_z,tip_x,tip_y,tip_z"
+    assert f'if they are in this order, write {suggested} above it, or give --names "{suggested}"' in told
+    assert init(monkeypatch, capsys, "arm", *words, "--names", suggested)[0] == 0
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    np.testing.assert_allclose(read.command, 1e-3 * run[[f"u{k}" for k in range(1, 5)]])
+    assert read.marker_names == ("low", "tip")
+
+
+@pytest.mark.parametrize(
+    ("rows", "commands", "markers", "names"),
+    [
+        ([["0.0", "1", "2", "3", "4", "5"], ["0.5", "1", "2", "3", "4", "5"]], 2, ["tip"], "t,c1,c2,tip_x,tip_y,tip_z"),
+        ([["9", "1", "2", "3", "4", "5"], ["8", "1", "2", "3", "4", "5"]], None, ["a"], "c1,c2,c3,a_x,a_y,a_z"),
+        ([["9", "1", "2", "3", "4", "5"], ["8", "1", "2", "3", "4", "5"]], 5, ["a"], ""),
+        ([["9", "1", "2"], ["8", "1", "2"]], None, ["a"], ""),
+        ([["noon", "1", "2", "3", "4"], ["one", "1", "2", "3", "4"]], None, ["a"], "c1,c2,a_x,a_y,a_z"),
+    ],
+)
+def test_names_are_suggested_if_there_are_as_many_columns(rows, commands, markers, names):
+    assert ",".join(suggested_names(rows, commands, markers) or []) == names
+
+
+def test_what_was_guessed_is_marked_with_its_evidence(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}", "u{0}", scale=0.1)
+    run["t"] = run["t"] * 20.0
+    for k in range(1, 5):
+        run[f"tension_{k}"] = 1.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    words = ("--recording", "run.csv", "--length-mm", "200", "--markers", "low=100,tip=200")
+    status, told = init(monkeypatch, capsys, "arm", *words)
+    assert status == 0
+    text = (tmp_path / "arm" / "experiment.toml").read_text(encoding="utf-8")
+    for line in (
+        'time_unit = "s"  # ASSUMED: 39 s of 40 rows, 1 a second',
+        'command_unit = "mm"  # ASSUMED: u1 to u4 reach 0.4',
+        'position_unit = "cm"  # ASSUMED: tip is 10 from low, and 100 mm on the robot',
+        'cables = ["cable_1", "cable_2", "cable_3", "cable_4"]',
+    ):
+        assert line in text
+    assert 'look over in the experiment file: time_unit = "s": 39 s of 40 rows' in told
+    assert "tension = true" in text
+
+
+def test_commands_in_percent_are_refused_by_their_names(tmp_path, monkeypatch, capsys):
+    table("t", "{marker}_{axis}", "valve{0}_pct").to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", "--recording", "run.csv")
+    assert status == 2
+    assert "commands are in '%' (valve1_pct, valve2_pct, valve3_pct, valve4_pct), neither lengths of cable nor" in told
+
+
+def test_disks_that_nobody_counted_share_out_over_the_segments(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert init(monkeypatch, capsys, "arm", "--shape", "disks", "--segments", "3", "--cables", "3")[0] == 0
+    text = (tmp_path / "arm" / "arm.toml").read_text(encoding="utf-8")
+    assert "disks = 12" in text
+    status, told = init(
+        monkeypatch, capsys, "b", "--shape", "disks", "--segments", "3", "--cables", "3", "--disks", "10"
+    )
+    assert status == 2
+    assert "10 disks do not share out over 3 segments; give a multiple of 3" in told
+
+
+def test_arrays_of_three_columns_are_markers(tmp_path):
+    run = table("t", "{marker}_{axis}", "u{0}")
+    arrays = {"t": run["t"], "u": run.filter(regex="^u"), "tip": run.filter(regex="^tip"), "ID": np.arange(ROWS)}
+    np.savez(tmp_path / "run.npz", **arrays)
+    guess = guess_columns(tmp_path / "run.npz")
+    assert (guess.format, guess.time, guess.markers) == ("npz", "t", ["tip"])
+    assert guess.commands == ["u[0]", "u[1]", "u[2]", "u[3]"]
+    assert guess.positions == [["tip[0]", "tip[1]", "tip[2]"]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -25,17 +24,13 @@ SHORT = [
 
 # The smallest settings that each method accepts and that bring it to its end.
 SETTINGS = {
-    "udr": ["inference.draws=20"],
     "rfdropo": ["inference.rollouts=200", "inference.rollouts_per_candidate=4", "inference.finalists=2"],
     "smc": ["inference.rollouts=600", "inference.particles=50", "inference.blocks=2"],
     "laplace": ["inference.rollouts=300", "inference.starts=1", "inference.draws=40"],
     "bridge": ["inference.rollouts=400", "inference.particles=50", "inference.replicates=2"],
-    "nested": ["inference.live=20", "inference.slices=2", "inference.draws=40"],
-    "nuts": ['simulator.engine="jax"', "inference.warmup=2", "inference.draws=8"],
-    "bayessim": ["inference.rollouts=100", "inference.max_epochs=5", "inference.draws=40"],
-    "npdr": ["inference.rollouts=200", "inference.rounds=2", "inference.max_epochs=5", "inference.draws=40"],
+    "nested": ["inference.live=20"],
+    "nuts": ['simulator.engine="jax"', "inference.draws=4"],
 }
-NEEDS = {"bayessim": "sbi", "npdr": "sbi"}  # extras without which a method cannot run
 
 
 def demo_without_method(folder: Path) -> Path:
@@ -61,8 +56,6 @@ def test_the_matrix_and_the_documents_name_every_method():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", SETTINGS)
 def test_every_method_writes_a_posterior_and_its_report(method, tmp_path):
-    if method in NEEDS and importlib.util.find_spec(NEEDS[method]) is None:
-        pytest.skip(f"{method} needs the extra {NEEDS[method]}")
     experiment, out = demo_without_method(tmp_path), tmp_path / "run"
     overrides = [*SHORT, f'inference.method="{method}"', *SETTINGS[method]]
     assert run("calibrate", experiment, "--out", out, overrides=overrides) == 0

@@ -94,7 +94,7 @@ def test_a_model_of_others_is_calibrated_drawn_predicted_and_written_back(place)
     rfdropo("calibrate", experiment, "--out", "fit", overrides=QUICK)
     row = json.loads(Path("fit/summary.json").read_text())["parameters"]["joint_damping"]
     assert abs(row["mean"] - DAMPING) < 0.02
-    rfdropo("predict", experiment, "--posterior", "fit", "--commands", "run_2.csv", "--out", "next")
+    rfdropo("predict", experiment, "--from", "fit", "--commands", "run_2.csv", "--out", "next")
     goal, small = ("--goal", "0.1,0.1,0.01"), {"steps": 512, "environments": 4, "evaluation_episodes": 4}
     sizes = [f"training.{name}={value}" for name, value in {**small, "evaluate_every": 512}.items()]
     rfdropo("train", "--from", "fit", "--task", "reach", *goal, "--out", "policy", overrides=sizes)

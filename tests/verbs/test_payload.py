@@ -43,7 +43,7 @@ def documented() -> list[str]:
     """The overrides of the command in the experiment's head that finds an unknown payload."""
     head = EXPERIMENT.read_text(encoding="utf-8").partition("\ntitle =")[0]
     command = re.sub(r"\\\n#\s*", " ", head)
-    (line,) = re.findall(r"rfdropo calibrate .* --from reports/payload .*", command)
+    (line,) = re.findall(r"rfdropo calibrate .* --from runs/payload .*", command)
     words = shlex.split(line)
     return [words[place + 1] for place, word in enumerate(words) if word == "--set"]
 

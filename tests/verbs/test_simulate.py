@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 
 from rfdropo_bayes.cli import main
 from rfdropo_bayes.data import DATA_VARIABLE, Trajectory
@@ -195,14 +194,7 @@ def test_the_mesh_is_looked_for_beside_the_experiment(bar, bar_mesh, tmp_path, m
     with pytest.raises(InputError, match=r"mine\.vtk: no such file"):
         simulate_all(model, tmp_path / "out")
     (tmp_path / "mine.vtk").write_bytes(bar_mesh.read_bytes())
-    report = simulate_all(model, tmp_path / "out", balance=True)["recordings"]["walk"]
-    assert (report["status"], report["balance"]) == ("ok", "written")
-    with xr.open_dataset(tmp_path / "out" / "trajectory.nc", engine="h5netcdf", group="balance") as balance:
-        units = {name: variable.attrs["units"] for name, variable in balance.data_vars.items()}
-        assert (units["base_force"], units["base_moment"], units["cable_work"]) == ("N", "N m", "J")
-        assert balance.base_force.dims == ("time", "axis")
-        np.testing.assert_allclose(balance.time, Trajectory.load(tmp_path / "out" / "trajectory.nc").time)
-        assert float(np.abs(balance.base_force).max()) > 0.1
+    assert simulate_all(model, tmp_path / "out")["recordings"]["walk"]["status"] == "ok"
 
 
 @pytest.mark.parametrize(

@@ -240,10 +240,10 @@ def test_a_posterior_beside_another_randomisation_is_refused(tmp_path) -> None:
     """It would take the place of the ranges without a word."""
     model = rb.Model("trunk_sofa", simulator=SINGLE)
     ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
-    with pytest.raises(InputError, match="a posterior was given, and randomisation = 'uniform'"):
-        rb.make_vec("TrunkReach-v0", model, posterior=tmp_path, **ranges)
+    with pytest.raises(InputError, match="a calibration was given, and randomisation = 'uniform'"):
+        rb.make_vec("TrunkReach-v0", model, fit=tmp_path, **ranges)
     with pytest.raises(InputError, match=r"posterior\.nc"):  # which is looked for where the two agree
-        rb.make_vec("TrunkReach-v0", model, posterior=tmp_path, randomisation="posterior")
+        rb.make_vec("TrunkReach-v0", model, fit=tmp_path, randomisation="posterior")
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def test_corners_of_a_turned_cube():
 
 
 def test_a_still_shows_trunk_and_cube(recording, tmp_path):
-    (path,) = run_view(recording, tmp_path / "new" / "still.png", [], None, 20)
+    (path,) = run_view(recording, tmp_path / "new" / "still.png", [], None)
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3).astype(int)
     blue = (pixels[:, 2] - pixels[:, 0] > 80).mean()
     orange = (pixels[:, 0] - pixels[:, 2] > 120).mean()
@@ -98,16 +98,16 @@ def test_a_still_shows_trunk_and_cube(recording, tmp_path):
 
 
 def test_an_animation_has_a_frame_for_every_instant(recording, tmp_path):
-    (path,) = run_view(recording, tmp_path / "motion.gif", [], None, 12)
+    (path,) = run_view(recording, tmp_path / "motion.gif", [], None)
     with Image.open(path) as picture:
-        assert picture.n_frames == 3  # 0.25 s at 12 frames a second
+        assert picture.n_frames == 5  # 0.25 s at 20 frames a second
         first = np.asarray(picture.convert("RGB"))
         picture.seek(2)
         assert np.any(np.asarray(picture.convert("RGB")) != first)
 
 
 def test_surfaces_for_paraview(recording, tmp_path):
-    index, *files = run_view(recording, tmp_path / "motion.vtk", [], None, 20)
+    index, *files = run_view(recording, tmp_path / "motion.vtk", [], None)
     assert index.read_text().count("<DataSet") == len(files) == 2 * ROWS
     cube = meshio.read(tmp_path / "motion.vtk" / "cube_0005.vtu")
     assert np.ptp(cube.points[:, 2]) == pytest.approx(0.035)  # upright: its height is its side
@@ -117,19 +117,19 @@ def test_surfaces_for_paraview(recording, tmp_path):
 
 def test_frames_off_screen(recording, tmp_path):
     pytest.importorskip("pyvista")
-    files = run_view(recording, tmp_path / "frames", [], None, 8)
-    assert len(files) == 2
+    files = run_view(recording, tmp_path / "frames", [], None)
+    assert len(files) == 5
     assert np.asarray(Image.open(files[0]).convert("RGB")).std() > 5.0
 
 
 def test_what_cannot_be_drawn_is_refused(recording, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"unknown format '\.bmp'"):
-        run_view(recording, tmp_path / "still.bmp", [], None, 20)
+        run_view(recording, tmp_path / "still.bmp", [], None)
     with pytest.raises(InputError, match="no such file"):
-        run_view(tmp_path / "absent.nc", tmp_path / "still.png", [], None, 20)
+        run_view(tmp_path / "absent.nc", tmp_path / "still.png", [], None)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(InputError, match="MP4 needs ffmpeg"):
-        run_view(recording, tmp_path / "motion.mp4", [], None, 20)
+        run_view(recording, tmp_path / "motion.mp4", [], None)
 
 
 def own_robot(folder: Path) -> Path:
@@ -156,10 +156,10 @@ def prediction(folder: Path) -> Path:
 def test_own_robots_are_found_beside_the_file_or_given(tmp_path):
     robot, file = own_robot(tmp_path), prediction(tmp_path)
     with pytest.raises(InputError, match=r"'my_arm', does not come with the package.*--robot"):
-        run_view(file, tmp_path / "still.png", [], None, 20)
-    (given,) = run_view(file, tmp_path / "given.png", [], None, 20, robot)
+        run_view(file, tmp_path / "still.png", [], None)
+    (given,) = run_view(file, tmp_path / "given.png", [], None, robot)
     shutil.copy(robot, tmp_path / "robot.toml")
-    (beside,) = run_view(file, tmp_path / "beside.png", [], None, 20)
+    (beside,) = run_view(file, tmp_path / "beside.png", [], None)
     pixels = [np.asarray(Image.open(path).convert("RGB")) for path in (given, beside)]
     assert np.array_equal(*pixels)
     assert pixels[0].std() > 10.0
@@ -168,4 +168,4 @@ def test_own_robots_are_found_beside_the_file_or_given(tmp_path):
 def test_a_robot_with_other_markers_is_refused(tmp_path):
     file = prediction(tmp_path)
     with pytest.raises(InputError, match=r"none of its markers \(m1, m2, m3, m4\) is the robot's"):
-        run_view(file, tmp_path / "still.png", [], None, 20, known_robots()["asl_trunk"])
+        run_view(file, tmp_path / "still.png", [], None, known_robots()["asl_trunk"])

@@ -27,7 +27,7 @@ INVALID_COMMAND = 0x05040001
 class StrictNode(canopen.LocalNode):
     """A node that knows subindex 0 alone of a plain variable, and answers by `StrictServer`."""
 
-    def __init__(self, node_id: int, object_dictionary: str) -> None:
+    def __init__(self, node_id: int, object_dictionary: canopen.ObjectDictionary) -> None:
         super().__init__(node_id, object_dictionary)
         self.sdo = StrictServer(0x600 + node_id, 0x580 + node_id, self)
 

@@ -25,10 +25,10 @@ import numpy as np
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bench.hub import Hub
 from rfdropo_bayes.deployment.bench.plant import START, PlantHere, PlantProcess, build_plant
-from rfdropo_bayes.deployment.bench.simulated_drive import SimulatedDrive
+from rfdropo_bayes.deployment.bench.simulated_node import SimulatedNode
 from rfdropo_bayes.deployment.bus import BusTable, open_bus
 from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
-from rfdropo_bayes.deployment.objects import Object
+from rfdropo_bayes.deployment.objects import Object, of_axis
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
@@ -49,7 +49,7 @@ class SimulationTable(NamedTuple):
         markers: "HOST:PORT" that markers are sent to; empty for none.
         encoder_offset: counts that every encoder shows at length zero, less the motor's own offset.
         start_length_m: cable on every drum at power-on.
-        values: of every drive's dictionary, as for `SimulatedDrive`.
+        values: of every node's dictionary, as for `SimulatedNode`.
         eds: data sheet of the drives.
     """
 
@@ -77,20 +77,28 @@ class SimulatedDrives:
             raise InputError("has no motors", where=f"robot {robot.name}", remedy="add [[motors]], one per channel")
         self.robot, self._bus, self._plant = robot, bus, plant
         self._zero = [motor.offset_counts + table.encoder_offset for motor in robot.motors]
-        self.drives = [self._drive(index, table) for index in range(len(robot.motors))]
+        self._start = [
+            motor.counts(table.start_length_m, zero) for motor, zero in zip(robot.motors, self._zero, strict=True)
+        ]
+        self.nodes = {number: self._node(number, table) for number in dict.fromkeys(m.node for m in robot.motors)}
+        self.drives = [self.nodes[motor.node].drives[motor.axis - 1] for motor in robot.motors]
+        for motor, drive in zip(robot.motors, self.drives, strict=True):
+            drive.counts_per_turn = motor.counts_per_turn
         self._markers = _marker_socket(table.markers)
         self._next_plant = self._reached = time.monotonic()
         plant.request(self.lengths(), 0.0)
         self.state = plant.newest()
         self._frame = 0
 
-    def _drive(self, index: int, table: SimulationTable) -> SimulatedDrive:
-        motor = self.robot.motors[index]
-        rated = {(int(Object.RATED_TORQUE), 0): round(1e3 * motor.rated_torque_n_m)}
-        start = motor.counts(table.start_length_m, motor.offset_counts + table.encoder_offset)
-        drive = SimulatedDrive(motor.node, self._send, start, table.eds, rated | dict(table.values))
-        drive.counts_per_turn = motor.counts_per_turn
-        return drive
+    def _node(self, number: int, table: SimulationTable) -> SimulatedNode:
+        rows = zip(self.robot.motors, self._start, strict=True)
+        mine = {motor.axis: (motor, start) for motor, start in rows if motor.node == number}
+        rated = {
+            (of_axis(Object.RATED_TORQUE, axis), 0): round(1e3 * motor.rated_torque_n_m)
+            for axis, (motor, _) in mine.items()
+        }
+        positions = [mine[axis][1] if axis in mine else 0 for axis in range(1, max(mine) + 1)]
+        return SimulatedNode(number, self._send, positions, table.eds, rated | dict(table.values))
 
     def lengths(self, ahead: float = 0.0) -> np.ndarray:
         """Cable on each drum [m], now or a time ahead [s]."""
@@ -115,8 +123,8 @@ class SimulatedDrives:
                 beat = message.arbitration_id == objects.SYNC
                 if beat:
                     self._show(now)
-                for drive in self.drives:
-                    drive.receive(message.arbitration_id, bytes(message.data), now)
+                for node in self.nodes.values():
+                    node.receive(message.arbitration_id, bytes(message.data), now)
                 if beat:
                     period = self.drives[0].interpolation_time or PLANT_PERIOD
                     self._next_plant = now + 2.5 * period
@@ -127,8 +135,8 @@ class SimulatedDrives:
 
     def tick(self, now: float) -> None:
         """Let time pass for the drives, and for the plant where no SYNC leads it."""
-        for drive in self.drives:
-            drive.tick(now)
+        for node in self.nodes.values():
+            node.tick(now)
         if now < self._next_plant:
             return
         self._next_plant = max(self._next_plant + PLANT_PERIOD, now)

@@ -1,4 +1,4 @@
-"""Which compilers the kernels of layered bodies take: ours, or Numba's own where ours do not fit the Numba at hand.
+"""Which compilers the kernels of rods take: ours, or Numba's own where ours do not fit the Numba at hand.
 
 Ours (`compilation`) rest on private parts of Numba. They are used without asking with the versions that they are tested
 with. With another version a small program is compiled and run first; if that fails in any way, Numba compiles the

@@ -21,8 +21,8 @@ MISSED = {"float64": 1e-9, "float32": 1e-5}
 
 
 class ContactScene(NamedTuple):
-    """What can touch; sphere s is bound to the rows ``place[k]`` of a body's velocities, k in ``first[s]:first[s + 1]``;
-    see ``sphere_maps``.
+    """What can touch; sphere s is bound to rows ``place[k]`` of the velocities, k in ``first[s]:first[s + 1]``; see
+    ``sphere_maps``.
 
     The centre of a mesh's sphere is bound to those before ``within[s]`` only.
     """

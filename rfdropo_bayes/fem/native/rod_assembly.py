@@ -4,10 +4,10 @@ The physics is that of ``fem.dynamics``. An element lies between the stations a 
 one section to the other, q the vector part of the quaternion from a to b and q0 its scalar part. With the chord d, the
 length h, u = R q, g = u / (1 + q0) and W = 1 - u g', the strains h Gamma = R' d - h e3 and h K = 2 q change as
 
-    h R dGamma = dr_b - dr_a + S_a da_a + S_b da_b,    S = [d]x (1 +- [g]x) / 2,    h R dK = W (da_b - da_a)
+    h R dGamma = dr_b - dr_a + S_a da_a + S_b da_b,    S = [d]x (1 +- [g]x) / 2 -+ e b',    h R dK = W (da_b - da_a)
 
-An arc is longer than its chord: its stretch is Gamma_3 + h^2 (K_1^2 + K_2^2) / 24, which changes by B (da_b - da_a) / h
-besides, B = h^2 W R (K_1, K_2, 0) / 12.
+An arc is longer than its chord: to h Gamma_3, along the axis e = R e3, belongs h^3 / 24 of the squared curvature, whose
+part of S is b = h^2 W R (K_1, K_2, 0) / 12.
 
 A time step and an iteration for equilibrium differ in a few factors only, held in ``factors``. ``tables``, ``samples``,
 ``factors`` and ``work`` are records of addresses; see `rod_records`. Stiffnesses are those over h, strains those times
@@ -74,11 +74,12 @@ def measure_element(tables, element, work, token):
     put(rows, CHORD, chord)
     put(rows, GRADIENT, gradient)
     x, y, z = components(rows, DIRECTOR, chord, token)
-    length, (k, l, m) = fill(tables.length[element], z, token), plus(between, between)
-    bow = length * (1.0 / 12.0)
-    store(rows, BOW, bow * k, bow * l)
-    put(rows, STRAIN, (x, y, fma(0.5 * bow, fma(k, k, l * l), z - length)))
-    put(rows, STRAIN + 3, (k, l, m))
+    bend, length = plus(between, between), fill(tables.length[element], work.element, token)
+    bow = scaled(load3(rows, TILTED, token), bend[0])
+    put(rows, BOW, scaled(added(load3(rows, TILTED + 3, token), bend[1], bow), length * (1.0 / 12.0)))
+    longer = fma(bend[0], bend[0], bend[1] * bend[1]) * (1.0 / 24.0) - 1.0
+    put(rows, STRAIN, (x, y, fma(longer, length, z)))
+    put(rows, STRAIN + 3, bend)
 
 
 @kernel
@@ -93,9 +94,8 @@ def _measure_rates(element, work, token):
     drift = minus(load3(work.velocity, b, token), load3(work.velocity, a, token))
     drift = added(cross(chord, middle), half, drift)
     x, y, z = components(rows, DIRECTOR, drift, token)
-    k, l, m = components(rows, TILTED, turning, token)
-    put(rows, RATE, (x, y, fma(load(rows, BOW, token), k, fma(load(rows, BOW + 1, token), l, z))))
-    put(rows, RATE + 3, (k, l, m))
+    put(rows, RATE, (x, y, z + dot(load3(rows, BOW, token), turning)))
+    put(rows, RATE + 3, components(rows, TILTED, turning, token))
 
 
 @kernel
@@ -105,6 +105,7 @@ def _add_forces(element, rows, field, token):
     b, half = a + SIZE, fill(0.5, field, token)
     force = combined(rows, DIRECTOR, load3(rows, STRESS, token), token)
     moment = combined(rows, TILTED, load3(rows, STRESS + 3, token), token)
+    moment = added(load3(rows, BOW, token), load(rows, STRESS + 2, token), moment)
     push = scaled(cross(load3(rows, CHORD, token), force), half)
     moment = minus(moment, cross(load3(rows, GRADIENT, token), push))
     add_to(field, a, force, token)
@@ -138,9 +139,6 @@ def add_element_force(tables, samples, factors, element, work, token):
         place_law_stress(tables, samples, element, force, rate, work, token)
     if samples.present[BRANCH]:
         add_branch(samples, factors, element, work, token)
-    pull = load(rows, STRESS + 2, token)
-    for i in range(2):
-        store(rows, STRESS + 3 + i, fma(pull, load(rows, BOW + i, token), load(rows, STRESS + 3 + i, token)))
     _add_forces(element, rows, work.field, token)
 
 
@@ -216,13 +214,13 @@ def _bending_tile(rows, elasticity, token):
 
 
 @kernel
-def _lever_tiles(upper, whole, soft, stiff, axis, even, odd, bow, work, token):
+def _lever_tiles(upper, whole, soft, stiff, axis, parts, work, token):
     """Tiles of moments by displacements: S' c of both stations, column by column.
 
-    S' c = ``soft`` S' + ``stiff`` s t' -+ ``bow`` t' with s = S' t, t the ``axis``; S and s are the sum and the
-    difference of parts that are even and odd in g.
+    Of a straight chord S' c = ``soft`` S' + ``stiff`` s t' with s = S' t, t the ``axis``; S and s are the sum and the
+    difference of parts that are even and odd in g. Of an arc follows ``bow``, b times the stiffness along the axis.
     """
-    rows, lower, half = work.element, upper - BLOCK, 0.5 * soft
+    rows, lower, half, (even, odd, bow) = work.element, upper - BLOCK, 0.5 * soft, parts
     g = load3(rows, GRADIENT, token)
     chord = scaled(load3(rows, CHORD, token), half)
     shift, zero = -dot(chord, g), fill(0.0, work.element, token)
@@ -249,31 +247,31 @@ def _put_full(target, t, a, skew):
 
 
 @kernel
-def _moment_tiles(upper, whole, soft, stiff, even, odd, bow, work, bending, token):
+def _moment_tiles(upper, whole, soft, stiff, parts, bending, work, token):
     """Tiles of moments by rotations: S' c S of both stations and of the pair, and ``bending``; see `_lever_tiles`."""
-    rows, quarter, diagonal = work.element, 0.25 * soft, upper + PANEL + 9
+    rows, quarter, diagonal, (even, odd, bow) = work.element, 0.25 * soft, upper + PANEL + 9, parts
     chord, g, one = load3(rows, CHORD, token), load3(rows, GRADIENT, token), fill(1.0, work.element, token)
     square, lean = dot(chord, chord), dot(chord, g)
-    steep, bent, zero = dot(g, g), lean * lean, one - one
+    steep, bent, zero, half = dot(g, g), lean * lean, one - one, 0.5 * one
     own, both = _symmetric(chord, quarter), _mixed(chord, scaled(g, quarter * lean))
     first, second = _symmetric(even, stiff), _symmetric(odd, stiff)
     mixed = _mixed(even, scaled(odd, stiff))
     swing = _mixed(chord, scaled(cross(chord, g), quarter))
-    mixed = _difference(_difference(mixed, swing), _mixed(even, bow))
+    mixed = _difference(_difference(mixed, swing), _mixed(bow, even))
+    arc = _mixed(bow, added(load3(rows, BOW, token), half, scaled(odd, -one)))
     ball = quarter * (square + bent)
-    same = _sum(_sum(first, second), bending)
+    same = _sum(_sum(_sum(first, second), bending), arc)
     same = _sum(_difference(same, both), _times(own, steep - one))
     same = _sum(same, (ball, zero, zero, ball, zero, ball))
     _put_lower(work.pivot, diagonal, _difference(same, mixed), True, token)
     if whole:
         _put_lower(work.pivot, diagonal - BLOCK, _sum(same, mixed), False, token)
         ball = quarter * (square - bent)
-        pair = _difference(_difference(first, second), bending)
+        pair = _difference(_difference(_difference(first, second), bending), arc)
         pair = _difference(_sum(pair, both), _times(own, steep + one))
         pair = _sum(pair, (ball, zero, zero, ball, zero, ball))
         skew = added(cross(odd, even), stiff, scaled(added(chord, lean, scaled(g, square)), quarter))
-        skew = plus(skew, cross(even, bow))
-        _put_full(work.coupling, diagonal, pair, scaled(skew, -one))
+        _put_full(work.coupling, diagonal, pair, minus(cross(bow, even), skew))
 
 
 @kernel
@@ -292,14 +290,9 @@ def add_element_tangent(factors, element, work, whole, token):
         _put_negative(work.coupling, upper, tile)
     even = scaled(cross(axis, chord), half)
     odd = scaled(added(chord, dot(g, axis), scaled(axis, -dot(chord, g))), half)
-    firm = elasticity * load(rows, SLOPE + 1, token)
-    bow = scaled(load3(rows, TILTED, token), load(rows, BOW, token))
-    bow = added(load3(rows, TILTED + 3, token), load(rows, BOW + 1, token), bow)
-    pull = scaled(bow, firm)
-    bending = _sum(_bending_tile(rows, elasticity, token), _symmetric(bow, firm))
-    bending = _difference(bending, _mixed(odd, pull))
-    _lever_tiles(upper, whole, soft, stiff, axis, even, odd, pull, work, token)
-    _moment_tiles(upper, whole, soft, stiff, even, odd, pull, work, bending, token)
+    parts = even, odd, scaled(load3(rows, BOW, token), soft + stiff)
+    _lever_tiles(upper, whole, soft, stiff, axis, parts, work, token)
+    _moment_tiles(upper, whole, soft, stiff, parts, _bending_tile(rows, elasticity, token), work, token)
 
 
 @kernel

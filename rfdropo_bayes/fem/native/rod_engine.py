@@ -59,9 +59,7 @@ and in a row of a quasi-static motion. What is left is a tenth of it at most: it
 
 # When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
 # resolves them.
-_NUMERICS = {
-    name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")
-}
+_NUMERICS = {name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")}
 
 
 class Run(NamedTuple):

@@ -14,11 +14,11 @@ from rfdropo_bayes.fem.native.simd import aligned_zeros
 
 KINDS = 2
 """Coulomb's friction and the capstan's."""
-DIRECTOR, TILTED, CHORD, GRADIENT, STRAIN, RATE, STRESS, SLOPE, FIRM, BOW = 0, 9, 18, 21, 24, 30, 36, 42, 50, 56
-"""First rows of an element's scratch: directors in its middle, these times W, chord, g, strains, their rates and the
+DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM = 0, 9, 18, 21, 24, 27, 33, 39, 45, 53
+"""First rows of an element's scratch: directors in its middle, these times W, chord, g, b, strains, their rates and the
 stresses; the section's tangent, of shear, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six
 without the law of fibres."""
-ELEMENT = BOW + 2
+ELEMENT = FIRM + 6
 
 
 class RodSamples(NamedTuple):

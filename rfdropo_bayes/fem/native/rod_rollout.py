@@ -17,12 +17,17 @@ from rfdropo_bayes.fem.native.rod_assembly import measure_element
 from rfdropo_bayes.fem.native.rod_constraints import constrained_stage
 from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED, follow_branch
 from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
-from rfdropo_bayes.fem.native.rod_statics import come_to_rest, keep_found, measure_imbalance, put_at_rest
+from rfdropo_bayes.fem.native.rod_statics import (
+    come_to_rest,
+    forget_iterations,
+    keep_found,
+    measure_imbalance,
+    put_at_rest,
+)
 from rfdropo_bayes.fem.native.rod_step import predict_stations, set_factors
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
-
 
 ROW_ITERATIONS = 30
 """Of a row of a quasi-static motion, at most."""
@@ -92,18 +97,22 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
     def rows(**sizes: int) -> dict[str, np.ndarray]:
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
-    values = stations * SIZE
     samples = rows(
         moduli=2, density=1, scale=elements, point_mass=stations, section=SECTION * elements, gravity=3, damping=2,
         law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
+    state = dict.fromkeys(
+        ("velocity", "solution", "field", "before", "sudden", "way", "change", "went", "older", "earlier", "branch"),
+        stations * SIZE,
+    )
+    once = dict.fromkeys(
+        ("unsolved", "accepted", "lost", "failed", "moving", "solves", "imbalance", "softness", "firmness", "loss"), 1
+    )
     work = rows(
-        turn=4 * stations, frame=FRAME * stations, velocity=values, pivot=BLOCK * stations, coupling=BLOCK * stations,
-        border=PANEL * panels * stations, condensed=9 * panels**2, solution=values, field=values, weight=3 * panels,
-        element=ELEMENT, lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
-        commanded=cables, unsolved=1, accepted=1, lost=1, failed=1, points=3 * tables.points, before=values,
-        sudden=values, way=values, change=values, went=values, older=values, earlier=values, moving=1, solves=1, imbalance=1, softness=1, firmness=1, loss=1,
-        pushed=3 * stations, given=3 * stations, branch=values,
+        turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
+        border=PANEL * panels * stations, condensed=9 * panels**2, weight=3 * panels, element=ELEMENT,
+        lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
+        commanded=cables, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state, **once,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
     return RodSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, RodWork(**work)
@@ -137,6 +146,7 @@ def start_rollouts(tables, batch, samples, work, first, token):
         samples.present[flag] = batch.present[flag]
     _prepare(tables, samples, token)
     put_at_rest(tables, nothing, work, token)
+    forget_iterations(tables, work, token)
     clear(work.tension, 0, tables.cables, token)
     clear(work.velocity, 0, values, token)
     clear(work.branch, 0, values, token)

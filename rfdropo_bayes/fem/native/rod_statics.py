@@ -34,8 +34,8 @@ LARGEST_TURN = 0.5
 """[rad] No section turns further in an iteration."""
 DISTINCT = 1e-6
 """Squared sine of the least angle between two changes of the increment that count as two."""
-TINY = 1e-30
-"""Squared changes of the increment below this are none [m2]."""
+ROUNDING = 1e-2
+"""Squared changes of the increment below this, relative to an increment at rest, are rounding."""
 
 
 @kernel
@@ -63,63 +63,65 @@ def _largest(tables, first, field, token):
 
 
 @kernel
-def _remember(tables, work, token):
-    """Turn ``before``, the increment of the iteration before, into its change, and keep the two last changes, and the
-    ways that made them."""
-    for row in range(SIZE * tables.held, SIZE * tables.stations):
-        store(work.older, row, load(work.change, row, token))
-        store(work.earlier, row, load(work.went, row, token))
-        store(work.change, row, load(work.solution, row, token) - load(work.before, row, token))
-        store(work.went, row, load(work.way, row, token))
-        store(work.before, row, load(work.solution, row, token))
+def _keep(rows, row, value, moving, token):
+    """Write a value in the lanes that move."""
+    store(rows, row, where_greater(moving, fill(0.0, rows, token), value, load(rows, row, token)))
 
 
 @kernel
-def _mixing(tables, work, number, token):
-    """Shares of the last two changes of the increment that cancel it best."""
-    zero, one, tiny = fill(0.0, work.frame, token), fill(1.0, work.frame, token), fill(TINY, work.frame, token)
-    first, along = _product(tables, work.change, work.change, token), _product(tables, work.change, work.solution, token)
-    alone = along / where_greater(first, tiny, first, one)
-    alone = where_greater(first, tiny, alone, zero)
-    if number < 2:
-        return alone, zero
-    second, beside = _product(tables, work.older, work.older, token), _product(tables, work.older, work.solution, token)
-    mixed = _product(tables, work.change, work.older, token)
+def _remember(tables, work, again, moving, token):
+    """Keep the increment, and if there was one before it its change, the way that made it, and the pair before that."""
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        now = load(work.solution, row, token)
+        if again:
+            _keep(work.older, row, load(work.change, row, token), moving, token)
+            _keep(work.earlier, row, load(work.went, row, token), moving, token)
+            _keep(work.change, row, now - load(work.before, row, token), moving, token)
+            _keep(work.went, row, load(work.way, row, token), moving, token)
+        _keep(work.before, row, now, moving, token)
+
+
+@kernel
+def _mixing(tables, work, least, token):
+    """Shares of the last two changes of the increment that cancel it best; of those that are no rounding."""
+    zero, one, change, older = fill(0.0, work.frame, token), fill(1.0, work.frame, token), work.change, work.older
+    first, second = _product(tables, change, change, token), _product(tables, older, older, token)
+    along, beside = _product(tables, change, work.solution, token), _product(tables, older, work.solution, token)
+    mixed = _product(tables, change, older, token)
+    alone = along / where_greater(first, least, first, one)
+    alone = where_greater(first, least, alone, zero)
     area = fnma(mixed, mixed, first * second)
     apart = where_greater(area, DISTINCT * first * second, one, zero)
-    apart = where_greater(area, tiny, apart, zero)
+    apart = where_greater(first, least, where_greater(second, least, apart, zero), zero)
     inverse = one / where_greater(apart, zero, area, one)
     a, b = fnma(beside, mixed, along * second) * inverse, fnma(along, mixed, beside * first) * inverse
     return where_greater(apart, zero, a, alone), where_greater(apart, zero, b, zero)
 
 
 @kernel
-def _choose_way(tables, work, number, token):
+def _choose_way(tables, work, again, small, moving, token):
     """Turn ``solution`` into the way that an iteration goes; returns the largest increment.
 
-    Anderson's mixing (1965, J. ACM 12:547) with the last two iterations, limited in length.
+    Anderson's mixing (1965, J. ACM 12:547) with two iterations before, or in the first one of a row with those of the
+    row before; limited in length.
     """
     one, turning = fill(1.0, work.frame, token), fill(tables.total, work.frame, token)
     size, turn = _largest(tables, 0, work.solution, token), turning * _largest(tables, 3, work.solution, token)
     size = where_greater(size, turn, size, turn)
-    if number > 0:
-        _remember(tables, work, token)
-        a, b = _mixing(tables, work, number, token)
+    _remember(tables, work, again, moving, token)
+    a, b = _mixing(tables, work, ROUNDING * small * small, token)
     for row in range(SIZE * tables.held, SIZE * tables.stations):
-        way = load(work.solution, row, token)
-        if number > 0:
-            way = fnma(a, load(work.went, row, token) + load(work.change, row, token), way)
-            way = fnma(b, load(work.earlier, row, token) + load(work.older, row, token), way)
-        else:
-            store(work.before, row, way)
-        store(work.way, row, way)
-    far, wide = _largest(tables, 0, work.way, token), _largest(tables, 3, work.way, token)
+        way = fnma(a, load(work.went, row, token) + load(work.change, row, token), load(work.solution, row, token))
+        way = fnma(b, load(work.earlier, row, token) + load(work.older, row, token), way)
+        store(work.solution, row, way)
+    far, wide = _largest(tables, 0, work.solution, token), _largest(tables, 3, work.solution, token)
     longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), fill(LARGEST_TURN, work.frame, token)
     share = where_greater(far, longest, longest / far, one)
     share = where_greater(share * wide, widest, widest / wide, share)
     for row in range(SIZE * tables.held, SIZE * tables.stations):
-        store(work.way, row, share * load(work.way, row, token))
-        store(work.solution, row, load(work.way, row, token))
+        way = share * load(work.solution, row, token)
+        store(work.solution, row, way)
+        _keep(work.way, row, way, moving, token)
     return size
 
 
@@ -145,13 +147,13 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, num
     )  # fmt: skip
     store(work.unsolved, 0, where_greater(moving, zero, load(work.unsolved, 0, token), unsolved))
     _take_tensions(tables, work, moving, token)
-    left = _choose_way(tables, work, number, token)
+    small = fill(bound * tables.total, work.frame, token)
+    left = _choose_way(tables, work, number > 0, small, moving, token)
     if runs is not None and slips > 0:
         sum_losses(tables, runs, samples, friction, p, token)
         keep_row(tables, factors, friction, p, work, slips, moving, token)
     move_stations(tables, moving, work, token)
     store(work.solves, 0, load(work.solves, 0, token) + moving)
-    small = fill(bound * tables.total, work.frame, token)
     store(work.moving, 0, where_greater(left, small, moving, zero))
 
 
@@ -171,6 +173,13 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
             break
     if runs is not None:
         end_row(friction, slips, token)
+
+
+@kernel
+def forget_iterations(tables, work, token):
+    """Begin without iterations to mix."""
+    for rows in (work.change, work.went, work.older, work.earlier):
+        clear(rows, 0, SIZE * tables.stations, token)
 
 
 @kernel

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import (
     BLOCK,
     PANEL,
@@ -288,7 +287,11 @@ def move_stations(tables, accepted, work, token):
     zero = fill(0.0, work.frame, token)
     for station in range(tables.held, tables.stations):
         frame, row, t = FRAME * station, SIZE * station, 4 * station
-        here, scalar, vector = load3(work.frame, frame, token), load(work.turn, t, token), load3(work.turn, t + 1, token)
+        here, scalar, vector = (
+            load3(work.frame, frame, token),
+            load(work.turn, t, token),
+            load3(work.turn, t + 1, token),
+        )
         put(work.frame, frame, chosen(accepted, plus(load3(work.solution, row, token), here), here))
         turn_station(work, station, load3(work.solution, row + 3, token), token)
         store(work.turn, t, where_greater(accepted, zero, load(work.turn, t, token), scalar))

@@ -7,6 +7,7 @@ such rows with fixed weights.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,7 +103,7 @@ def _cables(layout: Any, body: Rod) -> dict[str, np.ndarray]:
     place = guides.arm.sum(axis=1)
     place[:, 2] += np.sum(guides.weight * body.station[guides.station], axis=1)
     reach, length = np.zeros(len(anchor), dtype=int), np.zeros(len(anchor))
-    for cable, (one, two) in enumerate(zip(cable_first[:-1], cable_first[1:], strict=True)):
+    for cable, (one, two) in enumerate(pairwise(cable_first)):
         route = np.concatenate([anchor[cable : cable + 1], place[one:two]])
         length[cable] = np.linalg.norm(np.diff(route, axis=0), axis=1).sum()
         reach[cable] = station[first[one] : first[two]].max()

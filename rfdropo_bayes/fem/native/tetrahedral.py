@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.tetrahedra import POLAR_ITERATIONS
 from rfdropo_bayes.fem.native.simd import (
     fill,
     fma,
@@ -25,6 +24,7 @@ from rfdropo_bayes.fem.native.simd import (
     square_root,
     store,
 )
+from rfdropo_bayes.fem.tetrahedra import POLAR_ITERATIONS
 
 
 class Mesh(NamedTuple):

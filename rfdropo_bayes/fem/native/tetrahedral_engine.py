@@ -26,8 +26,8 @@ from rfdropo_bayes.fem.native.contact_records import (
     touch_storage,
 )
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
-from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.lane_blocks import in_blocks
+from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
 from rfdropo_bayes.fem.pushing import PushGeometry

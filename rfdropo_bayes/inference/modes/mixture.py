@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from numpyro.diagnostics import effective_sample_size
 from scipy.special import softmax
 
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.modes.climb import Laplace
 
 MIXTURES = ("equal", "evidence", "best")
@@ -66,3 +67,15 @@ def draw_mixture(
     means = np.stack([mode.mean for mode in modes])
     drawn = means[member] + np.einsum("nij,nj->ni", factors[member], normal)
     return drawn[np.asarray(jax.random.permutation(order_key, count))]
+
+
+def mixture_cautions(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
+    """A caution where more than one optimum explains the data about as well."""
+    if len(weights) == 1:
+        return []
+    use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
+    sentence = (
+        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does not describe "
+        "this posterior; use the bridge or SMC where the noise model is right"
+    )
+    return [Caution(Code.SEVERAL_OPTIMA, sentence)]

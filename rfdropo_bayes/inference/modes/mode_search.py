@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
-from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, TraceableProblem, WarmStart
+from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, WarmStart
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
@@ -40,12 +40,17 @@ from rfdropo_bayes.inference.modes.climb import (
     normal_at,
 )
 from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
-from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
+from rfdropo_bayes.inference.modes.mixture import (
+    MIXTURES,
+    draw_mixture,
+    mixture_cautions,
+    mixture_weights,
+    rivals,
+)
+from rfdropo_bayes.inference.modes.reweighting import CANDIDATE_SHARE, Reweighted, reweighted, reweighting_cautions
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
-    SmoothTarget,
     Target,
-    log_likelihood_derivatives,
     make_target,
     prior_derivatives,
 )
@@ -79,11 +84,11 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
-        draws: draws from the normal approximations.
+        draws: draws from the normal approximations, weighted by the exact posterior and resampled.
         mixture: weights of the optima that explain the data about as well as the best, see `mixture.rivals`: "equal",
             "evidence" (Laplace's), or "best" for the best alone.
         rollouts: budget in full-length rollouts, of which every climb gets its share, and a survey at most
-            `SURVEY_OF_CLIMBS`; None for no limit.
+            `SURVEY_OF_CLIMBS`; what climbs leave, a quarter at least, weights the draws. None for no limit.
     """
 
     starts: int = 4
@@ -318,7 +323,6 @@ def survey(
     sampling = sampler.SmcConfig(
         rollouts=whole,
         particles=config.survey,
-        kernel="crank_nicolson",
         blocks=len(horizons),
         spacing="linear",
         max_moves=SURVEY_MOVES,
@@ -469,25 +473,14 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
     """Horizons to climb at, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
-    if isinstance(problem, ResidualProblem):
-        prior = prior_derivatives(problem)
+    if not isinstance(problem, ResidualProblem):
+        raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
+    prior = prior_derivatives(problem)
 
-        def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
-            return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
+    def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
+        return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
 
-        return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
-    if isinstance(problem, TraceableProblem):
-        derivatives, slopes = log_likelihood_derivatives(problem), prior_derivatives(problem)
-
-        def by_hessians(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
-            return SmoothTarget(problem, ledger, derivatives, *slopes, noise=np.zeros(len(u), dtype=bool))
-
-        return (problem.n_rows,), by_hessians
-    raise InputError(
-        "this problem has no residuals, and no likelihood that JAX can differentiate",
-        where="[inference] method",
-        remedy='use method = "smc"',
-    )
+    return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
 
 
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
@@ -557,47 +550,67 @@ def run(
     def explain_as_well(climbs: Climbs) -> Bool[np.ndarray, " start"]:
         return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
 
-    found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
+    allowed = None if config.rollouts is None else (1.0 - CANDIDATE_SHARE) * config.rollouts
+    climbing = replace(config, rollouts=allowed)
+    found = find_modes(problem, climbing, mode_key, checkpoint, logbook, chosen=explain_as_well)
     ledger, began = found.climbs.ledger, time.monotonic()
-    problem, found, lasting = _counted(problem, found, config)
-    modes, seconds = found.modes, found.climbs.seconds + time.monotonic() - began
+    problem, found, lasting = _counted(problem, found, climbing)
+    modes, exact, rows = found.modes, None, None
+    compared = not (isinstance(whole, Hierarchy) and held)
     if isinstance(whole, Hierarchy) and held:
         draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
     else:
         weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
-        draws = chains(problem, [draw_mixture(modes, weights, config.draws, draw_key)])
-    best = modes[0]
+        left = config.draws if config.rollouts is None else min(config.draws, int(config.rollouts - ledger.rollouts))
+        by_evidence = config.mixture == "evidence"
+        exact = reweighted(problem, modes, weights, left, draw_key, ledger, config.draws, by_evidence)
+        position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
+        draws = chains(problem, [position])
+        rows = exact.rows[None] if exact is not None and problem is whole else None
+    best, seconds = modes[0], found.climbs.seconds + time.monotonic() - began
     return InferenceResult(
         method="laplace",
         draws=draws,
         log_evidence=(float(logsumexp([mode.log_evidence for mode in modes])), float("nan")),
+        log_likelihood=rows,
         trace=found.climbs.trace,
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
         cautions=[
             *found.cautions,
-            *_several(weights, config.mixture),
+            *mixture_cautions(weights, config.mixture),
+            *(reweighting_cautions(exact) if compared else []),
             *lasting_cautions(lasting),
             *prior_cautions(whole, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
         seconds=seconds,
         optimum={**mode_values(problem, best), **held},
-        details={
-            "lasting": {
-                name: {"share": each.share, "rows": each.rows, "widened": each.widened.tolist()}
-                for name, each in lasting.items()
-            },
-            "covariance_unconstrained": best.covariance.tolist(),
-            "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
-            "optima": [
-                {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
-                for weight, mode in zip(weights, modes, strict=True)
-            ],
-            "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
-        },
+        details=_details(problem, found._replace(modes=modes), lasting, weights, exact),
     )
+
+
+def _details(
+    problem: Problem,
+    found: Modes,
+    lasting: Mapping[str, Lasting],
+    weights: Float[np.ndarray, " mode"],
+    exact: Reweighted | None,
+) -> dict[str, Any]:
+    """Further numbers of a result."""
+    modes = found.modes
+    return {
+        "effective_draws": None if exact is None else exact.effective,
+        "lasting": {name: {**each._asdict(), "widened": each.widened.tolist()} for name, each in lasting.items()},
+        "covariance_unconstrained": modes[0].covariance.tolist(),
+        "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
+        "optima": [
+            {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
+            for weight, mode in zip(weights, modes, strict=True)
+        ],
+        "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
+    }
 
 
 def _with_scales(
@@ -663,18 +676,6 @@ def _counted(problem: Problem, found: Modes, config: LaplaceConfig) -> tuple[Pro
     again = lasting_residuals(counted, target, moved[0][0])
     lasting = {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
     return counted, Modes([mode for mode, _ in moved], climbs, _unfinished(moved[0][1])), lasting
-
-
-def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
-    """A caution where more than one optimum explains the data about as well."""
-    if len(weights) == 1:
-        return []
-    use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
-    sentence = (
-        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does not describe "
-        "this posterior; use the bridge or SMC where the noise model is right"
-    )
-    return [Caution(Code.SEVERAL_OPTIMA, sentence)]
 
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:

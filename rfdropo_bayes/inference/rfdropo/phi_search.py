@@ -45,7 +45,6 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         evaluations: candidates tried, where no budget is given (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
         optimiser: "cma" or "cem".
-        population: candidates per generation; None for 4 + floor(3 ln d), or 5 d for "cem".
         sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
         levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
@@ -63,7 +62,6 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
     evaluations: int = 5000
     rollouts_per_candidate: int = 100
     optimiser: str = "cma"
-    population: int | None = None
     sigma: float = 0.3
     horizon: str = "paper"
     levels: int = 8
@@ -84,8 +82,6 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
                 raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
-        if self.population is not None and self.population < 4:
-            raise InputError(f"population = {self.population} is less than 4", where=where)
         if self.variance_floor <= 0.0 or self.sigma <= 0.0:
             raise InputError("variance_floor and sigma must be positive", where=where)
 
@@ -115,7 +111,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
     names = config.parameters or problem.physical_names
     space = search_space(problem, names, config.search, prior)
-    population = config.population or default_population(config.optimiser, space.dimension)
+    population = default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
     scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
     finalists = config.finalists if config.mended else 0

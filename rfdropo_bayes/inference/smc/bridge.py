@@ -27,7 +27,6 @@ from scipy.special import gammaln, logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.cautions import Code
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import evaluate_prior
 from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
@@ -40,10 +39,14 @@ from rfdropo_bayes.inference.result import (
     prior_cautions,
     replicate_cautions,
     stage_cautions,
+    unseen_modes,
 )
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.moves import StraightProblem, host_generator, squared_distance
 
+INFLATION = 1.5  # of the Student-t's scale over the Laplace standard deviation
+DEGREES = 5.0  # of freedom of the Student-t's
+PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for what no climb has found
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
@@ -55,9 +58,6 @@ class BridgeConfig(MethodOptions, called="Bridge"):
 
     Attributes:
         climb: settings of the search for optima.
-        inflation: of the Student-t's scale over the Laplace standard deviation.
-        degrees: of freedom of the Student-t.
-        prior_share: of the particles that start at prior draws, for what no climb has found.
         rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
         particles: per replicate; None takes as many as the budget serves.
         replicates: independent repetitions.
@@ -66,20 +66,11 @@ class BridgeConfig(MethodOptions, called="Bridge"):
     """
 
     climb: LaplaceConfig = field(default_factory=LaplaceConfig)
-    inflation: float = 1.5
-    degrees: float = 5.0
-    prior_share: float = 0.05
     rollouts: float | None = None
     particles: int | None = 500
     replicates: int = 4
     target_ess: float = 0.5
     draws: int = 400
-
-    def __post_init__(self) -> None:
-        if self.inflation < 1.0 or self.degrees <= 0.0:
-            raise InputError("inflation must be at least 1 and degrees positive", where="[inference]")
-        if not 0.0 <= self.prior_share < 1.0:
-            raise InputError("prior_share must be at least 0 and below 1", where="[inference]")
 
     @property
     def sampling(self) -> sampler.SmcConfig:
@@ -100,9 +91,9 @@ class BridgedProblem(ProblemDefaults):
     Its one row is ``log prior + log likelihood - log mixture``, so that its evidence is the other's.
     """
 
-    def __init__(self, problem: Problem, modes: list[Laplace], config: BridgeConfig) -> None:
+    def __init__(self, problem: Problem, modes: list[Laplace]) -> None:
         self.problem = problem
-        self.mixture = ModeMixture(problem, modes, config.inflation, config.degrees, config.prior_share)
+        self.mixture = ModeMixture(problem, modes, INFLATION, DEGREES, PRIOR_SHARE)
         self.names = tuple(f"u{j}" for j in range(self.mixture.means.shape[1]))
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
@@ -170,14 +161,16 @@ def sample_from_modes(
     if isinstance(problem, ResidualProblem):
         view = straight = StraightProblem(problem, moment_key)
         modes = [straight.mode(mode) for mode in modes]
-    bridged = BridgedProblem(view, covering(view, modes, moment_key), config)
+    bridged = BridgedProblem(view, covering(view, modes, moment_key))
     sampled = sampler.run(bridged, sampling, run_key, logbook)
     _, draws = bridged.carried_back(sampled.draws, problem.names)
     spent = ledger + sampled.spent
     # Several optima are what the mixture is for: no caution here, unlike in Laplace alone.
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
-    kept = stage_cautions(sampled.trace, sampling.rollouts, sampling.correlation)
+    kept = stage_cautions(sampled.trace, sampling.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
+    first = found.climbs.trace[0]["horizon"]
+    kept += unseen_modes(sampling.chains, sum(row["horizon"] == first for row in found.climbs.trace))
     kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
     return replace(
         sampled,

@@ -36,8 +36,9 @@ from rfdropo_bayes.inference.result import (
     prior_cautions,
     replicate_cautions,
     stage_cautions,
+    unseen_modes,
 )
-from rfdropo_bayes.inference.smc.moves import KERNELS, MOST_LEAPS, Flow, chosen_kernel, flow_of, initial_scale
+from rfdropo_bayes.inference.smc.moves import initial_scale
 from rfdropo_bayes.inference.smc.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
 
 PARTICLES_WITHOUT_BUDGET = 1000
@@ -62,11 +63,6 @@ class SmcConfig(MethodOptions, called="SMC"):
         blocks: number of times the horizon is lengthened.
         spacing: of the blocks: "geometric" or "linear".
         target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
-        kernel: "crank_nicolson" (adapts between independent draws and small steps), "hamiltonian" (follows gradients),
-            or "auto": see `moves.chosen_kernel`.
-        degrees: degrees of freedom of the Student-t behind "crank_nicolson".
-        acceptance: acceptance rate that the step size is adapted to.
-        correlation: moves of a stage end once no direction is more correlated than this with its start.
         max_moves: most moves in a stage.
         start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
         draws: fewer particles, of all replicates together, move on with the rest of a budget: see `tempering.prolong`.
@@ -78,10 +74,6 @@ class SmcConfig(MethodOptions, called="SMC"):
     blocks: int = 6
     spacing: str = "geometric"
     target_ess: float = 0.5
-    kernel: str = "auto"
-    degrees: float = 8.0
-    acceptance: float = 0.3
-    correlation: float = 0.3
     max_moves: int = 20
     start: str = "auto"
     draws: int = 400
@@ -90,21 +82,18 @@ class SmcConfig(MethodOptions, called="SMC"):
         where = "[inference]"
         if self.start not in STARTS:
             raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"one of {', '.join(STARTS)}")
-        if self.kernel not in KERNELS:
-            raise InputError(f"unknown kernel {self.kernel!r}", where=where, remedy=f"one of {', '.join(KERNELS)}")
         if self.spacing not in SPACINGS:
             raise InputError(f"unknown spacing {self.spacing!r}", where=where, remedy=f"one of {', '.join(SPACINGS)}")
-        for name in ("target_ess", "acceptance", "correlation"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise InputError(f"{name} = {getattr(self, name)} is not between 0 and 1", where=where)
+        if not 0.0 < self.target_ess < 1.0:
+            raise InputError(f"target_ess = {self.target_ess} is not between 0 and 1", where=where)
         for name in ("replicates", "blocks", "max_moves", "draws"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
         if self.particles is not None and self.particles < 10:
             raise InputError(f"particles = {self.particles} is less than 10", where=where)
-        if self.degrees <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
-            raise InputError("degrees and rollouts must be positive", where=where)
+        if self.rollouts is not None and self.rollouts <= 0.0:
+            raise InputError("rollouts must be positive", where=where)
 
     @property
     def chains(self) -> int:
@@ -114,7 +103,7 @@ class SmcConfig(MethodOptions, called="SMC"):
     @property
     def tuning(self) -> Tuning:
         """What a stage needs of this."""
-        return Tuning(self.target_ess, self.kernel, self.degrees, self.acceptance, self.correlation, self.max_moves)
+        return Tuning(self.target_ess, self.max_moves)
 
 
 class ReplicatePlan(NamedTuple):
@@ -124,13 +113,11 @@ class ReplicatePlan(NamedTuple):
         particles: number of particles.
         horizons: prefix lengths at the ends of the blocks.
         budget: rollouts of this replicate; infinite for no limit.
-        flow: of trajectories; None for moves without gradients.
     """
 
     particles: int
     horizons: tuple[int, ...]
     budget: float
-    flow: Flow | None = None
 
 
 class SmcState(NamedTuple):
@@ -190,7 +177,7 @@ def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
             where="[inference] rollouts",
             remedy=f"allow at least {config.chains * least * (looks + 1.0):.0f}, or use fewer particles",
         )
-    return ReplicatePlan(least, horizons, budget, flow_of(problem) if config.kernel == "hamiltonian" else None)
+    return ReplicatePlan(least, horizons, budget)
 
 
 def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan, config: SmcConfig) -> SmcState:
@@ -210,7 +197,7 @@ def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan, config: SmcCo
     share, alive = len(base) / drawn, min(n, len(base))
     weights = np.where(np.arange(n) < alive, np.log(share / alive), -np.inf)
     stand_in = np.minimum(np.arange(n), alive - 1)
-    scale = initial_scale(config.kernel, u.shape[1])
+    scale = initial_scale(u.shape[1])
     population = Population(u[stand_in], base[stand_in], np.zeros((n, 0)), weights, 0.0, scale)
     return SmcState(population, -1, 0, 0.0, np.full(problem.n_rows, np.nan), ledger, [], 0.0, False)
 
@@ -235,9 +222,6 @@ def step(
     evaluate = partial(_evaluate, problem, horizon, state.ledger)
     moves = _affordable_moves(state, plan, horizon, problem.n_rows)
     tuning = config.tuning
-    if plan.flow is not None:
-        charge = partial(state.ledger.charge, problem, horizon=horizon)
-        tuning = tuning._replace(follow=partial(plan.flow, charge=charge))
     population, info = stage(key, state.population, float(horizon), evaluate, tuning, moves)
     if not np.isfinite(info.log_evidence_increment):
         raise _nothing_left(state, horizon)
@@ -285,7 +269,7 @@ def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows
         return 10**9
     looks = sum(plan.horizons[state.block + 1 :]) / n_rows
     left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
-    cost = plan.particles * horizon / n_rows * (1 if plan.flow is None else MOST_LEAPS + 2)
+    cost = plan.particles * horizon / n_rows
     if left < cost:
         return 0
     return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
@@ -317,7 +301,7 @@ def run(
         InputError: a budget that is too small, a prior that excludes the data, a checkpoint of another run.
     """
     digest = run_digest(problem, "smc", config, key)
-    config = replace(decided(problem.n_rows, config), kernel=chosen_kernel(config.kernel, problem, config.rollouts))
+    config = decided(problem.n_rows, config)
     plan = make_plan(problem, config)
     states = []
     for replicate in range(config.chains):
@@ -387,8 +371,9 @@ def _result(problem: Problem, config: SmcConfig, plan: ReplicatePlan, states: li
         cautions=[
             *prior_cautions(problem, draws),
             *exclusion_cautions(spent.excluded, spent.evaluations),
-            *stage_cautions(trace, config.rollouts, config.correlation),
+            *stage_cautions(trace, config.rollouts),
             *replicate_cautions(draws, values),
+            *unseen_modes(len(values)),
         ],
         seconds=sum(state.seconds for state in states),
         details={

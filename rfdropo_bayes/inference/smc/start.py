@@ -20,7 +20,7 @@ evenly along the data, b is also the prefix that a stage needs, which sets its c
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -33,8 +33,6 @@ from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evalua
 from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, screened
 from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
-from rfdropo_bayes.inference.plain import refinement
-from rfdropo_bayes.inference.plain.plain_problem import NumpyroProblem
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.smc import bridge, sampler
@@ -74,8 +72,6 @@ def run(
     Raises:
         InputError: as `sampler.run`; or a start at the optima is asked for and the problem has no residuals.
     """
-    if _refinable(problem, config):
-        return refinement.run(problem, config, key, logbook)
     if config.start == "prior" or (config.start == "auto" and not _worth_judging(problem, config)):
         return sampler.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
@@ -126,11 +122,6 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     starts = int(np.clip(budget / (steps * (4.0 * len(problem.names) + 7.0)), 1, LaplaceConfig().starts))
     limit = budget + surveyors * PER_SURVEYOR
     return LaplaceConfig(starts=starts, survey=surveyors, tolerance=CLOSE, rollouts=limit)
-
-
-def _refinable(problem: Problem, config: SmcConfig) -> TypeGuard[NumpyroProblem]:
-    """A plain model: it has gradients, and rows that are no rollouts, so that nothing limits a second pass."""
-    return config.start == "auto" and config.rollouts is None and isinstance(problem, NumpyroProblem)
 
 
 def _worth_judging(problem: Problem, config: SmcConfig) -> bool:

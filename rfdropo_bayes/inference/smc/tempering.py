@@ -30,6 +30,10 @@ from rfdropo_bayes.inference.smc.moves import (
     slowest_correlation,
 )
 
+DEGREES = 8.0  # of freedom of the Student-t behind proposals
+ACCEPTANCE = 0.3  # that step sizes are adapted to
+CORRELATION = 0.3  # moves go on until no direction is more correlated than this with where the stage began
+
 Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -58,22 +62,11 @@ class Tuning(NamedTuple):
 
     Attributes:
         target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        kernel: ``"crank_nicolson"`` or ``"hamiltonian"``.
-        degrees: degrees of freedom of the Student-t behind ``crank_nicolson``.
-        acceptance: acceptance that step sizes are adapted to.
-        correlation: moves go on until no direction is more correlated than this with where the stage began.
-        max_moves: and no longer than this.
-        follow: proposals of ``"hamiltonian"``: from the generator, positions, progress, references, second half and
-            scale.
+        max_moves: most moves in a stage.
     """
 
     target_ess: float
-    kernel: str
-    degrees: float
-    acceptance: float
-    correlation: float
     max_moves: int
-    follow: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
 
 
 class StageInfo(NamedTuple):
@@ -208,7 +201,7 @@ def move(
         references: location and spread that shape the proposals of the two halves.
         second: particles that belong to the second half.
         evaluate: proposals to (base, rows).
-        tuning: kernel and stopping rule.
+        tuning: proposals and stopping rule.
         moves: most moves the budget allows; at least one is made.
 
     Returns:
@@ -219,12 +212,7 @@ def move(
     correlation = 1.0
     for count in range(max(1, min(moves, tuning.max_moves))):
         generator = host_generator(jax.random.fold_in(key, count))
-        if tuning.follow is None:
-            proposal, ratio = _by_halves(generator, population.position, references, second, scale, tuning)
-        else:
-            proposal, ratio = tuning.follow(
-                generator, population.position, population.progress, references, second, scale
-            )
+        proposal, ratio = _by_halves(generator, population.position, references, second, scale)
         base, rows = evaluate(proposal)
         proposed = base + path_density(rows, population.progress)
         chosen = accept(generator, ratio + proposed - density)
@@ -235,9 +223,9 @@ def move(
         )
         density = np.where(chosen, proposed, density)
         rates.append(float(chosen.mean()))
-        scale = adapt_scale(tuning.kernel, scale, rates[-1], tuning.acceptance)
+        scale = adapt_scale(scale, rates[-1], ACCEPTANCE)
         correlation = slowest_correlation(first, population.position, references[0])
-        if correlation <= tuning.correlation:
+        if correlation <= CORRELATION:
             break
     done = {"moves": len(rates), "acceptance": float(np.mean(rates)), "correlation": correlation, "scale": scale}
     return population._replace(scale=scale), done
@@ -249,11 +237,10 @@ def _by_halves(
     references: tuple[Reference, Reference],
     second: Bool[np.ndarray, " n"],
     scale: float,
-    tuning: Tuning,
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
     proposal, ratio = np.empty_like(position), np.empty(len(position))
     for members, reference in zip((~second, second), references, strict=True):
-        proposal[members], ratio[members] = propose(generator, position[members], reference, scale, tuning.degrees)
+        proposal[members], ratio[members] = propose(generator, position[members], reference, scale, DEGREES)
     return proposal, ratio
 
 

@@ -125,6 +125,7 @@ def test_two_modes_keep_their_shares():
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.15)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.08)
     assert np.all(np.mean(result.draws["x0"] > 0, axis=1) > 0.3)
+    assert Code.MODES_UNSEEN not in [caution.code for caution in result.cautions]
 
 
 def test_failed_rollouts_get_no_weight_and_are_counted():
@@ -135,7 +136,9 @@ def test_failed_rollouts_get_no_weight_and_are_counted():
     assert np.isfinite(result.log_evidence[0])
     assert result.excluded.keys() == {"diverged"}
     assert result.excluded["diverged"] > 100
-    assert Code.ROLLOUTS_EXCLUDED in [caution.code for caution in result.cautions]
+    codes = [caution.code for caution in result.cautions]
+    assert Code.ROLLOUTS_EXCLUDED in codes
+    assert Code.MODES_UNSEEN in codes  # of one replicate
 
 
 def test_a_failure_costs_evidence_by_its_prior_mass():
@@ -186,9 +189,7 @@ def test_a_budget_that_allows_nothing_is_refused():
         sampler.run(LinearGaussian(), SmcConfig(rollouts=20.0), KEY)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"kernel": "hmc"}, {"spacing": "log"}, {"target_ess": 1.5}, {"replicates": 0}, {"rollouts": -1.0}]
-)
+@pytest.mark.parametrize("wrong", [{"spacing": "log"}, {"target_ess": 1.5}, {"replicates": 0}, {"rollouts": -1.0}])
 def test_settings_are_checked(wrong):
     with pytest.raises(InputError, match=str(next(iter(wrong)))):
         SmcConfig(**wrong)

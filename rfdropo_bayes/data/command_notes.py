@@ -1,0 +1,68 @@
+"""What is allowed of the times of commands, and perhaps not meant: lost commands, and two programs that command."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+REGULAR, NEAR = 0.7, 0.25
+"""Commands come regularly if this share of their intervals is as near to the median, as a share of it."""
+FEWEST = 10
+"""Intervals from which a rate is told."""
+HOLE = 4.0
+"""Usual intervals: a longer one is noted."""
+LOST = 0.04
+"""Share of commands that are lost one by one, from which on they are noted."""
+ALTERNATING = 8
+"""Commands in a row that go to and fro between two others, from which on two programs are suspected."""
+SAME = 0.2
+"""Share of a change of command within which the command after the next one is the same as this one."""
+
+
+def command_notes(time: Float[np.ndarray, " command"], command: Float[np.ndarray, "command channel"]) -> list[str]:
+    """What a user should look at, by time, and what to do.
+
+    Args:
+        time: of commands with times of their own [s], increasing.
+        command: in any unit.
+    """
+    return [*_lost(time), *_alternating(time, command)]
+
+
+def _lost(time: np.ndarray) -> list[str]:
+    """Gaps in commands that come regularly otherwise."""
+    gaps = np.diff(time)
+    if len(gaps) < FEWEST:
+        return []
+    usual = float(np.median(gaps))
+    if np.mean(np.abs(gaps - usual) <= NEAR * usual) < REGULAR:
+        return []
+    missing = np.rint(gaps / usual) - 1.0
+    holes = np.flatnonzero(gaps > HOLE * usual)
+    if not len(holes) and missing.sum() < LOST * len(gaps):
+        return []
+    longest = int(np.argmax(gaps))
+    return [
+        f"commands come every {1e3 * usual:.4g} ms, and {int(missing.sum())} of them are missing: the longest gap is "
+        f"{gaps[longest]:.4g} s, from {time[longest]:.4g} s on; each command is taken to hold until the next one. If "
+        "the recorder lost commands, leave these seconds out with rows"
+    ]
+
+
+def _alternating(time: np.ndarray, command: np.ndarray) -> list[str]:
+    """Commands that go to and fro, as those of two programs do that publish the same channels."""
+    if len(time) < ALTERNATING:
+        return []
+    next_one = np.linalg.norm(command[1:-1] - command[:-2], axis=1)
+    after = np.linalg.norm(command[2:] - command[:-2], axis=1)
+    fro = np.concatenate([[0], ((next_one > 0.0) & (after < SAME * next_one)).astype(int), [0]])
+    starts, ends = np.flatnonzero(np.diff(fro) == 1), np.flatnonzero(np.diff(fro) == -1)
+    runs = ends - starts
+    if not len(runs) or runs.max() < ALTERNATING:
+        return []
+    first = int(starts[np.argmax(runs >= ALTERNATING)])
+    zero = (command[first : first + 2] == 0.0).all(axis=1).any()
+    return [
+        f"commands go to and fro between two values{', one of them zero,' * bool(zero)} {int(runs.sum())} times, first "
+        f"from {time[first]:.4g} s on: if two programs sent the same channels, record the one that the drives obeyed"
+    ]

@@ -1,0 +1,136 @@
+"""How the text of a table is laid out: its separator and decimal sign, and whether names and units stand above it."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from rfdropo_bayes.errors import InputError
+
+SEPARATORS = (",", ";", "\t", "|", " ")
+"""In the order in which they are preferred; a space stands for any number of spaces and tabs."""
+SAMPLED = 40
+"""Rows that are tried with each separator."""
+MOST_SHOWN = 120
+"""Letters of a row that an error shows."""
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)|na|null|none", re.IGNORECASE)
+_COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.IGNORECASE)
+_DATE = re.compile(r"\d{4}-\d\d-\d\d([T ].*)?|\d+:\d\d(:\d\d)?([.,]\d+)?")
+_UNITS = re.compile(
+    r"s|sec|seconds?|ms|milliseconds?|[uµμ]s|microseconds?|ns|h|min|hz|m|cm|mm|[uµμ]m|metres?|meters?|"
+    r"deg|degrees?|°|rad|radians?|counts?|ticks?|steps?|pulses?|n|kn|newtons?|n ?m|v|mv|volts?|a|ma|amps?|"
+    r"%|percent|pct|pa|kpa|mpa|bar|mbar|psi|g|kg|k|°c|degc|c|-|1|(mm|cm|m|rad|deg|°)/s(\^?2)?",
+    re.IGNORECASE,
+)
+
+
+class Dialect(NamedTuple):
+    """How a CSV file separates its values, and what stands before their decimals."""
+
+    separator: str
+    decimal: str
+
+
+def cells_of(line: str, separator: str) -> list[str]:
+    """The cells of a line."""
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return line.split(separator)
+    return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+
+
+def dialect_of(lines: Sequence[str]) -> Dialect:
+    """Separator and decimal sign of a table whose first line may hold names.
+
+    The separator is the one between which the most of the first rows' cells are values. Decimals follow a comma if any
+    cell has a comma in a number; commas that separate are in quotes then.
+    """
+    separator = max(SEPARATORS, key=lambda sign: _fit(lines, sign))
+    rows = lines[1:] or lines
+    if separator == "," and not any('"' in line for line in rows):
+        return Dialect(separator, ".")
+    told = (cell for line in rows if "," in line for cell in cells_of(line, separator))
+    return Dialect(separator, "," if any(_COMMA.fullmatch(cell.strip()) for cell in told) else ".")
+
+
+def _fit(lines: Sequence[str], separator: str) -> tuple[bool, float, int, int]:
+    """How well a separator fits: whether it separates, the share of values and their number, and the names."""
+    names = len(cells_of(lines[0], separator))
+    rows = [cells_of(line, separator) for line in lines[1 : SAMPLED + 1] or lines if line.strip()]
+    cells = [cell for row in rows for cell in row]
+    values = sum(is_value(cell) for cell in cells)
+    if separator == " " and not values:  # words of any text
+        return False, 0.0, 0, 0
+    return max(names, *map(len, rows), 0) > 1, values / max(len(cells), 1), values, names
+
+
+def is_value(cell: str) -> bool:
+    """Whether a cell holds a number, a date or nothing."""
+    cell = cell.strip().strip('"').strip()
+    return not cell or bool(_NUMBER.fullmatch(cell) or _DATE.fullmatch(cell))
+
+
+def without_names(lines: Sequence[str], separator: str) -> bool:
+    """Whether the first line of a table holds values in place of names.
+
+    It may hold words in columns that are words below. A line of 0, 1, 2, ... numbers the columns, and so names them.
+    """
+    first = [cell.strip().strip('"') for cell in cells_of(lines[0], separator)]
+    if first == [str(number) for number in range(len(first))] and len(lines) > 1:
+        return False
+    numbers = sum(bool(_NUMBER.fullmatch(cell) or _DATE.fullmatch(cell)) for cell in first)
+    if 2 * numbers < len(first) or not numbers:
+        return False
+    below = [cells_of(line, separator) for line in lines[1 : SAMPLED + 1] if line.strip()]
+    return all(
+        is_value(cell) or any(column < len(row) and not is_value(row[column]) for row in below)
+        for column, cell in enumerate(first)
+    )
+
+
+def units_above(rows: Sequence[str], separator: str) -> list[str] | None:
+    """The units that the line below the names tells, one for each column; None if it is a row of values."""
+    if len(rows) < 2:
+        return None
+    cells = [cell.strip().strip('"').strip("[]() ") for cell in cells_of(rows[0], separator)]
+    told = [cell for cell in cells if cell]
+    known = sum(bool(_UNITS.fullmatch(cell)) for cell in told)
+    words = [cell for cell in told if not is_value(cell)]
+    below = cells_of(rows[1], separator)
+    numbered = len(below) == len(cells) and 2 * sum(is_value(cell) for cell in below) >= len(cells)
+    return cells if numbered and words and 2 * known >= len(told) and 2 * len(words) > len(told) else None
+
+
+def header_of(path: Path, lines: Sequence[str], separator: str, names: Sequence[str] | None) -> list[str]:
+    """The names of the columns: those in the first line, or ``names`` if the first line holds values.
+
+    Raises:
+        InputError: a first line of values and no names for them, or another number of names.
+    """
+    first = [cell.strip() for cell in cells_of(lines[0], separator)]
+    if not without_names(lines, separator):
+        return first
+    if names is None:
+        raise InputError(
+            f"the first line holds values, not the names of its {len(first)} columns: {first_rows(lines[:2])}",
+            where=str(path),
+            remedy=f"write a line of {len(first)} names above it, or give names = [...] in [data.columns] (init: "
+            '--names "t,c1,c2,tip_x,tip_y,tip_z")',
+        )
+    if len(names) != len(first):
+        raise InputError(
+            f"has {len(first)} columns, and names has {len(names)}; {first_rows(lines[:2])}",
+            where=str(path),
+            remedy="give one name for each column",
+        )
+    return list(names)
+
+
+def first_rows(lines: Sequence[str]) -> str:
+    """The first rows of a table, as an error shows them."""
+    rows = (line.replace("\t", " ").strip() for line in lines)
+    return "; ".join(f"row {k}: {row[:MOST_SHOWN]}{'...' * (len(row) > MOST_SHOWN)}" for k, row in enumerate(rows))

@@ -1,0 +1,374 @@
+"""An audit as plain values: the content of audit.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS
+from rfdropo_bayes.bayes.space import force_power
+from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.discrepancy.candidates import spoken
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
+from rfdropo_bayes.discrepancy.fit import Fit
+from rfdropo_bayes.discrepancy.gain import LEVELS, noise_distance
+from rfdropo_bayes.discrepancy.law_words import unknown_record
+from rfdropo_bayes.discrepancy.pipeline import Answer
+from rfdropo_bayes.discrepancy.prequential import in_words, prequential
+from rfdropo_bayes.discrepancy.score import likeness
+from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
+from rfdropo_bayes.discrepancy.sentence import sentence
+from rfdropo_bayes.discrepancy.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
+
+SCHEMA_VERSION = 1
+MILLIMETRES = 1e3
+STIFFNESS = "young_modulus"
+MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
+REFINE = "raise [simulator] refine and, of a motion, shorten its time_step"
+SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
+
+
+def record(
+    answer: Answer,
+    *,
+    versions: dict[str, str],
+    data_sha256: str,
+    next_experiment: Any,
+    doubts: Sequence[Caution] = (),
+) -> dict[str, Any]:
+    """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so.
+
+    ``doubts`` are those of its recordings.
+    """
+    findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
+    gain, noise = answer.validation.gain, answer.target.noise.first
+    base_rms = _rms(answer, answer.base.residual)
+    return {
+        "verdict": answer.verdict,
+        "sentence": sentence(answer, findings),
+        "findings": findings,
+        "candidates": _candidates(answer),
+        "between": _between(answer, findings),
+        "base_fit_converged": answer.base.converged,
+        "out_of_time": answer.cost.stopped,
+        "left_out": dict(answer.problem.left_out),
+        "adopted": [step.name for step in answer.adopted],
+        "unsupported": list(answer.causes.unsupported),
+        "bootstraps": answer.problem.rules.bootstraps,
+        "omnibus": [{"after": n, **_omnibus(screen)} for n, screen in enumerate(answer.causes.screens)],
+        "gain": None
+        if gain is None
+        else {
+            "rmse_base_mm": MILLIMETRES * gain.rmse_base,
+            "rmse_extended_mm": MILLIMETRES * gain.rmse_extended,
+            "elpd_difference": gain.elpd_difference,
+            "elpd_difference_se": gain.elpd_difference_se,
+            "elpd_p": gain.elpd_p,
+            "explained_fraction": gain.explained,
+            "explained_fraction_interval": list(gain.interval),
+            "test_trajectories": gain.trajectories,
+            "by_trajectory": gain.by_trajectory,
+            "measured_on": answer.validation.recordings,
+        },
+        "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
+        "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
+        "numerical_error_mm": None if answer.doubts.numerical is None else MILLIMETRES * answer.doubts.numerical,
+        "noise": _noise(answer),
+        "channels": list(answer.target.measurements.names_of_channels),
+        "residual_in_noise_deviations": base_rms,
+        "remainder": _remainder(answer),
+        "where": _where(answer),
+        "cautions": [caution.as_dict() for caution in (*doubts, *answer.doubts.priors)],
+        "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
+        **unknown_record(answer),
+        "next_experiment": next_experiment,
+        "rollouts": answer.cost.rollouts,
+        "seconds": round(answer.cost.seconds, 2),
+        "waited_seconds": round(answer.cost.waited, 2),
+        "profile": {stage: round(seconds, 2) for stage, seconds in answer.cost.profile.items()},
+        "seed": answer.problem.seed,
+        "versions": versions,
+        "data_sha256": data_sha256,
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _remainder(answer: Answer) -> dict[str, Any]:
+    return {
+        "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
+        "length_scale_s": answer.remainder.memory,
+        "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
+    }
+
+
+def _noise(answer: Answer) -> dict[str, Any]:
+    noise, shift, suspected = answer.target.noise.first, answer.doubts.shift, answer.doubts.suspected
+    return {
+        "source": noise.source,
+        "order": noise.order,
+        "autocorrelation": noise.autocorrelation.tolist(),
+        "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
+        "correlation_between_channels": None if noise.correlation is None else np.round(noise.correlation, 3).tolist(),
+        "other_channels": _other_noise(answer),
+        "shift_between_repeats_mm": None if shift is None else MILLIMETRES * shift,
+        "suspected_mm": None if suspected is None else (MILLIMETRES * suspected.first.scale).tolist(),
+    }
+
+
+def next_experiment(answer: Answer) -> dict[str, Any]:
+    """What to do at the robot next, in a sentence, and the candidates that this tells apart."""
+    apart = next((step for step in answer.causes.steps if len(step.members) > 1), None)
+    if answer.verdict == NO_DISCREPANCY:
+        words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
+    elif answer.verdict == NEGLIGIBLE:
+        words = "Nothing need be done: what is left is too small to matter."
+    elif answer.law is not None:
+        looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.found.terms))
+        words = f"Look at {looks}: the library has no mechanism that acts so."
+    elif not answer.fitted:
+        words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--from)."
+    elif not answer.converged:
+        words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --from."
+    elif answer.doubts.suspected is not None:
+        words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
+    elif answer.target.noise.doubtful:
+        words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
+    elif answer.verdict == UNEXPLAINED and answer.causes.steps:
+        words = f"No candidate explains it: {_watch(answer)}, for a cause that docs/mechanisms.md says how to add."
+    elif answer.verdict == NO_VERDICT:
+        words = "Nothing yet: raise [audit] minutes, and go on with --resume."
+    elif apart is not None:
+        checks = "; ".join(f"{spoken(member)}: {_remedy(answer, member)}" for member in apart.members)
+        both = " from ".join(spoken(member) for member in apart.members[:2])
+        words = f"To tell {both}: {checks}. Or let `rfdropo design` propose commands that differ."
+        return {"sentence": words, "separates": list(apart.members)}
+    elif not answer.causes.steps:
+        leading = [row.name for row in answer.causes.screens[0].rows[:2]]
+        asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
+        words = f"Send what `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
+        return {"sentence": words, "separates": leading}
+    else:
+        name, share = _largest(answer)
+        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.causes.steps) > 1 else ""
+        where = "Refine the simulation" if name == DISCRETISATION else f"Check {spoken(name)} on the robot"
+        words = f"{where}{most}: {_remedy(answer, name)}."
+        if not answer.adopted:
+            words = f"{words[:-1]}; and {_doubt(answer)}."
+        return {"sentence": words, "separates": [name]}
+    return {"sentence": words, "separates": []}
+
+
+def _doubt(answer: Answer) -> str:
+    """What shows whether a mechanism that is not adopted is there."""
+    gain = answer.validation.gain
+    if gain is None or not gain.opposed or gain.worse or answer.problem.compared:
+        return f"record {MORE_TESTS} more test recordings: they show whether the model needs it"
+    return f"see whether it was otherwise in {' and '.join(gain.against)}: compare groups of recordings with --between"
+
+
+def _largest(answer: Answer) -> tuple[str, float | None]:
+    """The step that explains most of the discrepancy, and the share; the first one where no share is known."""
+    shares = zip(answer.causes.steps, _shares(answer), strict=True)
+    step, share = max(shares, key=lambda entry: -np.inf if entry[1] is None else entry[1])
+    return step.name, share
+
+
+def _remedy(answer: Answer, name: str) -> str:
+    candidate = answer.problem.candidate(name)
+    if candidate is not None:
+        return candidate.mechanism.remedy
+    rod = answer.problem.lanes.simulator.description.get("body") == "rod"
+    return REFINE if rod else SHORTEN
+
+
+def _watch(answer: Answer) -> str:
+    """Where on the robot to look: when and at which marker the base model fails most."""
+    found = prequential(answer.target, answer.base)
+    worst, markers = int(np.argmax(found.surprise)), answer.problem.model.recordings.markers
+    marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
+    first, last = found.edges[worst : worst + 2]
+    return f"watch {marker} while what was sent from {first:.2g} to {last:.2g} s is sent again"
+
+
+def _other_noise(answer: Answer) -> dict[str, Any]:
+    """Noise of the channels beside the markers, in their own units; of tensions as a share of the reading."""
+    parts = zip(answer.target.measurements.channels, answer.target.noise.parts, strict=True)
+    return {
+        channel.name: {"standard_deviation": part.scale.tolist(), "autocorrelation": part.autocorrelation.tolist()}
+        for channel, part in parts
+        if channel is not answer.target.measurements.channels[0]
+    }
+
+
+def _rms(answer: Answer, white: np.ndarray) -> float:
+    measured = answer.target.measurements
+    return float(np.sqrt(np.mean(measured.series(white)[measured.valid] ** 2)))
+
+
+def _shares(answer: Answer) -> list[float | None]:
+    """Explained fraction that each step brought."""
+    if not answer.validation.stages:
+        return [None] * len(answer.causes.steps)
+    return [float(v) for v in np.diff([0.0, *answer.validation.stages])]
+
+
+def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]:
+    gain = answer.validation.gain if len(answer.causes.steps) == 1 else None
+    row = step.before.row(step.name)
+    candidate = answer.problem.candidate(step.name)
+    mechanism = candidate.mechanism if candidate else None
+    parameters: dict[str, Any] = {}
+    relative: dict[str, Any] = {}
+    if candidate is not None:
+        parameters = _drawn_parameters(answer, candidate.indices)
+        relative = relative_sizes(answer.problem.coordinates, answer.sizes, candidate.indices)
+    return {
+        "mechanism": candidate.title if candidate else step.name,
+        "group": candidate.group if candidate else "",
+        "equivalence_class": list(step.members),
+        "parameters": parameters,
+        "relative": relative,
+        "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
+        "remedy": _remedy(answer, step.name),
+        "explained_fraction": share,
+        "explained_fraction_interval": None if gain is None else list(gain.interval),
+        "adjusted_p": row.adjusted_p,
+        "log_bayes_factor": step.log_bayes_factor,
+        "refits": step.refits,
+    }
+
+
+def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """What differs between two groups of recordings, and what both lack; None where none are compared."""
+    groups = answer.problem.compared
+    if groups is None:
+        return None
+    keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")
+    alike = [list(step.members[1:]) for step in answer.causes.steps]
+    found = [
+        {**{key: finding[key] for key in keys}, "not_told_from": others}
+        for finding, others in zip(findings, alike, strict=True)
+    ]
+    return {
+        "groups": {name: list(members) for name, members in groups.members.items()},
+        "left_out": list(groups.left_out),
+        "differences": [row for row in found if row["group"]],
+        "in_both": [row for row in found if not row["group"]],
+    }
+
+
+def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
+    """Posterior of parameters in physical units, from the extended model's normal approximation."""
+    coordinates = answer.problem.coordinates
+    values = coordinates.values(answer.draws)
+    found = {}
+    for i in indices:
+        column = values[:, i]
+        found[coordinates.names[i]] = {
+            "mean": float(column.mean()),
+            "sd": float(column.std()),
+            "q05": float(np.quantile(column, 0.05)),
+            "q95": float(np.quantile(column, 0.95)),
+            "unit": coordinates.space.parameters[i].spec.unit,
+        }
+    return found
+
+
+def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
+    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free,
+    so that only the ratio is known where no force was measured. First-order error propagation in logarithms."""
+    if STIFFNESS not in coordinates.names[: coordinates.base]:
+        return {}
+    place = {int(i): k for k, i in enumerate(fit.free)}
+    modulus = coordinates.names.index(STIFFNESS)
+    named, slopes = coordinates.named(fit.x), coordinates.slopes(fit.x[None])[0]
+    found = {}
+    for i in indices:
+        name, unit = coordinates.names[i], coordinates.space.parameters[i].spec.unit
+        power = force_power(unit)
+        if power == 0 or i not in place or named[name] == 0.0:
+            continue
+        gradient = np.zeros(len(fit.free))
+        gradient[place[i]] = slopes[i] / named[name]
+        gradient[place[modulus]] -= power * slopes[modulus] / named[STIFFNESS]
+        ratio = named[name] / named[STIFFNESS] ** power
+        spread = float(np.sqrt(gradient @ fit.covariance @ gradient))
+        low, high = ratio * (1 - 1.645 * spread), ratio * (1 + 1.645 * spread)
+        title = f"{name}_over_{STIFFNESS}" if power > 0 else f"{name}_times_{STIFFNESS}"
+        found[title] = {
+            "parameter": name,
+            "power": power,
+            "mean": ratio,
+            "sd": abs(ratio) * spread,
+            "q05": min(low, high),
+            "q95": max(low, high),
+            "unit": f"{unit}/Pa" if power > 0 else f"{unit} Pa",
+        }
+    return found
+
+
+def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, float]:
+    named = answer.problem.coordinates.named(x)
+    return {answer.problem.coordinates.names[i]: named[answer.problem.coordinates.names[i]] for i in free}
+
+
+def _omnibus(screen: Screen) -> dict[str, Any]:
+    return {
+        "p": screen.omnibus.p,
+        "finer_mesh": screen.refined,
+        "tests": screen.omnibus.single,
+        "blocks": [None if np.isnan(block) else block for block in screen.omnibus.blocks.tolist()],
+    }
+
+
+def _where(answer: Answer) -> dict[str, Any]:
+    """When and where the base model fails."""
+    found, problem = prequential(answer.target, answer.base), answer.problem
+    markers = problem.model.recordings.markers
+    misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
+    return {
+        "sentence": in_words(found, markers, problem.rules.base_passes),
+        "block_edges_s": found.edges.tolist(),
+        "prequential_score": found.score.tolist(),
+        "block_p": found.p.tolist(),
+        "marker_misfit": dict(zip(markers, misfit.tolist(), strict=True)),
+    }
+
+
+def _candidates(answer: Answer) -> list[dict[str, Any]]:
+    """Every candidate as the screen of the base model saw it, best first."""
+    first = answer.causes.screens[0]
+    refits = answer.causes.steps[0].refits if answer.causes.steps else {}
+    return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
+
+
+def _candidate(answer: Answer, row: ScreenRow, screen: Screen, refit: float | None) -> dict[str, Any]:
+    coordinates = answer.problem.coordinates
+    alike: list[tuple[float, str]] = []
+    at: dict[str, float] = {}
+    if row.probe is not None:
+        alike = [
+            (round(likeness(row.probe.mark, other.probe.mark), 4), other.name)
+            for other in screen.rows
+            if other is not row and other.probe is not None
+        ]
+        point = answer.base.x.copy()
+        for index, value in row.probe.point.items():
+            point[index] = value
+        named = coordinates.named(point)
+        at = {coordinates.names[i]: named[coordinates.names[i]] for i in row.probe.point}
+    return {
+        "mechanism": row.name,
+        "visible": row.probe is not None,
+        "statistic": row.lm,
+        "degrees_of_freedom": row.rank,
+        "p": row.p,
+        "adjusted_p": row.adjusted_p,
+        "tried_at": at,
+        "log_bayes_factor": refit,
+        "named": any(step.name == row.name for step in answer.causes.steps),
+        "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
+    }

@@ -1,0 +1,275 @@
+"""What each candidate of the library does to the data, at its null value and where its shape is not known there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.space import SEPARATOR
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.score import Signature, project_out, signature, span
+from rfdropo_bayes.simulators.mechanisms import Mechanism
+
+LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
+LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
+WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
+NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
+NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
+SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
+UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
+
+
+def spoken(name: str) -> str:
+    """A candidate's name in words: ``payload@april`` is "payload in april"."""
+    title, _, group = name.partition(SEPARATOR)
+    return title.replace("_", " ") + (f" in {group.replace('_', ' ')}" if group else "")
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One way a candidate may look.
+
+    Attributes:
+        candidate: its name.
+        point: coordinates of its parameters there, by index.
+        columns: whitened effect of prior-sized changes of its amplitudes.
+        amplitudes: indices of the parameters the columns belong to; empty for a secant, the effect of `point` itself.
+        mark: what of it the base parameters cannot imitate.
+    """
+
+    candidate: str
+    point: dict[int, float]
+    columns: Float[np.ndarray, "n k"]
+    amplitudes: tuple[int, ...]
+    mark: Signature
+
+    def start(self, fit: Fit) -> Float[np.ndarray, " d"]:
+        """Where a fit of this candidate starts: base parameters and amplitudes moved as the linear model says."""
+        return start_together(fit, [self])
+
+
+def start_together(fit: Fit, probes: Sequence[Probe]) -> Float[np.ndarray, " d"]:
+    """Where a fit of several candidates starts, see `Probe.start`."""
+    x, columns = fit.x.copy(), np.concatenate([probe.columns for probe in probes], axis=1)
+    for probe in probes:
+        x[list(probe.point)] = list(probe.point.values())
+    design = np.concatenate([fit.jacobian, columns], axis=1)
+    ridge = np.concatenate([np.sqrt(np.diag(np.linalg.inv(fit.covariance))) * 1e-3, np.ones(columns.shape[1])])
+    step = np.linalg.lstsq(
+        np.concatenate([design, np.diag(ridge)]), np.concatenate([fit.residual, np.zeros(len(ridge))]), rcond=None
+    )[0]
+    x[fit.free] += np.clip(step[: len(fit.free)], -1.0, 1.0)
+    values = np.split(step[len(fit.free) :], np.cumsum([probe.columns.shape[1] for probe in probes])[:-1])
+    for probe, own in zip(probes, values, strict=True):
+        for index, value in zip(probe.amplitudes, own, strict=False):
+            x[index] += value
+    return x
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A mechanism that may be named.
+
+    Attributes:
+        name: registry name.
+        indices: coordinates of its parameters.
+        mechanism: itself.
+        source: what an experiment file calls it.
+        group: of recordings that it is in; empty for all. Its name then ends in ``@group``.
+    """
+
+    name: str
+    indices: tuple[int, ...]
+    mechanism: Mechanism
+    source: str
+    group: str = ""
+
+    @property
+    def title(self) -> str:
+        """Its name without the group's."""
+        return self.name.partition(SEPARATOR)[0]
+
+
+def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:
+    """Probes of every candidate at a fit of the present model, all in a few batches of rollouts.
+
+    A parameter without effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid. Where
+    the shape alone changes the data, that change is the direction; else the amplitudes are differentiated there.
+    """
+    base = span(fit.jacobian)
+    open_ = [c for c in candidates if c.indices]
+    indices = [i for c in open_ for i in c.indices]
+    at_null = np.zeros((len(fit.residual), 0))
+    if indices:
+        chosen = np.array(indices, dtype=int)
+        at_null = target.recall("null", [fit.x, chosen], lambda: {"slopes": target.jacobian(fit.x, chosen)})["slopes"]
+    column = dict(zip(indices, at_null.T, strict=True))
+    jobs: list[tuple[Candidate, dict[int, float]]] = []
+    probes: list[Probe] = []
+    for candidate in open_:
+        shapes = _shapes(target, candidate, {i: float(np.linalg.norm(column[i])) for i in candidate.indices})
+        if not shapes:
+            columns = np.stack([column[i] for i in candidate.indices], axis=1)
+            probes.append(_probe(target, base, candidate, {}, columns, candidate.indices))
+        jobs += [(candidate, point) for point in _grid(target, candidate, shapes)]
+    return probes + _probe_grid(target, fit, base, jobs)
+
+
+def screening_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> int:
+    """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of those that are shapes."""
+    forward, parameters = target.forward, target.forward.coordinates.space.parameters
+    found = 0
+    for candidate in candidates:
+        own = [parameters[i] for i in candidate.indices]
+        touched = sum(any(p.holds_for(name) for p in own) for name in target.measurements.names)
+        shapes = [len(p.spec.grid) for p in own if p.spec.grid]
+        found += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
+    return found
+
+
+def _shapes(target: FitTarget, candidate: Candidate, size: dict[int, float]) -> list[int]:
+    """Parameters without effect at null that may have one elsewhere."""
+    coordinates = target.forward.coordinates
+    seen = [i for i in candidate.indices if size[i] >= UNSEEN]
+    unseen = [i for i in candidate.indices if size[i] < UNSEEN]
+    # Beside an amplitude that is seen, another one without effect (a tilt about gravity itself) is no shape.
+    return [i for i in unseen if not seen or not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
+
+
+def _grid(target: FitTarget, candidate: Candidate, shapes: Sequence[int]) -> list[dict[int, float]]:
+    coordinates = target.forward.coordinates
+    levels = LEVELS if len(shapes) < 2 else LEVELS_OF_TWO
+    values = []
+    for i in shapes:
+        given = coordinates.space.parameters[i].spec.grid
+        values.append(coordinates.encode_one(i, given) if given else coordinates.quantiles(i, levels))
+    return [dict(zip(shapes, point, strict=True)) for point in product(*values)] if shapes else []
+
+
+def _probe_grid(
+    target: FitTarget, fit: Fit, base: np.ndarray, jobs: Sequence[tuple[Candidate, dict[int, float]]]
+) -> list[Probe]:
+    if not jobs:
+        return []
+    points = np.repeat(fit.x[None], len(jobs), axis=0)
+    for row, (_, point) in enumerate(jobs):
+        for index, value in point.items():
+            points[row, index] = value
+    residual = target.recall("grid", [points], lambda: {"residual": target.residual(points)})["residual"]
+    secants = np.clip(fit.residual - residual, -1e3, 1e3)
+    alone = np.linalg.norm(secants, axis=1) > UNSEEN
+    slots = [(row, i) for row, (c, p) in enumerate(jobs) if not alone[row] for i in c.indices if i not in p]
+    rows = np.array([row for row, _ in slots], dtype=int)
+    directions = np.eye(points.shape[1])[[i for _, i in slots]] if slots else np.zeros((0, points.shape[1]))
+    slopes = target.recall("slopes", [points[rows], directions], lambda: _slopes(target, points[rows], directions))
+    probes = []
+    for row, (candidate, point) in enumerate(jobs):
+        if alone[row]:
+            probes.append(_probe(target, base, candidate, point, secants[row][:, None], ()))
+        else:
+            amplitudes = tuple(i for i in candidate.indices if i not in point)
+            if amplitudes:
+                probes.append(_probe(target, base, candidate, point, slopes["slopes"][rows == row].T, amplitudes))
+    return probes
+
+
+def _slopes(target: FitTarget, points: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
+    return {"slopes": target.slopes(points, directions)[0]}
+
+
+def _probe(
+    target: FitTarget,
+    base: np.ndarray,
+    candidate: Candidate,
+    point: dict[int, float],
+    columns: np.ndarray,
+    amplitudes: tuple[int, ...],
+) -> Probe:
+    sign = 1 if not amplitudes else int(target.forward.coordinates.one_sided[amplitudes[0]])
+    mark = signature(base, columns, sign if columns.shape[1] == 1 else 0)
+    return Probe(candidate.name, point, columns, amplitudes, mark)
+
+
+def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, Float[np.ndarray, " d"]]:
+    """What a candidate may take from the sum of squares, and the point from which a refit should start.
+
+    The score statistic is the drop that an amplitude brings, if its effect is in proportion to it. One large enough to
+    shift a motion by its own period is not, so that several sizes of a single amplitude are tried besides. A shape
+    alone has no amplitude: its effect has the size it has, and may be too large where it was tried. The way there from
+    its null value is searched, with places and times held where there is also a size.
+    """
+    if len(probe.amplitudes) == 1:
+        drop, start, _ = _best_of(target, fit, _sizes(target, fit, probe))
+        return (drop, start) if drop > lm else (lm, probe.start(fit))
+    if probe.amplitudes:
+        return lm, probe.start(fit)
+    ladder = WAY
+    while True:
+        drop, start, best = _best_of(target, fit, _on_the_way(target, fit, probe, ladder))
+        low, high = ladder[max(best - 1, 0)], ladder[min(best + 1, len(ladder) - 1)]
+        # Of a stop that cables seldom reach, one rung does nothing and the next one far too much: the data are met
+        # between them.
+        if drop > NOTHING or high < NEIGHBOURS * low:
+            return drop, start
+        ladder = np.geomspace(low, high, len(WAY))
+
+
+def _on_the_way(
+    target: FitTarget, fit: Fit, probe: Probe, ladder: Float[np.ndarray, " way"]
+) -> Float[np.ndarray, "way d"]:
+    """A fit with a shape at some shares of the way from its null value to where it was tried."""
+    coordinates = target.forward.coordinates
+    points = np.repeat(fit.x[None], len(ladder), axis=0)
+    sizes = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
+    for index, value in probe.point.items():
+        null = coordinates.null[index]
+        points[:, index] = null + ladder * (value - null) if index in sizes or not sizes else value
+    return np.clip(points, *coordinates.bounds)
+
+
+def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
+    """A fit with several sizes of a probe's one amplitude, of both signs where it has two."""
+    coordinates, (index,) = target.forward.coordinates, probe.amplitudes
+    null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
+    sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])
+    points = np.repeat(fit.x[None], len(sizes), axis=0)
+    points[:, list(probe.point)] = list(probe.point.values())
+    points[:, index] = null + sd * sizes
+    return np.clip(points, *coordinates.bounds)
+
+
+def _best_of(
+    target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]
+) -> tuple[float, Float[np.ndarray, " d"], int]:
+    """How much the point that takes most takes from the sum of squares, base parameters moved with it; this point; its
+    number, the last one of several that take as much."""
+    base = span(fit.jacobian)
+    found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
+    left = np.sum(project_out(base, found.T) ** 2, axis=0)
+    best = len(left) - 1 - int(np.argmin(left[::-1]))
+    at_null = float(np.sum(project_out(base, fit.residual[:, None]) ** 2))
+    start = points[best]
+    step = np.linalg.lstsq(fit.jacobian, found[best], rcond=1e-6)[0]
+    start[fit.free] += np.clip(step, -1.0, 1.0)
+    return at_null - float(left[best]), start, best
+
+
+def discretisation_probe(
+    fit: Fit, name: str, finer: Float[np.ndarray, " n"], candidate_base: Float[np.ndarray, "n rank"]
+) -> Probe:
+    """The effect of a finer mesh and time step, from the residual of the finer simulator at the same point."""
+    columns = (fit.residual - finer)[:, None]
+    return Probe(name, {}, columns, (), signature(candidate_base, columns, 1))
+
+
+def fixed_drop(fit: Fit, probe: Probe) -> float:
+    """What a change without an amplitude takes from the sum of squares, base parameters moved with it."""
+    base = span(fit.jacobian)
+    now, then = (
+        np.sum(project_out(base, r) ** 2) for r in (fit.residual[:, None], fit.residual[:, None] - probe.columns)
+    )
+    return float(now - then)

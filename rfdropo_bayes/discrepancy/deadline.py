@@ -1,0 +1,102 @@
+"""How long an audit may take, and where its time goes: when it is up, the audit stops between two batches of rollouts,
+and says what it knows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rfdropo_bayes.discrepancy.processor_wait import delay, thread_times
+from rfdropo_bayes.runtime import available_processors
+
+KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
+BETWEEN_STAGES = "preparation and report"
+
+
+class OutOfTime(Exception):
+    """The time is up."""
+
+
+@dataclass
+class Deadline:
+    """A limit on the time of a whole run, by the clock on the wall: on a busy machine, less is done within it.
+
+    Attributes:
+        minutes: from its making on; infinite for no limit.
+        where: the setting that holds them.
+        share: part of the time after which rollouts stop.
+        reached: whether anything was left undone.
+        waited: seconds that the run has waited for processors which other programs held, see `delay`.
+    """
+
+    minutes: float = float("inf")
+    where: str = "[audit] minutes"
+    share: float = 1.0 - KEPT
+    began: float = field(default_factory=time.monotonic)
+    reached: bool = False
+    waited: float = 0.0
+    _spent: dict[str, float] = field(default_factory=dict)
+    _stages: list[str] = field(default_factory=lambda: [BETWEEN_STAGES])
+    _charged: float = field(default_factory=time.monotonic)
+    _threads: dict[str, tuple[float, float]] = field(default_factory=thread_times)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time within as that of a stage; of stages within one another, as that of the innermost."""
+        self._charge()
+        self._stages.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._stages.pop()
+
+    def recall(self, seconds: float) -> None:
+        """Count what an earlier part of the run has spent on what is now looked up."""
+        self._spent[self._stages[-1]] = self._spent.get(self._stages[-1], 0.0) + seconds
+
+    @property
+    def profile(self) -> dict[str, float]:
+        """Seconds of each stage up to now, in all parts of the run."""
+        self._charge()
+        return dict(self._spent)
+
+    def _charge(self) -> None:
+        now, threads = time.monotonic(), thread_times()
+        self.recall(now - self._charged)
+        self.waited += delay(now - self._charged, self._threads, threads, available_processors())
+        self._charged, self._threads = now, threads
+
+    @property
+    def left(self) -> float:
+        """Minutes until rollouts stop."""
+        return self.share * self.minutes - (time.monotonic() - self.began) / 60.0
+
+    def check(self) -> None:
+        """Raise OutOfTime once the time is up."""
+        self._charge()
+        if self.left <= 0.0:
+            self.reached = True
+            raise OutOfTime
+
+    @contextmanager
+    def reserve(self) -> Iterator[None]:
+        """Use the time that is kept for the gain, too."""
+        share, self.share = self.share, 1.0
+        try:
+            yield
+        finally:
+            self.share = share
+
+    def lift(self) -> None:
+        """No limit from now on."""
+        self.minutes = float("inf")
+
+
+def about(seconds: float) -> str:
+    """A time in words, as rough as it is known."""
+    if seconds < 90.0:
+        return f"about {max(round(seconds), 1)} s"
+    return f"about {seconds / 60.0:.0f} min"

@@ -1,0 +1,243 @@
+"""The audit's last word: what acts on the robot that the library does not have, described as a law at a port.
+
+It is asked where the library leaves something: beside the base model, and where that finds nothing better than what the
+library named, beside the model with what it named. A library candidate that a law beats clearly on unseen recordings
+stands in for the law, and is not adopted as a cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
+from rfdropo_bayes.discrepancy.deadline import OutOfTime
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, Rules
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
+from rfdropo_bayes.discrepancy.gain import Gain
+from rfdropo_bayes.discrepancy.held_out import HeldOut, JudgedModel, predicted, stages_of
+from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
+from rfdropo_bayes.discrepancy.law_search import FoundLaw, Refit, law_search
+
+
+@dataclass(frozen=True)
+class Described:
+    """What a search for laws says of an audit.
+
+    Attributes:
+        found: ports and law.
+        steps: of the library's mechanisms that the law stands beside, in the model.
+        stand_ins: mechanisms of the library that the law takes the place of.
+        gain: of the law on recordings that no fit has seen, against the model without it; None where there is no
+            law, or the time was up.
+        overall: the same against the base model.
+        held_out: predictions of these recordings: of the base model, and last of the model with the law.
+        holds: whether unseen recordings clearly support the law.
+    """
+
+    found: FoundLaw
+    steps: tuple[Added, ...] = ()
+    stand_ins: tuple[str, ...] = ()
+    gain: Gain | None = None
+    overall: Gain | None = None
+    held_out: HeldOut | None = None
+    holds: bool = False
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """Names of the library's mechanisms beside the law."""
+        return tuple(step.name for step in self.steps)
+
+    @property
+    def last(self) -> Refit | None:
+        """The model with the law."""
+        return self.found.last
+
+    @cached_property
+    def sizes(self) -> tuple[Fit, FitTarget] | None:
+        """The model's fit under priors that do not pull, and its target."""
+        last = self.last
+        return None if last is None else (widened(last.target, last.fit), last.target)
+
+
+@dataclass(frozen=True)
+class NamedModel:
+    """The base model with what the library named.
+
+    Attributes:
+        judge, base: the target under which the base model was fitted, and its fit under that.
+        steps: likewise.
+    """
+
+    judge: FitTarget
+    base: Fit
+    steps: tuple[Added, ...] = ()
+
+    @property
+    def last(self) -> tuple[FitTarget, Fit]:
+        """Target and fit with all steps."""
+        return (self.steps[-1].judge, self.steps[-1].fit) if self.steps else (self.judge, self.base)
+
+
+def describe(
+    problem: AuditProblem,
+    model: NamedModel,
+    held_out: HeldOut | None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Described | None:
+    """Where something acts that the library does not have, and by what law; None where nobody asks, or no time is left.
+
+    Args:
+        problem: with the ports of its simulator.
+        model: the base model, and what the library named.
+        held_out: predictions of unseen recordings by the base model and after each step; None without steps.
+        report: called with a line of words now and then.
+    """
+    if problem.ports is None or problem.compared is not None:
+        return None
+    answer: Described | None = None
+    clock = model.judge.forward.deadline
+    with clock.stage("ports and laws"), clock.reserve(), suppress(OutOfTime):
+        answer = _beside(problem, replace(model, steps=()), report)
+        if not model.steps:
+            return answer
+        names = tuple(step.name for step in model.steps)
+        seen = answer.held_out if answer.holds else None
+        if held_out is not None and seen is not None and seen.beside(held_out.after(len(names))).clear:
+            report(f"the law takes the place of {' and '.join(names)}")
+            return replace(answer, stand_ins=names)
+        further = _beside(problem, model, report)
+        if not further.holds:
+            return replace(answer, holds=False)
+        alone, answer = answer, further
+        answer = _without_stand_ins(problem, model, alone, further, report)
+    return answer
+
+
+def _without_stand_ins(
+    problem: AuditProblem, model: NamedModel, alone: Described, described: Described, report: Callable[[str], None]
+) -> Described:
+    """The law beside those mechanisms only that unseen recordings ask for once it is in the model.
+
+    What acts beside a named cause has stand-ins among the later ones. The law is looked for anew without these, and
+    kept if unseen recordings are not clearly likelier with them.
+
+    Args:
+        alone: the law beside the base model.
+        described: the law beside all of the model's mechanisms.
+    """
+    needed = _needed(problem, described)
+    gone = tuple(step.name for step in model.steps if step.name not in needed)
+    if not gone or described.held_out is None:
+        return described
+    report(f"with the law, unseen recordings do not ask for {' and '.join(gone)}: the law without them")
+    again = alone
+    if needed:
+        search, steps = ExtensionSearch(model.judge, problem.candidates, problem.rules, problem.seed), model.steps
+        for name in gone:
+            index = [step.name for step in steps].index(name)
+            steps = tuple(search.without(steps, index, model.base))
+        judge, fit = fit_with_noise(steps[-1].judge.measured, steps[-1].fit.x, steps[-1].fit.free)
+        again = _beside(problem, replace(model, steps=(*steps[:-1], replace(steps[-1], judge=judge, fit=fit))), report)
+    if not again.holds or again.held_out is None or described.held_out.beside(again.held_out).clear:
+        return described
+    return replace(again, stand_ins=gone)
+
+
+def _needed(problem: AuditProblem, described: Described) -> list[str]:
+    """Mechanisms beside a law without which unseen recordings are clearly less likely; the last one is asked first."""
+    assert described.last is not None
+    judge, fit, coordinates = described.last.target, described.last.fit, described.last.target.forward.coordinates
+    finer = DISCRETISATION in described.beside
+    needed: list[str] = []
+    for step in reversed(described.steps):
+        candidate = problem.candidate(step.name)
+        own = np.intersect1d(candidate.indices, fit.free) if candidate is not None else np.zeros(0, dtype=int)
+        if not own.size:  # the finer mesh, whose parameters are none
+            needed.append(step.name)
+            continue
+        start = fit.x.copy()
+        start[own] = coordinates.null[own]
+        less = climb(judge, start, np.setdiff1d(fit.free, own))
+        seen = predicted(problem, judge.measured, [JudgedModel(judge, each, finer) for each in (less, fit)])
+        if seen.count < 2 or seen.gain(0, 1).clear:
+            needed.append(step.name)
+        else:
+            fit = less
+    return needed
+
+
+def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], None]) -> Described:
+    """The law beside a model, and what it is worth on unseen recordings."""
+    simulator: Any = problem.lanes.simulator
+    assert problem.ports is not None
+    channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
+    target, fit = model.last
+    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups)
+    found = law_search(target, *options).find(target, fit)
+    if not found.terms:
+        return Described(found, model.steps)
+    stages = stages_of(model.judge, model.base, model.steps)
+    named = len(stages) - 1
+    stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
+    held_out = predicted(problem, model.judge.measured, stages)
+    if held_out.count < len(stages):
+        report(f"with {len(found.terms)} terms, an unseen recording cannot be simulated")
+        found = found.cut(max(held_out.count - 1 - named, 0))
+        if not found.terms:
+            return Described(found, model.steps)
+    # As with what the library names, a law is cut to what unseen recordings support.
+    kept = held_out.supported_from(named) - named or len(found.terms)
+    if kept < len(found.terms):
+        report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")
+    found, held_out = found.cut(kept), held_out.after(named + kept)
+    gain, overall = held_out.gain(named, named + kept), held_out.gain(0, named + kept)
+    return Described(found, model.steps, (), gain, overall, held_out, holds_on(problem.rules, gain))
+
+
+def holds_on(rules: Rules, gain: Gain) -> bool:
+    """Whether a law holds on unseen recordings: they are clearly likelier with it, and it explains more than a share of
+    the discrepancy that is next to nothing."""
+    return bool(gain.clear and not gain.worse and gain.interval[0] > rules.significant)
+
+
+def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
+    """Coefficients of a law: mean, deviation, quantiles and unit, by the model's normal approximation.
+
+    Shapes of features stand beside them; their deviation is None where they are not inferred.
+    """
+    if described.sizes is None:
+        return []
+    fit, target = described.sizes
+    coordinates, simulator = target.forward.coordinates, target.forward.lanes.simulator
+    unit = str(getattr(simulator, "command_unit", "m"))
+    draws = fit.draws(np.random.default_rng([seed, 7]), 1000, *coordinates.bounds)
+    values, rows = coordinates.values(draws), []
+    for refit in described.found.terms:
+        column = values[:, coordinates.names.index(refit.term.spec.name)]
+        shape = None if refit.term.shape is None else values[:, coordinates.names.index(refit.term.shape.name)]
+        rows.append(
+            {
+                "port": refit.term.port.name,
+                "group": refit.term.scope.group,
+                "feature": refit.term.feature.kind,
+                "coefficient": refit.term.spec.name,
+                "mean": float(column.mean()),
+                "sd": float(column.std()),
+                "q05": float(np.quantile(column, 0.05)),
+                "q95": float(np.quantile(column, 0.95)),
+                "unit": refit.term.spec.unit,
+                "shape": refit.term.feature.shape if shape is None else float(shape.mean()),
+                "shape_sd": None if shape is None else float(shape.std()),
+                "shape_unit": refit.term.feature.shape_unit(unit),
+                "left_out_gain": refit.gain.gain,
+                "left_out_share": refit.gain.share,
+                "score": refit.score,
+            }
+        )
+    return rows

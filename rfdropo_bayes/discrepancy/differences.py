@@ -1,0 +1,175 @@
+"""What may differ between groups of recordings, such as days: candidates of an audit that compares two of them, and of
+every audit of recordings that belong to groups.
+
+A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
+mechanism is there, or is larger, in one group only, or is absent there. A mechanism that all groups lack is a candidate
+as well, under its plain name: without it, an error of the base model would pass for a difference wherever it pays more
+in one group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+
+from rfdropo_bayes.bayes.pooling import deviation_spec
+from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
+from rfdropo_bayes.discrepancy.candidates import Candidate
+from rfdropo_bayes.discrepancy.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
+from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, families, stem
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+WHERE = "--between"
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Groups of recordings.
+
+    Attributes:
+        members: fitted and unseen recordings of each, by the group's name.
+        left_out: recordings that belong to none; where two groups are compared, these are not looked at.
+        compared: whether an audit asks for the differences between two groups, and for no others.
+        complements: recordings outside a group, by "all but NAME", where the fitted ones of them are no group.
+    """
+
+    members: Mapping[str, tuple[str, ...]]
+    left_out: tuple[str, ...] = ()
+    compared: bool = True
+    complements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the groups."""
+        return tuple(self.members)
+
+    @property
+    def shifted(self) -> tuple[str, ...]:
+        """Groups in which a value that all share may be another: of two groups without other recordings the second
+        alone, as the difference is the same, seen from either."""
+        return self.names[1:] if len(self.members) == 2 and not self.complements else self.names
+
+    def recordings(self, scope: str) -> tuple[str, ...]:
+        """Of a group, or of all groups but one."""
+        return self.members[scope] if scope in self.members else self.complements[scope]
+
+    def group_of(self, recording: str) -> str:
+        """The group of a recording; empty if it belongs to none."""
+        return next((name for name, own in self.members.items() if recording in own), "")
+
+
+@dataclass
+class _Space:
+    """Parameters that are found one after the other, and where each of them is."""
+
+    parameters: list[InferredParameter]
+
+    def add(self, parameter: InferredParameter) -> int:
+        self.parameters.append(parameter)
+        return len(self.parameters) - 1
+
+
+def with_differences(
+    space: ParameterSpace,
+    base: int,
+    simulated: Sequence[ParameterSpec],
+    library: Sequence[Candidate],
+    groups: Groups,
+    *,
+    spreads: Mapping[str, float],
+    held: Sequence[str] = (),
+) -> tuple[ParameterSpace, list[Candidate]]:
+    """Parameters and candidates, those that may differ between groups among them.
+
+    Args:
+        space: base parameters, then those of the library.
+        base: how many belong to the base model.
+        simulated: every parameter of the base simulator.
+        library: candidates that all groups may lack.
+        groups: of the recordings.
+        spreads: standard deviations between groups that the model states, by parameter [its unit].
+        held: parameters whose values are known, and which therefore do not differ.
+    """
+    found = _Space(list(space.parameters))
+    candidates = list(library)
+    shared = {p.spec.name: p for p in space.parameters[:base] if not p.recording}
+    free = {p.physical for p in space.parameters[:base] if p.recording}  # differ between recordings or groups already
+    places: dict[str, dict[str, int]] = {}  # by group, by parameter
+    known = {*held, *free}
+    specs = [spec for spec in simulated if spec.name not in known and (spec.name in shared or spec.prior)]
+    for spec in specs:
+        spread = np.sqrt(2.0) * spreads[spec.name] if spec.name in spreads else _deviation_of(spec, shared)
+        for group in groups.shifted if spec.name in shared else groups.names:
+            places.setdefault(group, {})[spec.name] = found.add(_difference(spec, spread, group, groups))
+    for group in groups.names:
+        own = places.get(group, {})
+        candidates += [_changed([spec], [own[spec.name]], group, groups) for spec in specs if spec.name in own]
+        for family in families([spec for spec in specs if spec.name in own]):
+            candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
+        candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
+    for scope in groups.complements:  # an effect of either sign is added to what all share, and so may be absent in one
+        candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
+    return ParameterSpace(tuple(found.parameters)), candidates
+
+
+def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) -> float:
+    """Standard deviation of a parameter's prior: what the model allows the parameter, it allows the difference."""
+    known = shared.get(spec.name)
+    prior = known.prior if known else prior_from_table(spec, dict(spec.prior), where=f"{WHERE} {spec.name}")
+    return float(np.std(np.asarray(prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
+
+
+def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> InferredParameter:
+    """What one group's value is off that of the others, Normal(0, ``spread``)."""
+    width = spec.high - spec.low
+    own = deviation_spec(spec, spread)._replace(low=-width, high=width)
+    prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
+    return InferredParameter(own, prior, group, dict(own.prior), groups.recordings(group), spec.name)
+
+
+def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
+    name = specs[0].name if len(specs) == 1 else stem(specs)
+    described = specs[0].description if len(specs) == 1 else f"{name.replace('_', ' ')} ({len(specs)} of them)"
+    elsewhere = next(name for name in groups.names if name != group) if groups.compared else "other groups"
+    cause = f"{described}: not the same in {group} as in {elsewhere}"
+    remedy = f"measure it in {group} and in {elsewhere}, and undo what changed"
+    change = OwnParameter(name, tuple(specs), cause, remedy)
+    return Candidate(f"{name}{SEPARATOR}{group}", tuple(places), change, name, group)
+
+
+def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Space) -> Candidate:
+    """A mechanism of the library in one group only. Shapes, which mean nothing where it is absent, are shared."""
+    parameters = [found.parameters[i] for i in candidate.indices]
+    sized = [(p.table or p.spec.prior).get("distribution") in MEASURED_FROM_NULL for p in parameters]
+    indices = []
+    for index, parameter, has_size in zip(candidate.indices, parameters, sized, strict=True):
+        if has_size:
+            indices.append(found.add(_of_one_group(parameter, group, groups)))
+        elif any(sized):
+            indices.append(index)
+        else:
+            spread = float(np.std(np.asarray(parameter.prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
+            indices.append(found.add(_difference(parameter.spec, spread, group, groups)))
+    return replace(candidate, name=f"{candidate.name}{SEPARATOR}{group}", indices=tuple(indices), group=group)
+
+
+def _one_sided(candidate: Candidate, found: _Space) -> bool:
+    """Whether a size of a mechanism has one sign only, so that nothing added to it takes it away."""
+    specs = [found.parameters[i].spec for i in candidate.indices]
+    return any(spec.low >= spec.nominal or spec.high <= spec.nominal for spec in specs)
+
+
+def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
+    """The size of a mechanism in one group, measured from its null value and added to what all share."""
+    spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
+    for key in ("loc", "low", "high"):
+        if key in table:
+            table[key] -= spec.nominal
+    low, high, grid = spec.low - spec.nominal, spec.high - spec.nominal, tuple(g - spec.nominal for g in spec.grid)
+    own = spec._replace(low=low, high=high, nominal=0.0, prior=table, grid=grid)
+    prior = prior_from_table(own, table, where=f"{WHERE} {spec.name}")
+    return InferredParameter(own, prior, group, table, groups.recordings(group), spec.name)

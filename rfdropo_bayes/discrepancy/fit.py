@@ -1,0 +1,548 @@
+"""Posterior modes of the base model and its extensions within bounds, with Laplace's evidence.
+
+Under a long recording the likelihood has many small summits, on which climbs of the whole end. The base model's optimum
+is looked for as `calibrate` looks for it: the climbs of `inference.find_modes` start at screened draws, and at short
+prefixes. `better_nearby` then asks rollouts, not derivatives, whether the summit that was found is one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.stats import norm
+
+from rfdropo_bayes.bayes.channels import Seen
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.problem import ProblemDefaults
+from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.forward import Fields, Forward
+from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
+from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
+from rfdropo_bayes.inference import Target as Climbed
+from rfdropo_bayes.simulators.finite_differences import usable_difference
+from rfdropo_bayes.simulators.protocol import Observation
+
+ALL = 40  # most steps of a climb to its end
+USUAL = 12  # steps of a climb, each with a Jacobian
+TOLERANCE = 0.01  # nats that a step promises at the end of a climb
+CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
+SEARCHED = 3  # steps of a climb of a search: of a linear model one or two, of the demonstration's arm five
+CLIMBED = 0.1  # nats that a step of a search's climbs promises at their end; the audit's own climb goes on from there
+POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
+ALONG = (4.0, 2.0, 1.0, 0.3)  # deviations of the posterior along its principal axes, likewise
+WITHIN = 0.5 * max(ALONG) ** 2  # nats that a step of slopes promises which is no longer than those tried
+FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A mode and the normal approximation around it.
+
+    Attributes:
+        x: coordinates of all parameters.
+        free: which of them were fitted.
+        residual: whitened, of all channels.
+        jacobian: of the whitened prediction with respect to the free coordinates.
+        covariance: of the free coordinates, prior included.
+        log_evidence: Laplace's, up to the noise's normaliser, which all models under one noise share; the prior counts
+            with its density and its curvature.
+        promise: what a Gauss-Newton step from here still promises [nat]; see `converged`.
+    """
+
+    x: Float[np.ndarray, " d"]
+    free: Int[np.ndarray, " free"]
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n free"]
+    covariance: Float[np.ndarray, "free free"]
+    log_evidence: float
+    promise: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether no step promises more than a nat, or more than what the accuracy of a large misfit allows."""
+        return self.promise < 1.0 + CLOSE * float(self.residual @ self.residual)
+
+    @property
+    def counted(self) -> float:
+        """How many independent values the residuals amount to, where rows that last count as fewer."""
+        return max(min(float(self.residual @ self.residual), len(self.residual)), np.e)
+
+    def draws(self, rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Draws of all coordinates, folded back at the bounds."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        z = rng.standard_normal((count, len(self.free))) * np.sqrt(np.maximum(values, 0.0))
+        points = np.repeat(self.x[None], count, axis=0)
+        points[:, self.free] += z @ vectors.T
+        points = np.where(points < low, 2 * low - points, np.where(points > high, 2 * high - points, points))
+        return np.clip(points, low, high)
+
+
+@dataclass(frozen=True)
+class FitTarget:
+    """What is fitted: measurements under a noise, by a simulator; ``journal`` keeps what was computed.
+
+    Where the noise is that of a model that is far off (see `inadequacy`), ``known`` is the same under the noise of the
+    measurement.
+    """
+
+    forward: Forward
+    measurements: Measurements
+    noise: Stacked
+    journal: Journal = field(default_factory=Journal)
+    known: FitTarget | None = None
+
+    @property
+    def measured(self) -> FitTarget:
+        """The same under the noise of the measurement."""
+        return self if self.known is None else self.known
+
+    def on(self, forward: Forward) -> FitTarget:
+        """The same with another simulator."""
+        known = None if self.known is None else replace(self.known, forward=forward)
+        return replace(self, forward=forward, known=known)
+
+    @cached_property
+    def identity(self) -> str:
+        """Digest of everything that a residual depends on beside the parameters."""
+        data = self.measurements
+        readings = [np.asarray(channel.measured) for channel in data.channels]
+        noise = [(part.scale, part.autocorrelation, part.correlation) for part in self.noise.parts]
+        known = [np.zeros(0) if array is None else array for part in noise for array in part]
+        return digest(self.forward.identity, *readings, data.count, *known, repr(data.weighed))
+
+    def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
+        """A computation with this target, looked up where the journal has it; its rollouts and seconds count either
+        way."""
+        before, looked_up = self.forward.rollouts, True
+
+        def counted() -> Arrays:
+            nonlocal looked_up
+            began, found, looked_up = time.monotonic(), compute(), False
+            seconds = np.asarray(time.monotonic() - began)
+            return {**found, "rollouts": np.asarray(self.forward.rollouts - before), "seconds": seconds}
+
+        found = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
+        self.forward.rollouts = before + int(found.pop("rollouts"))
+        seconds = float(found.pop("seconds", 0.0))
+        if looked_up:
+            self.forward.deadline.recall(seconds)
+        return found
+
+    def residual(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n m"]:
+        """Whitened residuals, measured less simulated, of a batch of points."""
+        return self.evaluate(points)[0]
+
+    def evaluate(
+        self, points: Float[np.ndarray, "n d"], rows: int | None = None
+    ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, " n"], np.ndarray]:
+        """Whitened residuals, the logarithms of the sizes that errors are relative to, and where rollouts ended well.
+
+        Only the first ``rows`` rows of every recording, all by default, are simulated; later ones hold no meaning.
+        Half the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.
+        """
+        shown, fine = self.forward.observe(points, rows)
+        each = [self._errors({name: part[i] for name, part in shown.items()}) for i in range(len(fine))]
+        white = self._whitened(np.stack([errors for errors, _ in each]), self.weighed(points)[0])
+        return np.where(fine[:, None], white, FAILED), np.array([float(size) for _, size in each]), fine
+
+    def log_likelihood(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        """Of a batch of points, up to the noise's normaliser; minus infinity where a rollout did not end well."""
+        white, sizes, fine = self.evaluate(points)
+        return np.where(fine, -0.5 * np.sum(white**2, axis=1) - sizes, -np.inf)
+
+    def errors(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, "group time column"]:
+        """Measured less simulated readings at one point, in the unit of the noise.
+
+        Raises:
+            InputError: a rollout there did not end well.
+        """
+        return np.asarray(self._errors(self.forward.observe_one(x))[0])
+
+    def shown_errors(self, shown: Fields, several: Sequence[str] = ()) -> Float[np.ndarray, "*many group time column"]:
+        """Measured less simulated readings, given what one point shows; of fields that have ``several`` values, each
+        in turn."""
+        if not several:
+            return np.asarray(self._errors(shown)[0])
+        axes = {name: 0 if name in several else None for name in shown}
+        return np.asarray(jax.vmap(lambda own: self._errors(own)[0], in_axes=(axes,))(shown))
+
+    def error_slopes(
+        self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
+    ) -> tuple[Float[np.ndarray, "k group time column"], Float[np.ndarray, " k"]]:
+        """Derivatives of the errors, and of the logarithms of sizes, along a direction at each point."""
+        if len(points) == 0:
+            return np.zeros((0, *self.measurements.count.shape)), np.zeros(0)
+        along = self.forward.tangents(points, directions)
+        if self._linear:  # what is shown enters errors as it is
+            shown = {name: np.zeros(part.shape[1:]) for name, part in along.items()}
+        slopes, at = [], np.zeros(0)
+        for k, point in enumerate(points):
+            tangent = {name: part[k] for name, part in along.items()}
+            if not self._linear and not np.array_equal(at, point):
+                shown, at = self.forward.observe_one(point), point
+            here = {name: jnp.asarray(shown[name], dtype=float) for name in tangent}
+            ahead = {name: jnp.asarray(part, dtype=float) for name, part in tangent.items()}
+            slopes.append(jax.jvp(self._errors, (here,), (ahead,))[1])
+        errors, sizes = zip(*slopes, strict=True)
+        return np.stack([np.asarray(part) for part in errors]), np.array([float(part) for part in sizes])
+
+    @property
+    def _linear(self) -> bool:
+        return all(channel.linear for channel in self.measurements.channels)
+
+    def _errors(self, shown: Fields) -> tuple[Float[jax.Array, "group time column"], Float[jax.Array, ""]]:
+        """Errors of all channels side by side at what one point shows, and the sum of logarithms of their sizes."""
+        seen = _seen(shown)
+        errors, sizes, channels = [], jnp.zeros(()), self.measurements.channels
+        for channel, own in zip(channels, self.measurements.columns, strict=True):
+            about = channel.expected(seen)
+            errors.append(channel.deviation(channel.measured, about))
+            size = channel.log_size(about, channel.measured)
+            if size is not None:
+                count = self.measurements.count[..., own]
+                sizes += jnp.sum(jnp.where(count > 0, size, 0.0))
+        return jnp.concatenate(errors, axis=-1), sizes
+
+    def _whitened(self, errors: np.ndarray, weighed: np.ndarray) -> np.ndarray:
+        return np.concatenate([self.measurements.whiten(errors, self.noise), weighed], axis=-1)
+
+    def weighed(
+        self, points: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"] | None = None
+    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+        """Residuals of the weighed parts, and what they lose along a direction at each point."""
+        parts, own = self.measurements.weighed, self.forward.coordinates
+        if parts is None:
+            return np.zeros((len(points), 0)), np.zeros((len(points), 0))
+        sums = np.array([[name in entry.parameters for name in own.names] for entry in parts.entries], dtype=float)
+        sd = np.array([entry.sd for entry in parts.entries])
+        left = (parts.measured - own.values(points) @ sums.T) / sd
+        along = np.zeros_like(points) if directions is None else own.slopes(points) * directions
+        return left, along @ sums.T / sd
+
+    def slopes(
+        self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
+    ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, " k"]]:
+        """Derivatives of the whitened prediction, and of the logarithms of sizes, along a direction at each point."""
+        errors, sizes = self.error_slopes(points, directions)
+        return self._whitened(-errors, self.weighed(points, directions)[1]), sizes
+
+    def jacobian(self, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> Float[np.ndarray, "m free"]:
+        """Derivatives of the whitened prediction."""
+        return self.slopes(np.repeat(x[None], len(free), axis=0), np.eye(len(x))[free])[0].T
+
+
+def _seen(shown: Fields) -> Seen:
+    parts = {name: shown.get(name) for name in Observation._fields}
+    return Seen(Observation(**{**parts, "status": 0}), shown, shown["offset"])  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Posterior(ProblemDefaults):
+    """The posterior over some coordinates, the others held, as inference methods see it; see `bayes.problem`.
+
+    A row is one row of every group of repeats, whitened given those before it. The noise is known.
+
+    Attributes:
+        target: what is fitted.
+        start: all coordinates.
+        free: those that are not held.
+    """
+
+    target: FitTarget
+    start: Float[np.ndarray, " d"]
+    free: Int[np.ndarray, " free"]
+    jacobian: str = "central"
+
+    @property
+    def _coordinates(self) -> Coordinates:
+        return self.target.forward.coordinates
+
+    @cached_property
+    def _parameters(self) -> tuple[InferredParameter, ...]:
+        return tuple(self._coordinates.space.parameters[i] for i in self.free)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters."""
+        return tuple(p.name for p in self._parameters)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of the parameters."""
+        return {p.name: p.spec.unit for p in self._parameters}
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Hard bounds."""
+        return {p.name: (p.spec.low, p.spec.high) for p in self._parameters}
+
+    @cached_property
+    def prior_ends(self) -> dict[str, tuple[float, float]]:
+        """Where each prior ends: on the hard bounds or between them."""
+        return {p.name: p.ends for p in self._parameters}
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the longest recording."""
+        return int(self.target.measurements.count.shape[1])
+
+    def place(self, u: Float[Any, "n free"]) -> Float[np.ndarray, "n d"]:
+        """Points of all coordinates, within their bounds."""
+        points = np.repeat(self.start[None], len(u), axis=0)
+        points[:, self.free] = np.asarray(u)
+        return np.clip(points, *self._coordinates.bounds)
+
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
+        """Independent prior draws."""
+        drawn = ParameterSpace(self._parameters).sample(key, n)
+        return {name: np.asarray(column, dtype=float) for name, column in drawn.items()}
+
+    def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n free"]:
+        """Coordinates of values."""
+        own = zip(self.free, self.names, strict=True)
+        return np.stack([self._coordinates.encode_one(i, np.asarray(values[name])) for i, name in own], axis=1)
+
+    def from_unconstrained(self, u: Float[Any, "n free"]) -> dict[str, Float[Any, " n"]]:
+        """Values of coordinates."""
+        values = self._coordinates.values(self.place(u))
+        return {name: values[:, i] for i, name in zip(self.free, self.names, strict=True)}
+
+    def log_prior(self, u: Float[Any, "n free"]) -> Float[Any, " n"]:
+        """Log prior density of the free coordinates."""
+        return self._coordinates.log_prior(self.place(u))[:, self.free].sum(axis=1)
+
+    @property
+    def prior_derivatives(self) -> tuple[Any, Any]:
+        """Gradient and Hessian of the log prior."""
+
+        def at(u: np.ndarray, order: int) -> np.ndarray:
+            return self._coordinates.prior_slopes(self.place(np.asarray(u)[None])[0])[order][self.free]
+
+        return (lambda u: at(u, 0)), (lambda u: np.diag(at(u, 1)))
+
+    def row_log_likelihood(
+        self, values: Mapping[str, Any], horizon: int
+    ) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
+        """Of each row given those before it, up to the noise's normaliser; status 1 for a rollout that was lost."""
+        white, weighed, fine = self._rows(values, horizon)
+        rows = -0.5 * np.sum(white**2, axis=(1, 3))
+        rows[:, 0] -= 0.5 * np.sum(weighed**2, axis=1)
+        return np.where(fine[:, None], rows, -np.inf), np.where(fine, 0, 1)
+
+    def residual_batch(self, values: Mapping[str, Any], horizon: int) -> Float[Any, "n m"]:
+        """Whitened residuals of a prefix."""
+        white, weighed, fine = self._rows(values, horizon)
+        return np.where(fine[:, None], np.concatenate([white.reshape(len(white), -1), weighed], axis=1), np.inf)
+
+    def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
+        """The same of one set of values."""
+        return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
+
+    def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals of a prefix, those of weighed parts, and where rollouts ended well.
+
+        What the sizes of relative errors add to the likelihood is left to the climb of the whole.
+        """
+        white, _, fine = self.target.evaluate(self.place(self.to_unconstrained(values)), horizon)
+        white = np.where(fine[:, None], white, 0.0)
+        series = self.target.measurements.series(white)
+        return series[:, :, :horizon], white[:, self.target.measurements.count.size :], fine
+
+    def whole(self) -> Climbed:
+        """All rows, as climbs want them: with the simulator's own derivatives, and those of the sizes of errors."""
+        known: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+        def at(u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            if u.tobytes() not in known:
+                known.clear()
+                x = self.place(u[None])
+                directions = np.eye(x.shape[1])[self.free]
+                slopes, sizes = self.target.slopes(np.repeat(x, len(self.free), axis=0), directions)
+                known[u.tobytes()] = self.target.residual(x)[0], -slopes.T, -sizes
+            return known[u.tobytes()]
+
+        def likelihood(u: np.ndarray) -> np.ndarray:
+            return self.target.log_likelihood(self.place(u))
+
+        low, high = self._coordinates.bounds
+        return Climbed(
+            lambda u: likelihood(u) + self.log_prior(u),
+            likelihood,
+            *self.prior_derivatives,
+            lambda u: at(u)[:2],
+            lambda u: self.target.residual(self.place(u)),
+            np.zeros(len(self.free), dtype=bool),
+            beside=lambda u: at(u)[2],
+            bounds=(low[self.free], high[self.free]),
+        )
+
+
+def climb(
+    target: FitTarget, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = ALL
+) -> Fit:
+    """Posterior mode over the free coordinates from one start, the others held."""
+
+    def compute() -> Arrays:
+        found = _climb(target, start, free, evaluations)
+        return {part.name: np.asarray(getattr(found, part.name)) for part in fields(Fit)}
+
+    found = target.recall("climb", [start, free, np.array(evaluations)], compute)
+    numbers = {name: float(found[name]) for name in ("log_evidence", "promise")}
+    return Fit(**{**found, **numbers})  # type: ignore[arg-type]
+
+
+def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
+    """A climb, and the normal approximation around where it ends."""
+    posterior = Posterior(target, start, free)
+    climbed = posterior.whole()
+    low, high = climbed.bounds
+    state, _ = maximise(climbed, np.clip(start[free], low, high), max_steps=evaluations, tolerance=TOLERANCE)
+    u, found = state.position, normal_at(climbed, state)
+    residual, jacobian = climbed.linearise(u)
+    spread = np.sqrt(np.diag(found.covariance))
+    # Only part of a peak at a bound is inside.
+    inside = np.log(np.maximum(norm.cdf((high - u) / spread) - norm.cdf((low - u) / spread), 1e-12))
+    slope, _ = climbed.quadratic(u)
+    slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
+    promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
+    evidence = found.log_evidence + float(np.sum(inside))
+    return Fit(posterior.place(u[None])[0], free, residual, -jacobian, found.covariance, evidence, promise)
+
+
+def climb_rollouts(target: FitTarget, parameters: int) -> int:
+    """Rollouts that a climb of so many parameters may take."""
+    forward = target.forward
+    return forward.count * USUAL * (1 + forward.lanes.slope_rollouts * parameters)
+
+
+def best_between(
+    target: FitTarget,
+    here: Float[np.ndarray, " d"],
+    there: Float[np.ndarray, " d"],
+    held: Sequence[int],
+    shares: Float[np.ndarray, " share"],
+) -> Float[np.ndarray, " d"]:
+    """The best point, at some shares of the way, between one and a linear extrapolation from it, which a large misfit
+    carries too far. Coordinates that are held, places and times, mean the same however large an effect is."""
+    coordinates = target.forward.coordinates
+    points = here + shares[:, None] * (there - here)
+    points[:, list(held)] = there[list(held)]
+    points = np.clip(points, *coordinates.bounds)
+    return points[int(np.argmax(heights(target, points, "shares")))]
+
+
+def heights(target: FitTarget, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
+    """Log posteriors of points, up to the noise's normaliser; kept in the journal by the name of ``what``."""
+
+    found = target.recall(what, [points], lambda: {"height": target.log_likelihood(points)})
+    return found["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
+
+
+def widened(target: FitTarget, fit: Fit) -> Fit:
+    """A fit as it is under priors no narrower than the sizes found: its point, its covariance, and its promise.
+
+    The prior of a candidate's size says what is usual, and decides whether the candidate is believed. Once it is, a
+    size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
+    prior deviation stay as they are. A first-order step would not do: where motion tells a ratio alone, such as that
+    of drag and modulus, the wider prior moves both far along a curve.
+
+    Args:
+        target: under which it was found.
+        fit: a mode.
+    """
+    own = target.forward.coordinates
+    factors = widening(fit, own)
+    if (factors == 1.0).all():
+        return fit
+    wide = target.on(target.forward.with_coordinates(own.widened(factors)))
+    found, unit = climb(wide, fit.x / factors, fit.free), factors[fit.free]
+    target.forward.rollouts = wide.forward.rollouts
+    x = np.clip(factors * found.x, *own.bounds)  # which the product misses by its last bit
+    return replace(fit, x=x, covariance=found.covariance * np.outer(unit, unit), promise=found.promise)
+
+
+def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
+    """By how much the scale of each prior is widened for a fit's sizes; 1 where it stays as it is."""
+    free = np.isin(np.arange(len(fit.x)), fit.free) & coordinates.affine
+    return np.where(free, np.maximum(np.abs(fit.x / coordinates.prior_sd), 1.0), 1.0)
+
+
+def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
+    """Where the best of `calibrate`'s climbs ends.
+
+    Raises:
+        NoLikelihoodError: all prior draws are lost.
+    """
+
+    def compute() -> dict[str, np.ndarray]:
+        own = target.forward.coordinates
+        posterior = Posterior(target, own.null, np.arange(own.base))
+        # Its normal approximation is not used: the coarse differences of short climbs suffice.
+        mode = find_modes(posterior, LaplaceConfig(tolerance=CLIMBED), key).modes[0]
+        return {"x": posterior.place(mode.mean[None])[0]}
+
+    return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
+
+
+def optimum_rollouts(target: FitTarget) -> int:
+    """Rollouts that `base_optimum` usually takes: draws that are screened, at each horizon, and climbs, of which the
+    better half goes on to the next."""
+    config, own = LaplaceConfig(), target.forward.coordinates
+    beginning, step = climb_cost(own.base, 0)
+    climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
+    return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))
+
+
+def poll_rollouts(target: FitTarget) -> int:
+    """Rollouts that `better_nearby` takes."""
+    return target.forward.count * (1 + 2 * (len(POLLED) + len(ALONG)) * target.forward.coordinates.base)
+
+
+def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> FitTarget:
+    """The target with derivatives over steps on whose scale its motion is smooth around a point.
+
+    Slopes over the steps of a ladder, in prior deviations, are compared, of all base parameters at once; rollouts say
+    which steps agree.
+    """
+    usual, coordinates = target.forward.lanes.difference, target.forward.coordinates
+    if usual is None:
+        return target
+    directions = np.diag(coordinates.prior_sd)[: coordinates.base]
+
+    def slope(step: float) -> np.ndarray:
+        points = np.clip(np.concatenate([x + step * directions, x - step * directions]), *coordinates.bounds)
+        found = target.recall("ladder", [points], lambda: {"residual": target.residual(points)})["residual"]
+        ahead, behind = np.split(found, 2)
+        return (ahead - behind) / (2.0 * step)
+
+    step = usable_difference(slope)
+    return target if step <= usual else replace(target, forward=target.forward.with_difference(step))
+
+
+def better_nearby(target: FitTarget, fit: Fit) -> Float[np.ndarray, " d"] | None:
+    """A point beside a fit that is clearly better; None where rollouts confirm that it is a summit.
+
+    Derivatives cannot tell: of a motion that is rough on the scale of their steps they are noise, and promise nothing.
+    """
+    coordinates = target.forward.coordinates
+    own = coordinates.prior_sd[fit.free]
+    values, vectors = np.linalg.eigh(fit.covariance / np.outer(own, own))
+    axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T * own
+    moves = [step * np.diag(own) for step in POLLED] + [step * axes for step in ALONG]
+    moved = np.concatenate([sign * move for move in moves for sign in (-1.0, 1.0)])
+    points = np.repeat(fit.x[None], 1 + len(moved), axis=0)
+    points[1:, fit.free] += moved
+    tried = np.clip(points, *coordinates.bounds)
+    height = heights(target, tried, "poll")
+    best = int(np.argmax(height))
+    return tried[best] if height[best] > height[0] + 1.0 + CLOSE * float(fit.residual @ fit.residual) else None

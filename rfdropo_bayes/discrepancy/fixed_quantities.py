@@ -1,0 +1,92 @@
+"""Parameters of a robot that a model holds at their nominal values, as candidates of an audit.
+
+The library has mechanisms; what a robot's own file describes and an experiment does not infer, such as the zeros of all
+cables, may be what its model lacks as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.discrepancy.candidates import Candidate
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+ZEROS = "initial_displacement"  # of cables, see `Robot`
+MEASURED = "offset_"  # of the frame: `camera_offset` is the library's name for it
+
+
+@dataclass(eq=False)
+class OwnParameter:
+    """A robot's own parameters as a candidate, with what a record asks of a mechanism."""
+
+    name: str
+    parameters: tuple[ParameterSpec, ...]
+    cause: str
+    remedy: str
+    stage: str = ""
+
+
+def with_fixed_quantities(
+    space: ParameterSpace, simulated: Sequence[ParameterSpec], known: Sequence[str]
+) -> tuple[ParameterSpace, list[Candidate]]:
+    """Parameters and candidates beyond those of the library.
+
+    One quantity at several places is asked for, and no other: a single value that is not inferred (a damping) is one
+    that the base model would have, were it to matter.
+
+    Args:
+        space: base parameters, then those of the library.
+        simulated: every parameter of the base simulator.
+        known: parameters whose values are known.
+    """
+    present = {*known, *(parameter.physical for parameter in space.parameters)}
+    absent = [spec for spec in simulated if spec.name not in present and spec.prior]
+    specs = [spec for spec in absent if not spec.name.startswith(MEASURED)]
+    parameters, candidates = list(space.parameters), []
+    for family in families(specs):
+        first = len(parameters)
+        for spec in family:
+            prior = prior_from_table(spec, dict(spec.prior), where=spec.name)
+            parameters.append(InferredParameter(spec, prior, "", dict(spec.prior)))
+        cause = f"{family[0].description}: not the nominal one"
+        own = OwnParameter(stem(family), tuple(family), cause, _remedy(family))
+        candidates.append(Candidate(own.name, tuple(range(first, len(parameters))), own, own.name))
+    return ParameterSpace(tuple(parameters)), candidates
+
+
+def _remedy(family: Sequence[ParameterSpec]) -> str:
+    """What to do at the robot."""
+    name = stem(family)
+    if name == ZEROS:
+        return (
+            "send zero to all drives, and turn each until its cable just begins to move the body; set the drive's zero "
+            "there, or infer initial_displacement in [model.priors]"
+        )
+    places = ", ".join(spec.name.removeprefix(f"{name}_").replace("_", " ") for spec in family)
+    return f"measure the {name.replace('_', ' ')} at each place ({places}), and state it in [model.fixed]"
+
+
+def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
+    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names; or
+    by their family, where a simulator tells it."""
+    alike: dict[str, list[ParameterSpec]] = {}
+    for spec in specs:
+        key = repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items())))
+        alike.setdefault(spec.family or key, []).append(spec)
+    return [found for found in alike.values() if found[0].family or (len(found) > 1 and stem(found))]
+
+
+def stem(specs: Sequence[ParameterSpec]) -> str:
+    """Their family, or what the names of several parameters begin with, in whole words."""
+    if specs[0].family:
+        return specs[0].family
+    words = zip(*(spec.name.split("_") for spec in specs), strict=False)
+    shared = []
+    for first, *others in words:
+        if any(other != first for other in others):
+            break
+        shared.append(first)
+    return "_".join(shared)

@@ -1,0 +1,374 @@
+"""Rollouts and their derivatives in batches of one size, so that two compilations serve a whole audit."""
+
+from __future__ import annotations
+
+import copy
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.batches import in_chunks
+from rfdropo_bayes.bayes.channels.object_pose import OFFSETS, Placing
+from rfdropo_bayes.discrepancy.coordinates import Coordinates
+from rfdropo_bayes.discrepancy.deadline import Deadline
+from rfdropo_bayes.discrepancy.journal import digest
+from rfdropo_bayes.errors import InputError, NoLikelihoodError
+from rfdropo_bayes.simulators.callbacks import distinct
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
+from rfdropo_bayes.simulators.protocol import Result, Simulator
+
+# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
+# computes what many lanes have in common once, be it padding or the value beside its slopes: of 16, 32, 48 and 64
+# lanes, 48 took the least time for the Jacobians of both real robots, two thirds of that of 16.
+WIDTH = 48
+NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
+
+Thetas = Float[np.ndarray, "lane physical"]
+Points = Float[np.ndarray, "n d"]
+Fields = dict[str, np.ndarray]
+"""Parts of an `Observation` by name, with a leading axis over lanes, or over points and recordings."""
+
+
+def _no_limit() -> None:
+    """No check of the time."""
+
+
+class Lanes:
+    """A simulator behind two compiled functions of a fixed number of lanes.
+
+    Args:
+        simulator: with the base model's mechanisms and every candidate at its null value.
+        marker_index: which of its markers are measured.
+        width: lanes of one call, the last of a batch being padded; None for what suits the engine.
+        slope_rollouts: what a derivative costs, that of the value included.
+        fields: parts of an observation that are data; beside the pose of an object it starts where it is told to.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        marker_index: np.ndarray,
+        width: int | None = None,
+        slope_rollouts: int = 3,
+        fields: Sequence[str] = ("position",),
+    ) -> None:
+        self.simulator = simulator
+        self.marker_index = marker_index
+        backend = getattr(getattr(simulator, "engine", None), "backend", None)
+        self.width = width or (NARROW if backend is not None and backend.name == "jax" else WIDTH)
+        self.slope_rollouts = slope_rollouts
+        self.fields = tuple(fields)
+        self.physical = tuple(spec.name for spec in simulator.parameters)
+
+    def _observe(
+        self, theta: jax.Array, start: jax.Array, commands: Commands, steps: jax.Array
+    ) -> tuple[dict[str, jax.Array], jax.Array]:
+        values: Any = dict(zip(self.physical, theta, strict=True))
+        if "object_pose" in self.fields:
+            assert isinstance(self.simulator, Placing)
+            values = self.simulator.with_object_at(values, start)
+        observation = self.simulator.rollout(values, commands, steps)
+        found = observation._replace(position=observation.position[:, self.marker_index])._asdict()
+        lacking = [name for name in self.fields if found[name] is None]
+        if lacking:
+            raise InputError(
+                f"the simulator does not tell its {lacking[0].replace('_', ' ')}",
+                where=f"[model] {lacking[0]}",
+                remedy="leave it out, or let its rollout return it",
+            )
+        status = found.pop("status")
+        return {name: part for name, part in found.items() if part is not None}, status
+
+    @property
+    def difference(self) -> float | None:
+        """Relative step of its derivatives; None where they are exact."""
+        engine: Any = getattr(self.simulator, "engine", None)
+        backend = getattr(engine, "backend", None)
+        if backend is None or backend.name != "numba":
+            return None
+        usual = FORWARD if backend.one_sided else DIFFERENCE[backend.precision]
+        return backend.difference or usual
+
+    def with_difference(self, step: float) -> Lanes:
+        """The same with central differences over another step."""
+        simulator: Any = self.simulator
+        backend = simulator.engine.backend._replace(difference=step)
+        return Lanes(simulator.with_backend(backend), self.marker_index, self.width, fields=self.fields)
+
+    @cached_property
+    def _rolled(self) -> Any:
+        return jax.jit(jax.vmap(self._observe, in_axes=(0, 0, 0, None)))
+
+    @cached_property
+    def _derived(self) -> Any:
+        def one(theta: jax.Array, tangent: jax.Array, start: jax.Array, commands: Commands) -> dict[str, jax.Array]:
+            def data(theta: jax.Array) -> dict[str, jax.Array]:
+                found, _ = self._observe(theta, start, commands, jnp.asarray(commands.step.shape[0]))
+                return {name: found[name] for name in self.fields}
+
+            return jax.jvp(data, (theta,), (tangent,))[1]
+
+        return jax.jit(jax.vmap(one))
+
+    def roll(
+        self,
+        theta: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+        steps: int | None = None,
+    ) -> tuple[Fields, np.ndarray]:
+        """What each set of parameters shows under the commands of its lane, and result codes.
+
+        ``start`` (lane, 7) are the poses that an object starts from. ``check`` is called before every batch, and may
+        raise. After ``steps`` time steps, all by default, rows hold no meaning.
+        """
+        limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
+        lanes = (theta, start, commands)
+        return in_chunks(lambda own: self._rolled(*own, limit), lanes, (self.width,), before=check)
+
+    def differentiate(
+        self,
+        theta: Thetas,
+        tangent: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+    ) -> Fields:
+        """Derivatives along tangents of those parts of an observation that are data."""
+        lanes = (theta, tangent, start, commands)
+        return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
+
+
+class RoutedLanes(Lanes):
+    """Two simulators of one model: a fast one for all that it can do, another for rollouts with further candidates.
+
+    Args:
+        fast: lanes of the simulator without these candidates.
+        slow: lanes of the simulator with all.
+        null: physical values at which the further candidates do nothing.
+    """
+
+    def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
+        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.slope_rollouts, slow.fields)
+        self.fast, self.slow = fast, slow
+        self._kept = np.array([self.physical.index(name) for name in fast.physical])
+        self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
+        self.null = null
+        self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    @property
+    def difference(self) -> float | None:
+        """See `Lanes.difference`."""
+        return self.fast.difference
+
+    def with_difference(self, step: float) -> Lanes:
+        """See `Lanes.with_difference`."""
+        return RoutedLanes(self.fast.with_difference(step), self.slow.with_difference(step), self.null)
+
+    def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
+        return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
+
+    def roll(
+        self,
+        theta: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+        steps: int | None = None,
+    ) -> tuple[Fields, np.ndarray]:
+        """See `Lanes.roll`."""
+
+        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> tuple[Fields, np.ndarray]:
+            return lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check, steps)
+
+        return self._routed(self._needs_slow(theta), run)
+
+    def differentiate(
+        self,
+        theta: Thetas,
+        tangent: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+    ) -> Fields:
+        """See `Lanes.differentiate`."""
+
+        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> Fields:
+            points, directions = theta[chosen][:, kept], tangent[chosen][:, kept]
+            return lanes.differentiate(points, directions, start[chosen], commands.of(chosen), check)
+
+        return self._routed(self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1), run)
+
+    def _routed(self, slow: np.ndarray, run: Callable[[Lanes, np.ndarray, Any], Any]) -> Any:
+        """What the two simulators find for the lanes that are theirs, put together again."""
+        routes = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
+        order = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes])
+        found = [run(lanes, np.flatnonzero(mask), kept) for mask, lanes, kept in routes if mask.any()]
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *found)
+
+
+class Forward:
+    """What a set of recordings should show, as a function of the audit's coordinates.
+
+    Args:
+        lanes: the simulator.
+        coordinates: what a point means.
+        commands: of the recordings, stacked.
+        chosen: which of these are simulated, by name.
+        rows: observations that are wanted of each; all by default.
+        deadline: of the rollouts; none by default.
+        start: poses (recording, 7) that an object starts from, where its poses are data.
+    """
+
+    def __init__(
+        self,
+        lanes: Lanes,
+        coordinates: Coordinates,
+        commands: Commands,
+        chosen: Mapping[str, int],
+        rows: int | None = None,
+        deadline: Deadline | None = None,
+        start: Float[np.ndarray, "recording 7"] | None = None,
+    ) -> None:
+        self.deadline = deadline or Deadline()
+        self.lanes = lanes
+        self.coordinates = coordinates
+        self.commands = _cut(commands.of(list(chosen.values())), rows)
+        self.recordings = tuple(chosen)
+        self.slots = coordinates.slots(self.recordings)
+        self.count = len(chosen)
+        self.start = np.zeros((self.count, 7)) if start is None else start
+        self.rollouts = 0
+        self.pace = 0.0  # seconds that a whole rollout took last, of different ones that fill a call
+
+    @cached_property
+    def identity(self) -> str:
+        """Digest of the simulator, its parameters with their priors, and the commands."""
+        own, simulator = self.coordinates, self.lanes.simulator
+        named = (simulator.description, own.names, own.base, sorted(own.fixed.items()), sorted(own.nominal.items()))
+        scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
+        prior = (own.prior_mean, own.prior_sd, *own.bounds)
+        return digest(
+            repr(named),
+            self.lanes.difference,
+            self.lanes.marker_index,
+            scale,
+            self.slots,
+            self.start,
+            self.lanes.fields,
+            *prior,
+            *map(np.asarray, self.commands[:4]),
+        )
+
+    def with_difference(self, step: float) -> Forward:
+        """The same with derivatives over another step."""
+        return self._with(lanes=self.lanes.with_difference(step))
+
+    def with_coordinates(self, coordinates: Coordinates) -> Forward:
+        """The same in other coordinates of the same parameters."""
+        return self._with(coordinates=coordinates)
+
+    def _with(self, **parts: Any) -> Forward:
+        changed = copy.copy(self)
+        changed.__dict__.pop("identity", None)
+        changed.__dict__.update(parts)
+        return changed
+
+    def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:
+        """What every recording shows at each point (point, recording, ...), and True where all rollouts ended well.
+
+        Only the first ``rows`` rows, all by default, are simulated; later ones hold no meaning.
+
+        Beside the parts of an observation there are ``offset`` [m], by which measured positions are shifted against
+        simulated ones, and the parameters that channels want and rollouts do not.
+        """
+        points = np.atleast_2d(points)
+        theta = self.coordinates.physical_values(points, self.slots)
+        flat, start, commands = self._per_lane(theta, points)
+        beside = np.repeat(self._beside(points), self.count, axis=0)
+        once, again = distinct([np.tile(np.arange(self.count), len(theta)), flat, beside])
+        began = time.monotonic()
+        every = self.commands.step.shape[1]
+        steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
+        found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check, steps)
+        # A call that is not full is filled with copies, which cost one engine nothing and the other as much as ever.
+        if steps is None and len(status) >= self.lanes.width:
+            self.pace = (time.monotonic() - began) / (-(-len(status) // self.lanes.width) * self.lanes.width)
+        self.rollouts += len(status)
+        status, found = status[again], {name: part[again] for name, part in found.items()}
+        found = self._as_seen(found, theta, points)
+        fine = status == Result.OK
+        for name in self.lanes.fields:
+            fine &= np.isfinite(found[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
+        shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()}
+        shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
+        return shown, fine.reshape(len(points), -1).all(axis=1)
+
+    def observe_one(self, point: Float[np.ndarray, " d"]) -> Fields:
+        """What every recording shows at one point.
+
+        Raises:
+            NoLikelihoodError: a rollout there did not end well.
+        """
+        found, fine = self.observe(point[None])
+        if not fine[0]:
+            words = "a rollout at the optimum did not end well"
+            raise NoLikelihoodError(words, where="audit", remedy=Result.DIVERGED.remedy)
+        return {name: part[0] for name, part in found.items()}
+
+    def tangents(self, points: Points, directions: Points) -> Fields:
+        """Derivatives of `observe`, of what is data, along a direction at each point; one-sided where a mechanism is so
+        at null."""
+        theta = self.coordinates.physical_values(points, self.slots)
+        tangent = self.coordinates.physical_tangents(points, directions, self.slots)
+        flat, start, commands = self._per_lane(theta, points)
+        along = tangent.reshape(flat.shape)
+        # Recordings that a direction does not touch, such as those of another group, stay as they are.
+        moved = np.flatnonzero(along.any(axis=1))
+        moved = moved if len(moved) else np.arange(1)
+        found = self.lanes.differentiate(
+            flat[moved], along[moved], start[moved], commands.of(moved), self.deadline.check
+        )
+        self.rollouts += self.lanes.slope_rollouts * len(moved)
+        shown = {}
+        for name, part in found.items():
+            every = np.zeros((len(flat), *part.shape[1:]))
+            every[moved] = np.nan_to_num(part)
+            shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
+        return shown | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+
+    def _offset(self, theta: np.ndarray) -> np.ndarray:
+        found = np.zeros((*theta.shape[:2], 3))
+        for axis, name in enumerate(OFFSETS):
+            if name in self.lanes.physical:
+                found[..., axis] = theta[..., self.lanes.physical.index(name)]
+        return found
+
+    def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
+        """What a rollout depends on beside the simulator's parameters."""
+        return np.zeros((len(points), 0))
+
+    def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
+        """What is measured of what rollouts show, one row a lane."""
+        return found
+
+    def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
+        """Parameters (point, recording, physical), starts and commands of each lane."""
+        lane = np.tile(np.arange(self.count), len(theta))
+        return theta.reshape(-1, theta.shape[-1]), self.start[lane], self.commands.of(lane)
+
+
+def _cut(commands: Commands, rows: int | None) -> Commands:
+    """The first observations only, and the steps that lead to them."""
+    observed = commands.sample_step[:, :rows]
+    last = int(observed.max()) + 1  # an observation may lie between two steps
+    return Commands(commands.initial, commands.step[:, :last], observed, commands.sample_fraction[:, :rows])

@@ -1,0 +1,265 @@
+"""Recordings that no fit has seen, as a model and its extensions predict them, and what they support."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
+from rfdropo_bayes.discrepancy.deadline import OutOfTime
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
+from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, measure_gain
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, spread
+from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.port_rollouts import with_laws_of
+from rfdropo_bayes.discrepancy.screen import Screen
+from rfdropo_bayes.errors import NoLikelihoodError
+
+DRAWS = 60
+HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
+
+
+def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
+    """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
+    as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
+    centre = target.errors(fit.x)
+    points = np.repeat(fit.x[None], len(fit.free), axis=0)
+    slopes, _ = target.error_slopes(points, np.eye(len(fit.x))[fit.free])
+    z = np.random.default_rng(seed).multivariate_normal(np.zeros(len(fit.free)), fit.covariance, DRAWS, method="eigh")
+    z -= z.mean(axis=0)
+    return UnseenErrors(centre + np.tensordot(z, slopes, axes=1))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Recordings that no fit has seen, as the base model and the model after each step predict them.
+
+    Attributes:
+        which: in words.
+        unseen: the measurements.
+        predictions: of the base model, then after each step.
+        patterns: what each of these models leaves where it was fitted, see `measure_gain`.
+        noise: of the measurements.
+        judges: the noise under which each of the models is judged, see `inadequacy`.
+        spreads: deviation of what each of them leaves, by column.
+        seed: of the gain's interval.
+    """
+
+    which: str
+    unseen: Unseen
+    predictions: list[UnseenErrors]
+    patterns: list[np.ndarray]
+    noise: Stacked
+    judges: list[Stacked]
+    spreads: list[np.ndarray]
+    seed: int
+
+    @property
+    def count(self) -> int:
+        """Models that predict; fewer than were asked where the motion of one of them ended."""
+        return len(self.predictions)
+
+    def gain(self, before: int, after: int) -> Gain:
+        """What the model after some steps is worth beside that after fewer."""
+        return self.after(after).beside(self.after(before))
+
+    def beside(self, other: HeldOut) -> Gain:
+        """What the last model is worth beside the last one of another sequence of steps."""
+        rng, judge, pattern = np.random.default_rng([self.seed, 4]), other.judges[-1], other.patterns[-1]
+        first, second, spread = other.predictions[-1], self.predictions[-1], self.spreads[-1]
+        return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
+
+    def after(self, steps: int) -> HeldOut:
+        """The same of no more than so many steps."""
+        parts = ("predictions", "patterns", "judges", "spreads")
+        return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
+
+    def supported(self) -> int:
+        """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
+        return self.supported_from(0)
+
+    def supported_from(self, first: int) -> int:
+        """The same of the steps after the first so many, which are taken as they are."""
+        last = first
+        for after in range(first + 1, len(self.predictions)):
+            if self.gain(last, after).clear:
+                last = after
+        return last
+
+
+def _without_carried(
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], held_out: HeldOut
+) -> tuple[list[Added], HeldOut]:
+    """Steps less those that were supported beside a later one only, and without which that one does as well.
+
+    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
+    it were the last step, must clearly predict unseen recordings better than the model without it. Where the time is
+    up, the steps stay that were supported together.
+    """
+    index, clock = 0, search.target.forward.deadline
+    with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
+        while index < len(steps) - 1:
+            if held_out.gain(index, index + 1).clear or steps[index].name == DISCRETISATION:
+                index += 1
+                continue
+            search.report(f"is {steps[index].name} needed? The model without it")
+            fewer = search.without(steps, index, base)
+            other = _predicted(problem, judge, search, base, fewer)
+            if other.count <= len(fewer) or held_out.beside(other).clear:
+                index += 1
+            else:
+                steps, held_out, index = fewer, other, 0
+    return steps, held_out
+
+
+def _held_out(
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
+) -> HeldOut | None:
+    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
+    was up."""
+    if not steps:
+        return None
+    search.report("measuring the gain on recordings that no fit has seen")
+    with search.target.forward.deadline.stage("gain"), suppress(OutOfTime):
+        return _predicted(problem, judge, search, base, steps)
+    return None
+
+
+class JudgedModel(NamedTuple):
+    """A model that predicts recordings which it has not seen.
+
+    Attributes:
+        judge: target under which it was fitted.
+        fit: the model.
+        finer: whether it runs on the finer simulator.
+    """
+
+    judge: FitTarget
+    fit: Fit
+    finer: bool
+
+
+def _predicted(
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
+) -> HeldOut:
+    """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
+    return predicted(problem, search.target.measured, stages_of(judge, base, steps))
+
+
+def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[JudgedModel]:
+    """The base model, and the model after each step."""
+    names = [step.name for step in steps]
+    after = [JudgedModel(step.judge, step.fit, DISCRETISATION in names[: k + 1]) for k, step in enumerate(steps)]
+    return [JudgedModel(judge, base, False), *after]
+
+
+def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedModel]) -> HeldOut:
+    """Predictions of models; ``target`` has the measurement's noise.
+
+    A model whose rollout of an unseen recording does not end well predicts nothing, and none after it is asked.
+
+    Raises:
+        NoLikelihoodError: the first model's rollout does not end well.
+    """
+    count, every = len(problem.trajectories), len(problem.model.recordings.names)
+    fits, judges = [stage.fit for stage in stages], [stage.judge for stage in stages]
+    if every > count:
+        which = "test recordings"
+        tested = measurements_of(problem, range(count, every))
+        unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
+        predictions = list[UnseenErrors]()
+        with _up_to_the_last(predictions):
+            for judge, fit, finer in stages:
+                forward = with_laws_of(judge.forward, simulated(problem, finer, tested, range(count, every)))
+                own = replace(target, forward=forward, measurements=tested)
+                predictions.append(_predict(own, fit, [problem.seed, 3]))
+    else:
+        which, unseen, predictions = _left_out(problem, judges, target, fits)
+    stages, judges = stages[: len(predictions)], judges[: len(predictions)]
+    patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit, _ in stages]
+    spreads, noises = [spread(judge, fit) for judge, fit, _ in stages], [judge.noise for judge in judges]
+    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
+
+
+@contextmanager
+def _up_to_the_last(predicted: Sequence[Any]) -> Iterator[None]:
+    """End where a model's rollout does not end well, with the models before it; an error where there are none."""
+    try:
+        yield
+    except NoLikelihoodError:
+        if not predicted:
+            raise
+
+
+def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:
+    position = np.asarray(tested.channels[0].measured)
+    names = tuple(" and ".join(recordings[i] for i in group) for group in tested.members)
+    return Unseen(position.reshape(*position.shape[:2], -1), valid, names, tested.steps)
+
+
+def _left_out(
+    problem: AuditProblem, judges: Sequence[FitTarget], target: FitTarget, fits: Sequence[Fit]
+) -> tuple[str, Unseen, list[UnseenErrors]]:
+    """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
+    the later rows of all from the earlier ones."""
+    measured = target.measurements
+    groups = len(measured.members)
+    kinds = problem.kinds(target.forward.recordings)
+    if min(kinds.count(kind) for kind in kinds) > 1:
+        held_out = "fitted recordings, each left out in turn"
+        masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
+    else:
+        held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"
+        masks = [later_rows(measured.valid)[:, :, None]]
+    parts = list[list[np.ndarray]]()
+    with _up_to_the_last(parts):
+        for judge, fit in zip(judges, fits, strict=True):
+            row = list[np.ndarray]()
+            for mask in masks:
+                count = np.where(mask, 0.0, judge.measurements.count)
+                kept = replace(judge.measurements, count=count)
+                refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
+                row.append(_predict(target.on(judge.forward), refitted, [problem.seed, 3]).errors)
+            parts.append(row)
+    draws = min(len(part) for row in parts for part in row)
+    predictions = []
+    for row in parts:
+        joined = np.zeros((draws, *measured.count.shape))
+        for mask, part in zip(masks, row, strict=True):
+            joined = np.where(mask, part[:draws], joined)
+        predictions.append(UnseenErrors(joined))
+    valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
+    return held_out, _unseen(measured, valid, problem.model.recordings.names), predictions
+
+
+def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray, "group time"]:
+    """Rows of every recording that come after the share of its measured ones that is fitted, wherever its gaps are."""
+    seen = np.asarray(valid.any(axis=2))
+    before: np.ndarray = np.cumsum(seen, axis=1) - seen
+    return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
+
+
+def supported_steps(
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], last: Screen
+) -> tuple[list[Added], Screen, HeldOut | None]:
+    """The steps that recordings which no fit has seen support, all of them where these support none; the screen
+    of the model with them; and the predictions of these recordings."""
+    held_out = _held_out(problem, judge, search, base, steps)
+    if held_out is not None and held_out.count <= len(steps):
+        name = steps[held_out.count - 1].name
+        search.report(f"with {name}, an unseen recording cannot be simulated: it is not supported")
+        steps, last = steps[: held_out.count - 1], steps[held_out.count - 1].before
+        if not steps:
+            return steps, last, None
+    if held_out is None or not (kept := held_out.supported()):
+        return steps, last, held_out
+    last = steps[kept].before if kept < len(steps) else last
+    steps, held_out = _without_carried(problem, judge, search, base, steps[:kept], held_out.after(kept))
+    return steps, last if len(steps) == kept else search.tested(steps[-1].fit, len(steps)), held_out

@@ -1,0 +1,136 @@
+"""How a model is judged that is far off: as `calibrate` judges it, by white noise of the size of its residuals.
+
+Under the noise of the measurement, whatever moves the markers brings thousands of nats to a model that is far off: no
+prior has a say, and noise with memory weighs a wrong increment above a wrong pose. While a model leaves more than
+`POOR` times the noise's variance, it is fitted and extended under noise of the size of what it leaves, and a row
+counts by how long that lasts. Repeats do not make the error of a model smaller: a mean of five counts once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
+from rfdropo_bayes.inference import lasting_series
+
+POOR = 2.0  # squared residual per value, in the noise's variance, from which on a model is far off
+ROUNDS = 6  # of noise and fit in turn
+SETTLED = 0.1  # relative change of the noise between rounds
+
+
+def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
+    """Whether a model leaves more than `POOR` times the variance of the measurement's noise."""
+    known = target.measured
+    if known.noise.source == RESIDUALS:  # of the model itself
+        return False
+    residual = known.recall("left", [x], lambda: {"residual": known.residual(x[None])[0]})["residual"]
+    return bool(residual @ residual > POOR * np.count_nonzero(residual))
+
+
+def fit_with_noise(
+    known: FitTarget, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
+) -> tuple[FitTarget, Fit]:
+    """The target under which a model is judged, and its fit, climbed from a point."""
+    if not far_off(known, x):
+        return known, climb(known, x, free)
+    judge = _under(known, known.errors(x))
+    for _ in range(ROUNDS):
+        fit = climb(judge, x, free)
+        if not far_off(known, fit.x):
+            return known, climb(known, fit.x, free)
+        before, x = judge, fit.x
+        judge = _under(known, _errors(judge, fit.residual), _shares(judge, fit))
+        if np.all(np.abs(judge.noise.scale / before.noise.scale - 1.0) < SETTLED):
+            break
+    return judge, climb(judge, x, free)
+
+
+def as_measured(judge: FitTarget, fit: Fit) -> Fit:
+    """A fit with residuals and slopes in deviations of the measurement's noise; its covariance stays."""
+    return fit if judge.known is None else seen_under(judge, judge.known, fit)
+
+
+def seen_under(judge: FitTarget, other: FitTarget, fit: Fit) -> Fit:
+    """A fit with residuals and slopes in deviations of the noise of another target; its covariance stays. One that is
+    judged by the noise of the measurement is no model that is far off, and stays as it is."""
+    if judge.known is None or judge.noise is other.noise:
+        return fit
+
+    def whitened(white: np.ndarray) -> np.ndarray:
+        weighed = white[..., other.measurements.count.size :]
+        return np.concatenate([rewhitened(judge, other, white), weighed], axis=-1)
+
+    promise = fit.promise if fit.converged else np.inf
+    return replace(fit, residual=whitened(fit.residual), jacobian=whitened(fit.jacobian.T).T, promise=promise)
+
+
+def rewhitened(
+    judge: FitTarget, other: FitTarget, white: Float[np.ndarray, "*batch n"]
+) -> Float[np.ndarray, "*batch m"]:
+    """Residuals of the channels under the white noise of a judge, in deviations of the noise of another target."""
+    return other.measurements.whiten(_errors(judge, white), other.noise)
+
+
+def judged_anew(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
+    """Target and fit of a model that has got better: where its judge took it for far off, under the noise of what it
+    leaves now."""
+    return (target, fit) if target.known is None else fit_with_noise(target.known, fit.x, fit.free)
+
+
+def noise_share(judge: FitTarget) -> float:
+    """Mean square of the measurement's noise in deviations of a judge's noise; 1 where the model is not far off."""
+    if judge.known is None:
+        return 1.0
+    known = judge.known.measurements
+    variance = (judge.known.noise.scale / judge.noise.scale) ** 2 / np.maximum(known.count, 1.0)
+    return float(np.mean(variance[known.valid]))
+
+
+def spread(judge: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:
+    """Deviation of what a fit leaves of each column: that of the measurement's noise, unless the model is far off."""
+    return judge.noise.scale if judge.known is None else _sizes(judge, _errors(judge, fit.residual))
+
+
+def _errors(judge: FitTarget, white: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch group time column"]:
+    """Errors of which the white noise of a judge makes these residuals."""
+    return judge.measurements.series(white) * judge.noise.scale
+
+
+def _sizes(target: FitTarget, errors: Float[np.ndarray, "group time column"]) -> Float[np.ndarray, " column"]:
+    """Root mean square of errors, one for all columns of a channel."""
+    valid, sizes = target.measurements.valid, np.empty(errors.shape[-1])
+    for own in target.measurements.columns:
+        sizes[own] = np.sqrt(np.mean(errors[..., own][valid[..., own]] ** 2))
+    return sizes
+
+
+def _shares(judge: FitTarget, fit: Fit) -> list[float]:
+    """What a row of each channel counts, see `lasting_series`."""
+    measured = judge.measurements
+    errors = _errors(judge, fit.residual)
+    series = np.where(measured.valid, errors / _sizes(judge, errors), 0.0)
+    reach = measured.series((fit.jacobian @ np.linalg.cholesky(fit.covariance)).T)
+    steps = measured.steps
+    return [
+        lasting_series(series[..., own], measured.valid[..., own], reach[..., own], steps).share
+        for own in measured.columns
+    ]
+
+
+def _under(
+    known: FitTarget, errors: Float[np.ndarray, "group time column"], shares: Sequence[float] | None = None
+) -> FitTarget:
+    """The target under white noise of the size of errors, over the root of what a row counts."""
+    measured, parts, sizes = known.measurements, [], _sizes(known, errors)
+    for own, share in zip(measured.columns, shares or [1.0] * len(measured.columns), strict=True):
+        parts.append(Autoregression(sizes[own] / np.sqrt(share), np.ones(1), MISFIT, np.inf))
+    firsts = tuple((group[0],) for group in measured.members)
+    once = replace(measured, count=np.minimum(measured.count, 1.0), members=firsts)
+    return replace(known, noise=Stacked(tuple(parts)), measurements=once, known=known)

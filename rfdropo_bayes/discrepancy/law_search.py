@@ -1,0 +1,663 @@
+"""By what law something acts at a port: terms are chosen by recordings that they are not fitted to, and refitted.
+
+One term at a time: every feature at every port is fitted together with the base parameters, linearly, to all recordings
+but one, and predicts that one. The best are refitted without linearisation. Then the next term is looked for in what is
+left. Choosing several terms before the first refit lets false ones in.
+
+Ports and terms are judged under the noise that candidates of the library are judged under: where the model is far off,
+that of what it leaves (see `inadequacy`), taken anew after each term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.discrepancy.deadline import OutOfTime
+from rfdropo_bayes.discrepancy.differences import Groups
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
+from rfdropo_bayes.discrepancy.inadequacy import judged_anew
+from rfdropo_bayes.discrepancy.port_evidence import PortEvidence, evidences
+from rfdropo_bayes.discrepancy.port_responses import (
+    Responses,
+    feature_columns,
+    responses,
+    signal_sizes,
+    under,
+    with_exact_columns,
+)
+from rfdropo_bayes.discrepancy.port_rollouts import (
+    EVERYWHERE,
+    PREFIX,
+    FeatureTable,
+    PlacedTerm,
+    PortedForward,
+    Scope,
+    coefficient_name,
+    placed,
+)
+from rfdropo_bayes.discrepancy.screen import null_residuals
+from rfdropo_bayes.mechanisms.features import Feature, dictionary, own_dictionary
+from rfdropo_bayes.mechanisms.ports import Port, PortMap
+
+LEAST = 0.01
+"""Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
+BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
+EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
+FRESH = 3  # terms that are refitted in each round
+GLANCE = 4  # steps of a refit that only ranks
+TIED = 10.0  # nats by which a refit must be worse to be told apart from the best
+PIECES = 3  # parts of a single recording, which are left out in turn
+NULLS = 199  # simulated data sets behind the p-values of ports
+COLLINEAR = 1e-6  # share of a column that the base parameters must leave
+
+
+@dataclass(frozen=True)
+class TermGain:
+    """One feature at one port, fitted linearly together with the base parameters.
+
+    Attributes:
+        port, feature, scope: which, and in which recordings.
+        gain: of log density of left-out recordings [nat].
+        share: of what is left beyond the noise there.
+        size: of the coefficient; sd: its deviation.
+        typical: root mean square of the feature.
+    """
+
+    port: Port
+    feature: Feature
+    gain: float
+    share: float
+    size: float
+    sd: float
+    typical: float
+    scope: Scope = EVERYWHERE
+
+    @property
+    def place(self) -> tuple[Port, Feature, str]:
+        """See `PlacedTerm.place`."""
+        return self.port, self.feature, self.scope.group
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A model with one more term, refitted.
+
+    Attributes:
+        term: the last one.
+        target, fit: the model.
+        gain: see `TermGain`.
+        score: nats that the term brings, less what a parameter and the choice among many cost. It says whether the term
+            is needed; its coefficient over its deviation does not: cables leave the common scale of stiffness and
+            forces free, so that every force is as uncertain as Young's modulus, however large its effect.
+    """
+
+    term: PlacedTerm
+    target: FitTarget
+    fit: Fit
+    gain: TermGain
+    score: float
+
+    @property
+    def shape(self) -> float | None:
+        """Shape of the term's feature; None where it is not inferred."""
+        if self.term.shape is None:
+            return None
+        coordinates = self.target.forward.coordinates
+        return float(coordinates.values(self.fit.x[None])[0, coordinates.names.index(self.term.shape.name)])
+
+    @property
+    def feature(self) -> Feature:
+        """The term's feature, in the shape that it has in the fit."""
+        return self.term.feature if self.shape is None else self.term.feature.in_shape(self.shape)
+
+    @property
+    def square(self) -> float:
+        """Sum of squares that the model leaves, in deviations of the noise that it was fitted under."""
+        return float(self.fit.residual @ self.fit.residual)
+
+
+@dataclass(frozen=True)
+class FoundLaw:
+    """What the search for laws found around one model.
+
+    Attributes:
+        map: all ports.
+        ports: evidence of every port before the first term.
+        terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
+        ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
+        afterwards: largest log evidence of any port with each term and those before it in the model.
+        centre: times of the ports' signals [s] from the recordings' first rows on; of recordings whose commands begin
+            before these by different times, from their median on.
+        gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
+        offered: largest gain [nat] of any feature at any port before the first term; 0 where none brings anything.
+    """
+
+    map: PortMap
+    ports: list[PortEvidence]
+    terms: list[Refit]
+    ties: list[Refit]
+    afterwards: list[PortEvidence]
+    centre: Float[np.ndarray, " spline"]
+    gate: float | None
+    offered: float
+
+    @property
+    def last(self) -> Refit | None:
+        """The model with all terms."""
+        return self.terms[-1] if self.terms else None
+
+    @property
+    def after(self) -> PortEvidence | None:
+        """Largest log evidence of any port once the law is in the model; None without a law."""
+        return self.afterwards[-1] if self.terms else None
+
+    def cut(self, terms: int) -> FoundLaw:
+        """The law of the first so many terms."""
+        return replace(self, terms=self.terms[:terms], afterwards=self.afterwards[:terms])
+
+    @property
+    def rivals(self) -> list[Refit]:
+        """The first term, and what is tied with it; empty without a law."""
+        return [*self.terms[:1], *self.ties]
+
+    def significant(self, family: float) -> list[PortEvidence]:
+        """Ports where something acts."""
+        return [row for row in self.ports if row.adjusted_p <= family and row.log_evidence > 0.0]
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data; the
+    pull of the priors is that of the first data set."""
+
+    jj: Float[np.ndarray, "piece d d"]
+    jx: Float[np.ndarray, "piece d feature"]
+    xx: Float[np.ndarray, "piece feature"]
+    jy: Float[np.ndarray, "piece d data"]
+    xy: Float[np.ndarray, "piece feature data"]
+    yy: Float[np.ndarray, "piece data"]
+    count: Float[np.ndarray, " piece"]
+    pull: Float[np.ndarray, " d"]
+
+
+def _pieces(array: Float[np.ndarray, "group value *rest"]) -> Float[np.ndarray, "piece value *rest"]:
+    """Recordings, or parts of a single one."""
+    if len(array) > 1:
+        return array
+    length = array.shape[1] // PIECES
+    return array[0, : PIECES * length].reshape(PIECES, length, *array.shape[2:])
+
+
+def _sums(
+    found: Responses,
+    columns: Float[np.ndarray, "group value feature"],
+    null: Float[np.ndarray, "group value draw"] | None = None,
+) -> _Sums:
+    """Of the residual, and after it of simulated ones."""
+    j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)[..., None]
+    count = found.noise * np.count_nonzero(y[..., 0], axis=1)
+    if null is not None:
+        y = np.concatenate([y, _pieces(null)], axis=-1)
+    return _Sums(
+        np.swapaxes(j, 1, 2) @ j,
+        np.swapaxes(j, 1, 2) @ x,
+        np.einsum("pvf,pvf->pf", x, x),
+        np.swapaxes(j, 1, 2) @ y,
+        np.swapaxes(x, 1, 2) @ y,
+        np.sum(y**2, axis=1),
+        count,
+        np.zeros(j.shape[2]) if found.pull is None else found.pull,
+    )
+
+
+def left_out_gains(
+    sums: _Sums, precision: Float[np.ndarray, "d d"] | None = None
+) -> tuple[Float[np.ndarray, "feature data"], np.ndarray, np.ndarray, np.ndarray]:
+    """Gain [nat] of every feature in every data set, each alone beside the base parameters; of the first data set also
+    share, size and deviation.
+
+    A piece that is left out is predicted by base parameters of which the other pieces leave some unknown: r ~ N(0, S),
+    S = 1 + J A^-1 J' with A the precision that the others give. A gain is half of what a feature takes from r' S^-1 r.
+    Counted as r'r, it would mostly be what a feature happens to take from the error of base parameters that this piece
+    alone determines, and no refit brings it.
+
+    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, and it
+    pulls at the parameters where they are not at its centre, unless more is known of them.
+    """
+    before, gain = 0.0, np.zeros(sums.xy.shape[1:])
+    held = np.eye(sums.jj.shape[1]) if precision is None else precision
+    whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
+    if precision is None:
+        whole[3][:, 0] -= sums.pull
+    inverse = np.linalg.inv(whole[0] + held)
+    for p in range(len(sums.yy)):
+        own = (sums.jj[p], sums.jx[p], sums.xx[p], sums.jy[p], sums.xy[p])
+        others = [every - part for every, part in zip(whole, own, strict=True)]
+        b, u, c, _ = _solved(others, held)
+        left_j, left_jx = sums.jy[p] - sums.jj[p] @ b, sums.jx[p] - sums.jj[p] @ u
+        along = sums.xy[p] - sums.jx[p].T @ b - u.T @ left_j - left_jx.T @ inverse @ left_j
+        square = sums.xx[p] - np.sum(u * (sums.jx[p] + left_jx), axis=0) - np.sum(left_jx * (inverse @ left_jx), axis=0)
+        gain += 2.0 * c * along - c**2 * square[:, None]
+        first, own_j = left_j[:, 0], sums.jy[p, :, 0]
+        before += sums.yy[p, 0] - float(b[:, 0] @ (own_j + first)) - float(first @ inverse @ first) - sums.count[p]
+    _, _, size, sd = _solved(whole, held)
+    return 0.5 * gain, gain[:, 0] / max(before, 1e-300), size[:, 0], sd
+
+
+def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Base parameters alone, what they take of every feature, and each feature's coefficients and deviation."""
+    jj, jx, xx, jy, xy = sums
+    prior = jj + precision
+    b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
+    left = xx - np.sum(u * jx, axis=0)
+    seen = left > COLLINEAR * np.maximum(xx, 1e-300)
+    safe = np.where(seen, left, 1.0)
+    c = np.where(seen[:, None], (xy - u.T @ jy) / safe[:, None], 0.0)
+    return b, u, c, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
+
+
+class LinearModel(NamedTuple):
+    """A model, linear around its fit, beside which further terms are ranked.
+
+    Attributes:
+        known: target of the simulator without a law.
+        terms: of the law that the model has.
+        fit: the model.
+        found: responses, with the residual and the slopes of the fit.
+        precision: of the base parameters, see `left_out_gains`.
+    """
+
+    known: FitTarget
+    terms: Sequence[Refit]
+    fit: Fit
+    found: Responses
+    precision: Float[np.ndarray, "d d"] | None = None
+
+
+@dataclass
+class LawSearch:
+    """The search for a law beside a fitted model.
+
+    Attributes:
+        ports: of the simulator.
+        table: features of the commands, and of the motion for ports of the body.
+        own: features of a cable's own command, for ports of several cables.
+        units: names of the commands, and their unit.
+        seed: of simulated data sets.
+        family: probability that a port is named where nothing is hidden.
+        report: called with a line of words.
+        most: terms that a law may have; None leaves their number to the recordings.
+        taken: names of coefficients that the model has, of laws that an earlier audit found.
+        scopes: recordings in which a law may act: all, and those of each group.
+    """
+
+    ports: PortMap
+    table: FeatureTable
+    own: Sequence[Feature]
+    units: tuple[tuple[str, ...], str]
+    seed: int
+    family: float
+    report: Callable[[str], None] = lambda line: None
+    most: int | None = None
+    taken: frozenset[str] = frozenset()
+    scopes: tuple[Scope, ...] = (EVERYWHERE,)
+
+    def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
+        """Where something acts that the model lacks, and by what law.
+
+        Args:
+            target: under which the model was fitted.
+            fit: the model.
+            forced: whether a first term is looked for though no port is significant.
+        """
+        known = target
+        found = responses(known, fit, self.ports, self.table, self.report)
+        values = self._values(found)
+        null = self._null(known, fit, found)
+        where = evidences(found, null)
+        first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
+        afterwards: list[PortEvidence] = []
+        offered = 0.0
+        try:
+            while len(terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not terms)):
+                if not terms:
+                    found = self._sharpened(known, fit, found, values, where)
+                    offered = next((row.gain for row in self._ranked(found, values, 0.0)), 0.0)
+                gates.append(self._gate(found, values, null))
+                ranked = self._ranked(found, values, gates[-1], terms=terms)
+                model = LinearModel(known, terms, fit, found)
+                chosen = self._confirmed(model, ranked, gates[-1], partial(leading_terms, where=where))
+                refits = self._refits(known, terms, fit, chosen)
+                if not refits or refits[0].score <= 0.0:
+                    break
+                best, others = self._exchanged(known, terms, found, values, refits, gates[-1], where)
+                if best.score <= 0.0:
+                    break
+                ties = ties if terms else _tied(best, others)
+                best = self._shaped(known, terms, best)
+                judge, fit = judged_anew(best.target, best.fit)
+                anew = judge is not best.target
+                best = replace(best, target=judge, fit=fit)
+                terms.append(best)
+                found, known = under(found, known, judge), judge.on(target.forward)
+                found = _relinearised(known, found, fit)
+                null = self._null(known, fit, found)
+                where = evidences(found, null)
+                afterwards.append(where[0])
+                self._say(best, where[0])
+                if anew and len(terms) == 1:
+                    ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
+        except OutOfTime:
+            self.report("the time was up before the law was found")
+        # The time may be up between a term and what is left beside it.
+        terms, gate = terms[: len(afterwards)], next(iter(gates), None)
+        centre = found.basis.centre - found.begun
+        return FoundLaw(self.ports, first, terms, ties, afterwards, centre, gate, offered)
+
+    def _sharpened(
+        self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
+    ) -> Responses:
+        """Responses with exact columns at the ports that lead by evidence or gain, and at all that need no rollouts."""
+        by_gain = dict.fromkeys(row.port for row in self._ranked(found, values, 0.0))
+        leading = [row.port for row in where[:BY_EVIDENCE]] + list(by_gain)[:BY_GAIN]
+        chosen = [p for p in self.ports.ports if p.stage == "sensing" or p in leading]
+        return with_exact_columns(known, fit, found, {port: self._offered(port, values)[1] for port in chosen})
+
+    def _values(self, found: Responses) -> Float[np.ndarray, "group feature row"]:
+        """All features of the commands, then those of the motion."""
+        values = self.table.over(found.levels)
+        return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
+
+    def _has(self, port: Port, feature: Feature, group: str) -> bool:
+        """Whether a law of the model has this term."""
+        return bool(self.taken) and coefficient_name(port, feature, self.units[0], group) in self.taken
+
+    def _features(self, port: Port) -> Sequence[Feature]:
+        """What a law at a port may be made of: on a body of the motion, too."""
+        if self.ports.members(port) != (port,):
+            return self.own
+        return (*self.table.features, *self.table.of_motion) if port.stage == "body" else self.table.features
+
+    def _offered(self, port: Port, values: Float[np.ndarray, "group feature row"]) -> tuple[np.ndarray, np.ndarray]:
+        """Sizes of a port's features, and the features over their sizes (group, feature, member, row)."""
+        place = {feature: k for k, feature in enumerate((*self.table.features, *self.table.of_motion))}
+        own = [[place[f.of(m.number)] for m in self.ports.members(port)] for f in self._features(port)]
+        signals = values[:, np.array(own)]
+        sizes = signal_sizes(signals)
+        return sizes, signals / np.maximum(sizes, 1e-300)[:, None, None]
+
+    def _say(self, best: Refit, where: PortEvidence) -> None:
+        names = self.units[0]
+        law = f"{best.term.port.words}: {best.feature.formula(names)}{in_words(best.term.scope)}"
+        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
+
+    def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
+        """Whitened residuals of simulated data sets that lack nothing."""
+        rng = np.random.default_rng([self.seed, 6])
+        draws = null_residuals(known.measurements, known.noise, found.base, len(fit.free), rng, NULLS)
+        return draws[:, : found.residual.size]
+
+    def _gate(self, found: Responses, values: np.ndarray, null: Float[np.ndarray, "draw n"]) -> float:
+        """Gain [nat] that the best of all features at all ports has in a share `family` of data sets that lack
+        nothing."""
+        series = np.moveaxis(null.reshape(-1, *found.residual.shape), 0, 2)
+        most = np.full(len(null), -np.inf)
+        for port in self.ports.ports:
+            for _, columns in self._scoped(found, feature_columns(found, port, self._offered(port, values)[1])):
+                most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
+        return float(np.quantile(most, 1.0 - self.family, method="higher"))
+
+    def _ranked(
+        self, found: Responses, values: np.ndarray, gate: float, precision: Float[np.ndarray, "d d"] | None = None,
+        terms: Sequence[Refit] = (),
+    ) -> list[TermGain]:  # fmt: skip
+        """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`.
+
+        Terms that the law has are none of them, nor those of a law that is in the model already: where a port is far
+        from linear, they would bring something again. A term whose shape is inferred has every shape.
+        """
+        rows = []
+        had = {refit.term.place for refit in terms}
+        had |= {_of_any_shape(refit.term.place) for refit in terms if refit.term.shape}
+        for port in self.ports.ports:
+            features, (sizes, signals) = self._features(port), self._offered(port, values)
+            for scope, columns in self._scoped(found, feature_columns(found, port, signals)):
+                gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
+                for k in np.flatnonzero((gains[:, 0] > gate) & (share >= LEAST)).tolist():
+                    parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
+                    row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
+                    if not had & {row.place, _of_any_shape(row.place)} and not self._has(*row.place):
+                        rows.append(row)
+        return sorted(rows, key=lambda row: -row.gain)
+
+    def _scoped(
+        self, found: Responses, columns: Float[np.ndarray, "group value feature"]
+    ) -> Iterator[tuple[Scope, Float[np.ndarray, "group value feature"]]]:
+        """What features do where they act in the recordings of each scope alone."""
+        for scope in self.scopes:
+            yield scope, columns * scope.has(found.recordings)[:, None, None] if scope.group else columns
+
+    def _exchanged(
+        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
+        gate: float, where: Sequence[PortEvidence],
+    ) -> tuple[Refit, list[Refit]]:  # fmt: skip
+        """The best term climbed to its end, or another one in its place; and all others that were refitted.
+
+        The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
+        with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
+        anew, with base parameters held to what is then known of them. The term's feature is also tried at the ports
+        that lead by evidence, where the linear model may have preferred another one: a delay is far from linear.
+        """
+        chosen, every = refits[0], list(refits)
+        best, tried = self._climbed(chosen), {chosen.term.place}
+        for _ in range(EXCHANGES):
+            fit = best.fit
+            without = fit.x.copy()
+            without[-1] = 0.0
+            residual = best.target.residual(without[None])[0]
+            bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
+                           covariance=fit.covariance[:-1, :-1])  # fmt: skip
+            model = LinearModel(known, terms, bare, _relinearised(known, found, bare), _precision(known, bare))
+            ranked = self._ranked(model.found, values, gate, model.precision, terms)
+            ranked = [row for row in ranked if row.place not in tried]
+            fresh = self._confirmed(model, ranked, gate, partial(fresh_terms, best=best.term, where=where))
+            tried |= {row.place for row in fresh}
+            others = [self._refit(known, terms, bare, row) for row in fresh]
+            every += others
+            better = max(others, key=lambda refit: refit.score, default=best)
+            if better.square >= best.square - 2.0:
+                break
+            words = f"{better.term.port.words}: {better.term.feature.formula(self.units[0])}"
+            self.report(f"instead: {words}{in_words(better.term.scope)}")
+            best = self._climbed(better)
+        before = chosen.square + 2.0 * (chosen.score + self._cost(known))
+        best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
+        return best, every
+
+    def _cost(self, known: FitTarget) -> float:
+        """Nats that a term costs: its parameter, and the choice among all features at all ports."""
+        count = max(float(np.sum(known.measurements.valid)), 2.0)
+        choices = len(self.scopes) * sum(len(self._features(port)) for port in self.ports.ports)
+        return float(0.5 * np.log(count) + np.log(choices))
+
+    def _confirmed(
+        self, model: LinearModel, ranked: Sequence[TermGain], gate: float,
+        chosen: Callable[[Sequence[TermGain]], list[TermGain]],
+    ) -> list[TermGain]:  # fmt: skip
+        """The terms to refit, each with the gain that it has beside the model as it is now.
+
+        Responses are those of the first model, and splines miss what is fast. A law and the base parameters beside it
+        move the model far enough that gains are found which no refit brings. So what a chosen term does is found anew
+        by rollouts, and terms are chosen again until all of them have been seen so.
+        """
+        rows, seen = list(ranked), dict[tuple[Port, Feature, str], TermGain]()
+        while fresh := [row for row in chosen(rows) if row.place not in seen]:
+            seen |= {row.place: row for row in self._beside(model, fresh)}
+            rows = [seen.get(row.place, row) for row in rows]
+            rows = sorted((r for r in rows if r.gain > gate and r.share >= LEAST), key=lambda row: -row.gain)
+        return chosen(rows)
+
+    def _beside(self, model: LinearModel, rows: Sequence[TermGain]) -> list[TermGain]:
+        """Terms with their gains beside a model, by what rollouts of it say that each does."""
+        placed_terms = [self._placed(row) for row in rows]
+        target = model.known.on(self._with(model.known, model.terms, placed_terms))
+        x = np.append(model.fit.x, np.zeros(len(rows)))
+        directions = np.eye(len(x))[-len(rows) :]
+
+        def compute() -> dict[str, np.ndarray]:
+            return {"slopes": target.slopes(np.repeat(x[None], len(rows), axis=0), directions)[0]}
+
+        series = target.measurements.series(target.recall("terms", [x], compute)["slopes"])
+        columns = np.moveaxis(series.reshape(len(rows), len(model.found.residual), -1), 0, 2)
+        gains, share, size, sd = left_out_gains(_sums(model.found, columns), model.precision)
+        scales = [float(term.spec.prior["scale"]) for term in placed_terms]
+        numbers = zip(rows, gains[:, 0].tolist(), share.tolist(), size * scales, sd * scales, strict=True)
+        return [replace(row, gain=g, share=s, size=float(c), sd=float(d)) for row, g, s, c, d in numbers]
+
+    def _placed(self, row: TermGain) -> PlacedTerm:
+        return placed(row.port, row.feature, row.typical, *self.units, row.scope)
+
+    def _with(self, known: FitTarget, terms: Sequence[Refit], added: Sequence[PlacedTerm]) -> PortedForward:
+        """Rollouts with terms after those that the law has."""
+        return PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), *added])
+
+    def _refits(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, chosen: Sequence[TermGain]) -> list[Refit]:
+        """Terms, each refitted; the best first."""
+        refits = []
+        for row in chosen:
+            found = self._refit(known, terms, fit, row)
+            refits.append(found)
+            words = f"{row.port.words}: {row.feature.formula(self.units[0])}{in_words(row.scope)}"
+            self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
+        return sorted(refits, key=lambda refit: -refit.score)
+
+    def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
+        """The model with one more term, climbed a few steps from where the linear model has it."""
+        term = self._placed(row)
+        scale = float(term.spec.prior["scale"])
+        start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
+        free = np.append(fit.free, len(start) - 1)
+        target = known.on(self._with(known, terms, [term]))
+        found = climb(target, start, free, evaluations=GLANCE)
+        gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
+        return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
+
+    def _climbed(self, refit: Refit) -> Refit:
+        """The same, climbed to its end."""
+        return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
+
+    def _shaped(self, known: FitTarget, terms: Sequence[Refit], best: Refit) -> Refit:
+        """The same with the shape of the last term's feature inferred, if the data say that it is another one.
+
+        The dictionary has few shapes. What is left of one between them would ask for further terms, which are false.
+        """
+        if best.term.feature.shape is None:
+            return best
+        term = best.term.with_shape(self.units[1])
+        target, start = known.on(self._with(known, terms, [term])), np.append(best.fit.x, 0.0)
+        fit = climb(target, start, np.append(best.fit.free, len(best.fit.x)))
+        found = replace(best, term=term, target=target, fit=fit)
+        cost = 0.5 * float(np.log(max(float(np.sum(known.measurements.valid)), 2.0)))
+        gained = 0.5 * (best.square - found.square) - cost
+        if gained <= 0.0:
+            return best
+        self.report(f"its shape is {found.feature.shape:.3g}, {gained:.1f} nats better than {best.feature.shape:.3g}")
+        return replace(found, score=best.score + gained)
+
+
+def leading_terms(ranked: Sequence[TermGain], where: Sequence[PortEvidence]) -> list[TermGain]:
+    """The best terms by evidence of their ports and by gain."""
+    by_port: dict[Port, TermGain] = {}
+    for row in ranked:
+        by_port.setdefault(row.port, row)
+    chosen = list(by_port.values())[: BY_GAIN + 1]
+    chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
+    return list(dict.fromkeys([*chosen, *ranked[:BY_GAIN]]))
+
+
+def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:
+    """Terms that may take the place of the best one: those of most gain, its feature at the leading ports, and the term
+    itself in other recordings."""
+    leading = [row.port for row in where[:BY_EVIDENCE]]
+    same = [row for row in ranked if row.feature == best.feature]
+    alike = [row for row in same if row.port == best.port or (row.port in leading and row.scope == best.scope)]
+    return list(dict.fromkeys([*ranked[:FRESH], *alike]))
+
+
+def _of_any_shape(place: tuple[Port, Feature, str]) -> tuple[Port, Feature, str]:
+    """The place of a term whose shape may be any."""
+    port, feature, group = place
+    return port, feature._replace(shape=None), group
+
+
+def in_words(scope: Scope) -> str:
+    """Where a law acts in one group of recordings alone, the group."""
+    return f" in {scope.group} alone" if scope.group else ""
+
+
+FARTHEST = 100.0  # prior deviations within which a refit starts
+
+
+def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
+    """Refits of other terms that leave as little as the best one, within `TIED`; each term once, the best first."""
+    found: dict[tuple[Port, Feature, str], Refit] = {}
+    for refit in sorted(others, key=lambda refit: -refit.score):
+        found.setdefault(refit.term.place, refit)
+    found.pop(best.term.place, None)
+    return [refit for refit in found.values() if refit.score > best.score - TIED]
+
+
+def _under_noise_of(best: Refit, tie: Refit) -> Refit:
+    """A refit of another term under the noise that the best one leaves: that of a model far off tells less apart."""
+    target = best.target.on(tie.target.forward)
+    fit = climb(target, tie.fit.x, tie.fit.free, evaluations=GLANCE)
+    found = replace(tie, target=target, fit=fit)
+    return replace(found, score=best.score - 0.5 * (found.square - best.square))
+
+
+def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
+    """Prior deviations of a fit's parameters; coefficients of laws have their own as a unit."""
+    base = fit.free < len(known.forward.coordinates.names)
+    return np.append(known.forward.coordinates.prior_sd[fit.free[base]], np.ones(np.count_nonzero(~base)))
+
+
+def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
+    """What is known of a fit's parameters, in deviations of their priors."""
+    scale = _scale(known, fit)
+    return np.linalg.inv(fit.covariance / np.outer(scale, scale))
+
+
+def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
+    """The same responses beside the residual and the slopes of another fit, the coefficients of laws among them."""
+    groups = found.residual.shape[0]
+    white = known.measurements.series(fit.residual).reshape(groups, -1)
+    slopes = known.measurements.series(fit.jacobian.T).reshape(len(fit.free), groups, -1)
+    scale = _scale(known, fit)
+    own = known.forward.coordinates
+    pulls = np.append(own.prior_slopes(fit.x[: len(own.names)])[0], -fit.x[len(own.names) :])  # laws have unit normals
+    jacobian = np.moveaxis(slopes * scale[:, None, None], 0, 2)
+    return replace(found, residual=white, jacobian=jacobian, pull=-pulls[fit.free] * scale)
+
+
+def law_search(
+    target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, family: float,
+    report: Callable[[str], None], groups: Groups | None = None,
+) -> LawSearch:  # fmt: skip
+    """The search on a simulator with these ports and commands, for laws of all recordings and of single groups."""
+    commands = target.forward.commands
+    stroke = float(np.ptp(np.concatenate([np.asarray(commands.step), np.asarray(commands.initial)[:, None]], axis=1)))
+    stroke = max(stroke, 1e-12)
+    features = dictionary(len(channels), stroke)
+    table = FeatureTable(target.forward.lanes, features)
+    own, names = own_dictionary(stroke), target.forward.coordinates.names
+    taken = frozenset(name for name in names if name.startswith(PREFIX))
+    members = {} if groups is None else groups.members
+    scopes = (EVERYWHERE, *(Scope(name, recordings) for name, recordings in members.items()))
+    units = (tuple(channels), unit)
+    return LawSearch(ports, table, own, units, seed, family, report, taken=taken, scopes=scopes)

@@ -1,0 +1,100 @@
+"""When and where a model fails: how surprising each stretch of rows is, given those before it.
+
+With the model linear around its mode, the predictive density of every block of rows, given all rows before it, is a
+normal one (Dawid 1984, "The prequential approach"); the sum of their logarithms is the log evidence. Parameters are
+taken to be known no better than the prior and the earlier rows say, so that a fit to later rows hides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.omnibus import BLOCK
+
+BEGINNING = (
+    "Only the first block fails: was another command in force before the first row than these recordings have, or was "
+    "the robot not at rest? rfdropo check says which command it is; initial_command sets it."
+)
+
+
+@dataclass(frozen=True)
+class Prequential:
+    """Scores of successive blocks of rows, over all recordings.
+
+    Attributes:
+        edges: times at which blocks begin, and the last one ends [s].
+        score: log predictive density of each block, whitened data.
+        p: probability that a block of a model that is right is as surprising.
+        surprise: mean square of a block's prediction errors in their own deviations, 1 where the model is right.
+        misfit: mean square of what each marker coordinate leaves at the mode, 1 where the model is right.
+    """
+
+    edges: Float[np.ndarray, " edge"]
+    score: Float[np.ndarray, " block"]
+    p: Float[np.ndarray, " block"]
+    surprise: Float[np.ndarray, " block"]
+    misfit: Float[np.ndarray, " column"]
+
+
+def prequential(target: FitTarget, fit: Fit) -> Prequential:
+    """Score the blocks of a fitted model."""
+    measured = target.measurements
+    shape, valid = measured.count.shape, measured.valid
+    residual, slopes = measured.series(fit.residual), np.moveaxis(measured.series(fit.jacobian.T), 0, -1)
+    coordinates = target.forward.coordinates
+    mean = coordinates.prior_mean[fit.free] - fit.x[fit.free]
+    precision = np.diag(coordinates.prior_sd[fit.free] ** -2.0)
+    known, design = fit.residual[measured.count.size :], fit.jacobian[measured.count.size :]  # weighed before all rows
+    before, precision = precision @ mean, precision + design.T @ design
+    mean = np.linalg.solve(precision, before + design.T @ known)
+    starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block has what is left over, too
+    scores, p, surprise = [], [], []
+    for start, end in zip(starts, [*starts[1:], shape[1]], strict=True):
+        rows = slice(start, end)
+        used = valid[:, rows]
+        r, j = residual[:, rows][used], slopes[:, rows][used]
+        left = r - j @ mean
+        after = precision + j.T @ j
+        gain = np.linalg.solve(after, j.T @ left)
+        square = float(left @ left - (j.T @ left) @ gain)  # left' (I + J P J')^-1 left, by Woodbury's identity
+        growth = float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(precision)[1])
+        scores.append(-0.5 * (square + growth + len(r) * np.log(2.0 * np.pi)))
+        p.append(max(float(chi2.sf(square, len(r))), float(np.finfo(float).tiny)) if len(r) else 1.0)
+        surprise.append(square / max(len(r), 1))
+        mean, precision = mean + gain, after
+    clock = measured.time[int(np.argmax(valid.any(axis=2).sum(axis=1)))]
+    edges = np.append(clock[starts], clock[-1])
+    misfit = np.sum(residual**2, axis=(0, 1)) / np.maximum(valid.sum(axis=(0, 1)), 1)
+    misfit = misfit[: measured.markers]
+    return Prequential(edges, np.array(scores), np.array(p), np.array(surprise), misfit)
+
+
+def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
+    """When the model first fails, when most, and at which marker.
+
+    Args:
+        found: the scores.
+        markers: names, three channels each.
+        level: of the p-values, shared by all blocks.
+    """
+    failing = np.flatnonzero(found.p <= level / len(found.p))
+    if len(failing) == 0:
+        return "No stretch of rows is surprising by itself, given those before it."
+    first, worst = failing[0], int(np.argmax(found.surprise))
+    at = int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))
+    share = "in every block" if len(failing) == len(found.p) else f"in {len(failing)} of {len(found.p)} blocks"
+    return (
+        f"The model fails {share} of rows, first from {found.edges[first]:.2g} to {found.edges[first + 1]:.2g} s, most "
+        f"from {found.edges[worst]:.2g} to {found.edges[worst + 1]:.2g} s, and most at marker {markers[at]}."
+        + (f" {BEGINNING}" if begins_wrong(found, level) else "")
+    )
+
+
+def begins_wrong(found: Prequential, level: float) -> bool:
+    """Whether the first block of rows fails, and no other of several."""
+    return len(found.p) > 1 and np.flatnonzero(found.p <= level / len(found.p)).tolist() == [0]

@@ -1,0 +1,205 @@
+"""The screen of a model: is anything wrong with it, and which candidates say what.
+
+All p-values are taken from residuals as they would be if the model were right (a parametric bootstrap): noise is drawn
+for every recording, its model is estimated from it as it was from the data, and the base model is refitted linearly. No
+rollouts are needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.discrepancy.candidates import Probe
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.omnibus import Omnibus, block_squares, joint_test, statistics
+from rfdropo_bayes.discrepancy.score import project_out, span, statistic
+
+CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
+DIRECTED = "candidates"
+
+
+@dataclass(frozen=True)
+class ScreenRow:
+    """What the screen says of one candidate.
+
+    Attributes:
+        name: registry name.
+        probe: its best probe; None where no effect of it is visible.
+        lm: score statistic of that probe; rank: its degrees of freedom.
+        p: of that probe alone.
+        adjusted_p: probability that, were the model right, any probe of any candidate surprised as much.
+        score: LM - rank log n, n being the values that count, by which candidates are ranked.
+    """
+
+    name: str
+    probe: Probe | None
+    lm: float
+    rank: int
+    p: float
+    adjusted_p: float
+    score: float
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A model, the joint test of its residuals, and the screen of what it might lack (best first).
+
+    ``finer`` is the joint test of the residuals on a finer mesh and time step, None where there is none; ``omnibus``
+    is the same where the model is let pass by it.
+    """
+
+    fit: Fit
+    omnibus: Omnibus
+    rows: tuple[ScreenRow, ...]
+    finer: Omnibus | None = None
+
+    @property
+    def refined(self) -> bool:
+        """Whether it is on the finer mesh and time step that the model was tested."""
+        return self.omnibus is self.finer
+
+    def row(self, name: str) -> ScreenRow:
+        """That of one candidate."""
+        return next(row for row in self.rows if row.name == name)
+
+
+def screen(
+    target: FitTarget,
+    fit: Fit,
+    probes: Sequence[Probe],
+    names: Sequence[str],
+    seed: Any,
+    bootstraps: int,
+    finer: Float[np.ndarray, " n"] | None = None,
+) -> Screen:
+    """Test a fitted model and screen candidates against it, calibrated by parametric bootstrap.
+
+    Args:
+        target: data and noise.
+        fit: of the model.
+        probes: of all candidates.
+        names: of all candidates, those without a probe among them.
+        seed: of the bootstrap.
+        bootstraps: simulated data sets.
+        finer: residuals of the finer simulator with the same parameters.
+    """
+    seen = [probe for probe in probes if probe.mark.rank > 0]
+    # As in the simulated data sets, what the parameters could still take is no discrepancy: a prior holds a size of
+    # many of its deviations back from where the data have it.
+    left = np.stack([fit.residual] if finer is None else [fit.residual, finer])
+    residuals = project_out(span(fit.jacobian), left.T).T
+    observed, surprises = _statistics(target, residuals, seen)
+    simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
+    if target.noise.source == RESIDUALS:  # whose mean square is that of the residuals by construction
+        del observed["variance"], simulated["variance"]
+    most = reference.max(axis=1) if seen else np.zeros(bootstraps)
+    if seen:  # without candidates there is no test by them, and no p-value of one that says nothing
+        observed[DIRECTED], simulated[DIRECTED] = surprises.max(axis=1), most
+    tests = []
+    for index, residual in enumerate(residuals):
+        white = target.measurements.series(residual)
+        blocks = block_squares(white, target.measurements.valid)
+        tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
+    rows = [_row(name, seen, surprises[0], most, fit) for name in names]
+    return Screen(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)
+
+
+def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> ScreenRow:
+    own = [i for i, probe in enumerate(seen) if probe.candidate == name]
+    if not own:
+        return ScreenRow(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
+    best = max(own, key=lambda i: surprises[i])
+    probe = seen[best]
+    lm = float(statistic(probe.mark, fit.residual)[0])
+    score = lm - probe.mark.rank * np.log(fit.counted)
+    return ScreenRow(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
+
+
+def _p_value(surprise: float) -> float:
+    """Never zero, which no p-value is: the smallest number that is left."""
+    return max(float(np.exp(-surprise)), float(np.finfo(float).tiny))
+
+
+def _statistics(
+    target: FitTarget, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
+) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "count probe"]]:
+    found = statistics(target.measurements.series(residuals))
+    surprises = [statistic(probe.mark, residuals)[1] for probe in probes]
+    return found, np.stack(surprises, axis=1) if probes else np.zeros((len(residuals), 0))
+
+
+def _simulated(
+    target: FitTarget, fit: Fit, probes: Sequence[Probe], rng: np.random.Generator, count: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    base = span(fit.jacobian)
+    chunk = max(1, min(count, int(CHUNK_NUMBERS / base.shape[0])))
+    parts: list[tuple[Mapping[str, np.ndarray], np.ndarray]] = []
+    for start in range(0, count, chunk):
+        size = min(chunk, count - start)
+        residuals = null_residuals(target.measurements, target.noise, base, len(fit.free), rng, size)
+        parts.append(_statistics(target, residuals, probes))
+    joined = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
+    return joined, np.concatenate([part[1] for part in parts])
+
+
+def null_residuals(
+    measurements: Measurements,
+    noise: Stacked,
+    base: Float[np.ndarray, "n rank"],
+    parameters: int,
+    rng: np.random.Generator,
+    count: int,
+) -> Float[np.ndarray, "count n"]:
+    """Whitened residuals of ``count`` data sets without discrepancy, after the base model is fitted to each.
+
+    Args:
+        measurements: the data, for their times, gaps and repeats.
+        noise: that is drawn.
+        base: orthonormal basis of what the base parameters do to whitened data.
+        parameters: how many of them were fitted.
+        rng: of the noise.
+        count: data sets.
+    """
+    found = np.empty((count, len(base)))
+    drawn = noise.at(measurements.single_steps).draw(rng, (count, *measurements.spread.shape))
+    if noise.source == RESIDUALS:
+        drawn = _fitted(measurements, noise, base, drawn)
+    for row, single in enumerate(drawn):
+        estimated = noise
+        if noise.source not in (STATED, MISFIT):
+            estimated = measurements.noise(single, parameters, noise)
+        found[row, : measurements.count.size] = measurements.whiten(measurements.mean_of(single), estimated)
+    weighed = measurements.size - measurements.count.size  # whose errors are known
+    found[:, measurements.count.size :] = rng.standard_normal((count, weighed))
+    return project_out(base, found.T).T
+
+
+def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """What the base model leaves of data sets without repeats: where the noise is estimated from that, it is estimated
+    from that here, too; the noise before a fit would be a little larger in most of them, and give itself away."""
+    order = [group[0] for group in measurements.members]
+    white = measurements.whiten(drawn[:, order], noise)
+    rows = base[: measurements.count.size]
+    left = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
+    fitted = np.empty_like(drawn)
+    fitted[:, order] = noise.at(measurements.steps).colour(left, measurements.valid)
+    return fitted
+
+
+def tail(observed: float, simulated: Float[np.ndarray, " count"]) -> float:
+    """Share of simulated statistics at least as large, the observed one among them."""
+    return float((1 + np.sum(simulated >= observed)) / (1 + len(simulated)))
+
+
+def p_in_words(p: float, simulated: int) -> str:
+    """A bootstrap's p-value, "= 0.02"; "< 0.001" where none of the simulated statistics was as large."""
+    least = 1.0 / (1 + simulated)
+    return f"= {p:.2g}" if p > 1.5 * least else f"< {least:.2g}"

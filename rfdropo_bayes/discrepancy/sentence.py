@@ -1,0 +1,310 @@
+"""The audit in a sentence that a lab can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
+from rfdropo_bayes.discrepancy.candidates import spoken
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, TOLD_APART
+from rfdropo_bayes.discrepancy.gain import noise_distance
+from rfdropo_bayes.discrepancy.law_words import law_sentence, ports_sentence
+from rfdropo_bayes.discrepancy.pipeline import Answer
+from rfdropo_bayes.discrepancy.prequential import BEGINNING, begins_wrong, prequential
+from rfdropo_bayes.discrepancy.prior_ends import in_words
+from rfdropo_bayes.discrepancy.screen import p_in_words
+from rfdropo_bayes.discrepancy.verdict import EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
+
+MOST_EXCLUDED = 3
+MOST_SIZES = 4
+
+
+def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
+    words = (
+        _words(answer, findings)
+        + ports_sentence(answer)
+        + _compared(answer, findings)
+        + _unfitted_alone(answer)
+        + _suspicion(answer)
+        + _shifted(answer)
+        + _decided(answer)
+        + _numerical(answer)
+        + _beginning(answer)
+        + _left_out(answer)
+        + _stopped(answer)
+    )
+    return words[0].upper() + words[1:]
+
+
+def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    """What two groups of recordings have in common, where they are compared."""
+    groups = answer.problem.compared
+    if groups is None or answer.verdict == NO_VERDICT:
+        return ""
+    names = " and ".join(groups.names)
+    left_out = f" {len(groups.left_out)} recordings of neither are left out." if groups.left_out else ""
+    both = [finding["mechanism"].replace("_", " ") for finding in findings if not finding["group"]]
+    lacking = f" {' and '.join(both)} {'is' if len(both) == 1 else 'are'} the same in both." if both else ""
+    if len(both) == len(findings):
+        return f"{lacking} No parameter and no mechanism is found to differ between {names}.{left_out}"
+    return f"{lacking} All else is shared by {names}.{left_out}"
+
+
+def _left_out(answer: Answer) -> str:
+    count = len(answer.problem.left_out)
+    does = "candidate does" if count == 1 else "candidates do"
+    return f" Left out: {count} {does} not run on this body or engine." if count else ""
+
+
+def _stopped(answer: Answer) -> str:
+    if not answer.cost.stopped:
+        return ""
+    minutes, waited = answer.problem.rules.minutes, round(answer.cost.waited / 60.0)
+    busy = f" For {waited} of them the audit waited for processors that other programs held." if waited else ""
+    return (
+        f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
+        f"go on with --resume.{busy}"
+    )
+
+
+def _unfitted_alone(answer: Answer) -> str:
+    """What is said where the base model could be fitted with what it lacks only."""
+    if answer.base.converged or not answer.causes.steps:
+        return ""
+    return (
+        " The fit of the base model alone has not converged: a better one may leave less, and what was found then "
+        "explains less."
+    )
+
+
+def _suspicion(answer: Answer) -> str:
+    noise = answer.doubts.suspected
+    if noise is None:
+        return ""
+    stated, other = (1e3 * noise_distance(n.first) for n in (answer.target.noise, noise))
+    memory = f", {noise.first.autocorrelation[1]:.2f} of it kept from row to row," if noise.first.order else ""
+    return (
+        f" But noise of {other:.2g} mm{memory} instead of the {stated:.2g} mm stated would leave no discrepancy: "
+        "check [noise], or repeat one command sequence three times."
+    )
+
+
+def _shifted(answer: Answer) -> str:
+    if answer.doubts.shift is None:
+        return ""
+    return (
+        f" Repeats differ by constants of {1e3 * answer.doubts.shift:.2g} mm, which pass for noise here: a frame or a "
+        "start that was not the same each time? Let camera_offset differ in [model.per_recording]."
+    )
+
+
+def _decided(answer: Answer) -> str:
+    """What is said of findings beside which a prior decides a parameter of the base model."""
+    return in_words(answer.doubts.priors) if answer.causes.steps else ""
+
+
+def _numerical(answer: Answer) -> str:
+    """What is said of a simulation that half the time step changes by more than the noise."""
+    error, noise = answer.doubts.numerical, noise_distance(answer.target.noise.first)
+    if error is None or error <= noise:
+        return ""
+    return (
+        f" Half the time step and a finer mesh move the last model's markers by {1e3 * error:.2g} mm, the noise by "
+        f"{1e3 * noise:.2g} mm: what is found may stand for an error of the simulation; shorten [simulator] time_step."
+    )
+
+
+def _beginning(answer: Answer) -> str:
+    """What is asked where the base model fails in the first block of rows alone."""
+    if answer.verdict == NO_DISCREPANCY or not answer.converged:
+        return ""
+    found = prequential(answer.target, answer.base)
+    return f" {BEGINNING}" if begins_wrong(found, answer.problem.rules.base_passes) else ""
+
+
+def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    if not answer.fitted:
+        return "No verdict: the fit of the base model is not done."
+    if answer.law is not None:
+        return law_sentence(answer)
+    if answer.verdict == NEGLIGIBLE:
+        return _small(answer)
+    if not answer.converged:
+        left = answer.base.residual
+        return (
+            f"No verdict: the fit of the base model has not converged (sum of squares {left @ left:.3g} for "
+            f"{np.count_nonzero(left)} values, and better points beside it). Start from a calibration with --from, "
+            "narrow the priors, or shorten [simulator] time_step."
+        )
+    if answer.verdict == NO_DISCREPANCY:
+        return (
+            f"No discrepancy: what the base model leaves is noise as far as these data can tell "
+            f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
+        )
+    if not findings and answer.causes.screens[0].omnibus.p > answer.problem.rules.base_passes:
+        distance = 1e3 * noise_distance(answer.target.noise.first)
+        return (
+            f"What the base model leaves, {distance:.2g} mm, changes too slowly to be the noise of a measurement, but "
+            f"without repeats it cannot be told from noise, and no candidate stands out of it "
+            f"(joint test p {_p(answer)})."
+        )
+    if not findings and answer.verdict == NO_VERDICT:
+        return f"Something is wrong with the base model (joint test p {_p(answer)}); no candidate was tried to the end."
+    if not findings:
+        tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
+        asked = "no candidate of the library says what" if answer.problem.candidates else "no candidate was asked"
+        return f"Something is wrong with the base model, and {asked}: {tail}."
+    named = " and ".join(_named(finding) for finding in findings)
+    gain = answer.validation.gain
+    if gain is None:
+        return f"{named}; how much it explains could not be measured."
+    low, high = (100.0 * min(max(x, 0.0), 1.0) for x in gain.interval)
+    share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}] of the discrepancy"
+    if unclear(answer.problem.rules, gain):
+        verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
+        head = (
+            f"{named} {verb} named, but unseen recordings do not say how much of the discrepancy that explains "
+            f"([{low:.0f}, {high:.0f}] %); they are {likelier}likelier with it"
+        )
+    elif gain.worse:
+        errors = f"{1e3 * gain.rmse_base:.3g} mm without, {1e3 * gain.rmse_extended:.3g} mm with it"
+        head = f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse ({errors})"
+    elif answer.verdict == UNEXPLAINED:
+        head = f"Unexplained: the best of the library, {named}, explains only {share}"
+    elif answer.verdict in (EXPLAINED, "equivalent"):
+        head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"
+    elif answer.causes.screens[-1].omnibus.p > answer.problem.rules.extended_passes:
+        head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
+    else:
+        head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
+    return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
+
+
+def _small(answer: Answer) -> str:
+    """What is said of a discrepancy that is sure, and too small to matter."""
+    size, noise = answer.remainder.amplitude * np.sqrt(3.0), noise_distance(answer.target.noise.first)
+    limit, numerical = answer.problem.rules.matters, answer.doubts.numerical
+    beside = f"the noise is {1e3 * noise:.2g} mm"
+    if numerical is not None:
+        beside += f", and half the time step and a finer mesh move the markers by {1e3 * numerical:.2g} mm"
+    if limit is not None:
+        beside += f"; [audit] matters_mm is {1e3 * limit:g}"
+    return (
+        f"Negligible: a discrepancy of {1e3 * size:.2g} mm is sure (joint test p {_p(answer)}), for repeats are many, "
+        f"but {beside}. Nothing need be done."
+    )
+
+
+def _invisible(answer: Answer) -> str:
+    """Candidates that could be there all the same, as nothing that was measured shows them."""
+    names = [
+        row.name.replace("_", " ") for row in answer.causes.screens[0].rows if row.probe is None and "@" not in row.name
+    ]
+    if not names:
+        return ""
+    which = ", ".join(names[:MOST_EXCLUDED]) + (" ..." if len(names) > MOST_EXCLUDED else "")
+    data = " and ".join(name.replace("_", " ") for name in answer.target.measurements.names_of_channels)
+    return f" What was measured ({data}) cannot show {which}."
+
+
+def _p(answer: Answer) -> str:
+    return p_in_words(answer.causes.screens[0].omnibus.p, answer.problem.rules.bootstraps)
+
+
+def _adoption(answer: Answer) -> str:
+    """What of the findings joins the model for good."""
+    gain = answer.validation.gain
+    if not answer.adopted and gain is not None and gain.opposed and not gain.worse:
+        worst, found = min(gain.against.items(), key=lambda item: item[1].elpd)
+        errors = f"{1e3 * found.rmse_base:.3g} mm without, {1e3 * found.rmse_extended:.3g} mm with it"
+        return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model."
+    if not answer.adopted:
+        return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
+    if answer.causes.unsupported:
+        names = " and ".join(map(spoken, answer.causes.unsupported))
+        return f" The fitted recordings asked for {names}, too, which unseen ones do not support: not adopted."
+    return ""
+
+
+def _named(finding: dict[str, Any]) -> str:
+    name = finding["mechanism"].replace("_", " ") + (f" in {finding['group']}" if finding["group"] else "")
+    if finding["mechanism"] == DISCRETISATION:
+        return "the coarse mesh or time step"
+    # Where cables leave the common scale of forces and stiffness free, only the ratio means something.
+    ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
+    given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
+    surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
+    sizes = ", ".join(
+        _size(title.replace(f"@{finding['group']}", ""), row) for title, row in given if (title, row) in surest
+    )
+    others = [spoken(other) for other in finding["equivalence_class"][1:]]
+    alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
+    return f"{name} ({sizes}){alike}"
+
+
+def _size(name: str, row: dict[str, Any]) -> str:
+    unit = "" if row["unit"] == "-" else f" {row['unit']}"
+    return f"{spoken(name)} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
+
+
+def _excluded(answer: Answer) -> str:
+    """Candidates that were refitted in the first step and are much less likely."""
+    step = answer.causes.steps[0]
+    worse = [
+        spoken(name)
+        for name, value in step.refits.items()
+        if name not in step.members
+        and value < step.log_bayes_factor - TOLD_APART
+        and all(name != other.name for other in answer.causes.steps)
+    ]
+    return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""
+
+
+def _only_noise(answer: Answer) -> bool:
+    """Whether unseen recordings are missed by no more than repeats differ by."""
+    noise, gain = answer.target.noise, answer.validation.gain
+    return noise.source == REPEATS and gain is not None and noise_distance(noise.first) >= gain.rmse_extended
+
+
+def _pattern(answer: Answer) -> str:
+    """What the joint test says of an extended model that does not pass it."""
+    rules, last = answer.problem.rules, answer.causes.screens[-1].omnibus.p
+    words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
+    sure = last <= rules.base_passes and not _only_noise(answer)
+    return f"{words}: something else is at work" if sure else words
+
+
+def _remains(answer: Answer) -> str:
+    assert answer.validation.gain is not None
+    remain = f"{1e3 * answer.validation.gain.rmse_extended:.2g} mm remain"
+    if _only_noise(answer):
+        return f"{remain}, no more than repeats differ by"
+    if answer.target.noise.source != REPEATS:
+        return remain
+    return f"{remain}, {1e3 * noise_distance(answer.target.noise.first):.2g} mm of it noise"
+
+
+def _resolution(answer: Answer) -> str:
+    if answer.causes.screens[0].refined:
+        return " on a mesh and time step twice as fine, which differ too little to be named"
+    return ""
+
+
+def _assumption(answer: Answer) -> str:
+    source = answer.target.noise.source
+    if source == REPEATS:
+        return ""
+    if source == STATED:
+        return "; the noise is what the experiment file states"
+    words = "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"
+    if apart := answer.target.measurements.apart:
+        which = ", ".join(apart[:MOST_EXCLUDED]) + (" ..." if len(apart) > MOST_EXCLUDED else "")
+        words += (
+            f" (the same commands were repeated in {which}, but rows or clocks differ: [data] resample brings "
+            "recordings onto one clock)"
+        )
+    return words

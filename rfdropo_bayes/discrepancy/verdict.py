@@ -1,0 +1,77 @@
+"""The verdict by stated rules, and a sentence a lab can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rfdropo_bayes.discrepancy.extension import Rules
+from rfdropo_bayes.discrepancy.gain import Gain
+
+NO_VERDICT = "no_verdict"  # no fit has converged, or the time was up before anything was found
+DESCRIBED = "described"  # a law at a port, for which the library has no name, holds on unseen recordings
+NEGLIGIBLE = "negligible"  # a discrepancy is sure, and far too small to matter
+NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
+    "no_discrepancy",
+    "explained",
+    "equivalent",
+    "partly_explained",
+    "unexplained",
+)
+
+
+def unclear(rules: Rules, gain: Gain) -> bool:
+    """Whether unseen trajectories do not say how much of the discrepancy is explained: it is too small, or the fraction
+    differs too much between them, so that its interval reaches from "none" to "all"."""
+    return gain.interval[0] <= rules.significant and gain.interval[1] >= rules.explained
+
+
+SMALL = 0.25
+"""Share of the noise below which a discrepancy is far below it: with it in quadrature errors grow by 3 %."""
+
+
+def negligible(rules: Rules, size: float, noise: float, numerical: float | None) -> bool:
+    """Whether a discrepancy that is sure need not be mended.
+
+    It is where it is smaller than what matters, where that is said. Else it is where it is far below the noise of one
+    measurement, and below what half the time step and a finer mesh move; all as distances of a marker [m].
+    """
+    if rules.matters is not None:
+        return size < rules.matters
+    return numerical is not None and size < SMALL * noise and size < numerical
+
+
+def decide(
+    rules: Rules,
+    base_p: float,
+    extended_p: float | None,
+    class_sizes: Sequence[int],
+    gain: Gain | None,
+    doubtful: bool = False,
+) -> str:
+    """Apply the rules.
+
+    - no_discrepancy: the base model passes the joint test (p > .01), under a noise that may be one;
+    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %, or unseen
+      trajectories are predicted worse with them;
+    - explained: the extended model passes (p > .05), the lower bound of the explained fraction exceeds 80 %, and unseen
+      trajectories clearly support it; equivalent where a named class has several members;
+    - partly_explained: a significant gain, but one of these fails.
+
+    Args:
+        rules: the numbers above.
+        base_p, extended_p: p-values of the joint tests; None without an extension.
+        class_sizes: members of each named class.
+        gain: on unseen trajectories; None where it could not be measured.
+        doubtful: see `Stacked.doubtful`.
+    """
+    if base_p > rules.base_passes and not doubtful:
+        return NO_DISCREPANCY
+    if not class_sizes or extended_p is None:
+        return UNEXPLAINED
+    if gain is None:
+        return PARTLY
+    if gain.worse or gain.explained <= rules.significant:
+        return UNEXPLAINED
+    if extended_p > rules.extended_passes and gain.clear and gain.interval[0] > rules.explained:
+        return EQUIVALENT if max(class_sizes) > 1 else EXPLAINED
+    return PARTLY

@@ -1,0 +1,157 @@
+"""Draws of normal approximations, weighted by the exact posterior: what a normal says of a curved ridge is mended here.
+
+The first candidates come from the approximations. A normal is thin where a ridge bends away from it, and weights do not
+show what no candidate has seen. So the next rounds come from Student-t distributions with the weighted covariance of
+all before them, added to that of the normal (adaptive multiple importance sampling, Cornuet et al. 2012). All together
+have the density ``q``. A candidate's weight for optimum k is ``p(u) / q(u)`` times the share
+of k in ``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight
+are then resampled, and the effective number ``(sum w)^2 / sum w^2`` says how many candidates are behind them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, multivariate_t
+
+from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.cautions import Caution, Code
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.smc.moves import host_generator
+
+CANDIDATE_SHARE = 0.25  # of a budget that climbs leave to candidates
+FEWEST_CANDIDATES = 20
+ROUNDS = 4
+DEGREES = 5.0  # of freedom of the wide candidates
+ENOUGH, TOO_FEW = 100.0, 20.0  # effective draws: fewer are said, and still fewer must not be used
+LIKE = 0.1  # share of the candidates that counts where the normal describes the posterior
+
+
+class Reweighted(NamedTuple):
+    """Draws of equal weight.
+
+    Attributes:
+        position: unconstrained.
+        rows: log density of each data row at each of them.
+        effective: number of independent draws that they are worth.
+        candidates: from which they were taken.
+    """
+
+    position: Float[np.ndarray, "draw d"]
+    rows: Float[np.ndarray, "draw row"]
+    effective: float
+    candidates: int
+
+
+def reweighted(
+    problem: Problem,
+    modes: Sequence[Laplace],
+    weights: Float[np.ndarray, " mode"],
+    candidates: int,
+    key: PRNGKeyArray,
+    ledger: Ledger,
+    count: int,
+    by_evidence: bool = False,
+) -> Reweighted | None:
+    """Draws from a mixture of approximations, as the exact posterior has them.
+
+    Args:
+        problem: whose posterior it is.
+        modes: normal approximations.
+        weights: of the mixture.
+        candidates: number of rollouts.
+        key: random key.
+        ledger: is charged; candidates without a likelihood are counted there.
+        count: of draws wanted.
+        by_evidence: let the exact posterior decide between the optima, and not the weights.
+
+    Returns:
+        None if there are too few candidates, or none has a posterior density.
+    """
+    if candidates < FEWEST_CANDIDATES:
+        return None
+    draw_key, order_key = jax.random.split(key)
+    generator = host_generator(draw_key)
+    sources = [[multivariate_normal(mode.mean, mode.covariance) for mode in modes]]
+    u, rows, posterior = np.empty((0, len(modes[0].mean))), np.empty((0, problem.n_rows)), np.empty(0)
+    for size in np.diff(np.linspace(0, candidates, ROUNDS + 1).astype(int)).tolist():
+        if len(u):
+            by_mode = _weights(posterior, weights, sources, u)
+            sources.append([_widened(mode, u, by_mode[:, k]) for k, mode in enumerate(modes)])
+        sizes = zip(sources[-1], _counts(weights, size), strict=True)
+        drawn = [np.reshape(source.rvs(int(n), random_state=generator), (n, -1)) for source, n in sizes if n]
+        more_rows, more = _exact(problem, np.concatenate(drawn), ledger)
+        u, rows = np.concatenate([u, *drawn]), np.concatenate([rows, more_rows])
+        posterior = np.concatenate([posterior, more])
+    if not np.isfinite(posterior).any():
+        return None
+    by_mode = _weights(posterior, weights, sources, u)
+    mass = by_mode.sum(axis=0)
+    found = mass > 0.0
+    share = mass[found] if by_evidence else weights[found]
+    weight = by_mode[:, found] @ (share / share.sum() / mass[found])
+    chosen = _systematic(weight, count, order_key)
+    return Reweighted(u[chosen], rows[chosen], float(weight.sum() ** 2 / np.sum(weight**2)), candidates)
+
+
+def _exact(
+    problem: Problem, u: Float[np.ndarray, "n d"], ledger: Ledger
+) -> tuple[Float[np.ndarray, "n row"], Float[np.ndarray, " n"]]:
+    """Log density of each row, and of the posterior; minus infinity for rollouts that are left out."""
+    rows = evaluate_rows(problem, u, problem.n_rows, ledger)
+    return rows, evaluate_prior(problem, u) + rows.sum(axis=1)
+
+
+def _weights(
+    posterior: Float[np.ndarray, " n"],
+    weights: Float[np.ndarray, " mode"],
+    sources: Sequence[Sequence[Any]],
+    u: Float[np.ndarray, "n d"],
+) -> Float[np.ndarray, "n mode"]:
+    """``p / q`` times the share of each mode in ``q``, the largest of them 1; zero throughout if ``p`` is."""
+    each = np.array([[source.logpdf(u) for source in of_round] for of_round in sources])
+    with np.errstate(divide="ignore"):
+        parts = np.log(weights) + logsumexp(np.reshape(each, (len(sources), len(weights), -1)), axis=0).T
+    logs = posterior[:, None] + parts - 2.0 * logsumexp(parts, axis=1, keepdims=True)
+    return np.exp(logs - logs.max()) if np.isfinite(logs).any() else np.zeros_like(logs)
+
+
+def _widened(mode: Laplace, u: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Any:
+    """Student-t around the weighted mean; around the mode if nothing has a weight."""
+    if weight.sum() == 0.0:
+        return multivariate_t(mode.mean, 2.0 * mode.covariance, DEGREES)
+    mean = weight @ u / weight.sum()
+    spread = (weight * (u - mean).T) @ (u - mean) / weight.sum()
+    return multivariate_t(mean, spread + mode.covariance, DEGREES)
+
+
+def _counts(weights: Float[np.ndarray, " mode"], count: int) -> Int[np.ndarray, " mode"]:
+    """Candidates of each mode, in proportion up to one."""
+    return np.diff(np.round(np.cumsum(weights / weights.sum()) * count).astype(int), prepend=0)
+
+
+def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) -> Int[np.ndarray, " draw"]:
+    """Indices in proportion to the weights, in random order; equal weights give every index its share exactly."""
+    first_key, order_key = jax.random.split(key)
+    ticks = (np.arange(count) + float(jax.random.uniform(first_key))) / count
+    chosen = np.searchsorted(np.cumsum(weight) / weight.sum(), ticks, side="left")
+    return np.minimum(chosen, len(weight) - 1)[np.asarray(jax.random.permutation(order_key, count))]
+
+
+def reweighting_cautions(found: Reweighted | None) -> list[Caution]:
+    """What the exact posterior says of the normal approximation; None stands for draws that were not compared."""
+    remedy = "allow more rollouts, or use the bridge or SMC"
+    if found is None:
+        sentence = f"no rollouts were left to check the normal approximation that the draws are from: {remedy}"
+        return [Caution(Code.NORMAL_DIFFERS, sentence)]
+    if found.effective >= ENOUGH:
+        return []
+    unlike = ": a normal distribution does not describe this posterior" * (found.effective < LIKE * found.candidates)
+    sentence = f"the draws are worth {found.effective:.0f} of {found.candidates} independent ones{unlike}; {remedy}"
+    return [Caution(Code.NORMAL_DIFFERS, sentence, grave=found.effective < TOO_FEW)]

@@ -1,1 +1,0 @@
-"""Plain numpyro models: as a problem, and sampled in two passes."""

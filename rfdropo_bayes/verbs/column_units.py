@@ -1,0 +1,243 @@
+"""Units of columns: those that names or a line of units tell, else those that sizes suggest, with the evidence."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from rfdropo_bayes.data import named_columns
+from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.named_columns import COMMAND_UNITS, METRES
+from rfdropo_bayes.data.sample_times import PER_SECOND, pace
+from rfdropo_bayes.errors import InputError
+
+WORD = re.compile(r"[a-z0-9]+")
+UNITS = {unit: unit for unit in ("mm", "cm", "m", "deg", "rad")} | dict.fromkeys(
+    ("count", "counts", "cnt", "cnts", "tick", "ticks", "pulse", "pulses", "steps", "qc"), named_columns.COUNTS
+)
+"""Words in the name of a column, and the unit they tell."""
+FOREIGN = {
+    "%": re.compile(r"%|(?<![a-z])(percent|percentage|pct|duty|pwm)(?![a-z])", re.IGNORECASE),
+    "V": re.compile(r"volt|[_ .\[(]m?V[\])]?$|^m?V$"),
+    "A": re.compile(r"(?<![a-z])amps?(?![a-z])|[_ .\[(]m?A[\])]?$|^m?A$"),
+    "bar": re.compile(r"(?<![a-z])(m?bar|psi|[km]?pa|pressure)(?![a-z])", re.IGNORECASE),
+    "N": re.compile(r"newton|[_ .\[(]N[\])]?$|^N$"),
+}
+"""Units of commands that are neither a length of cable nor an angle of a motor."""
+ANGLES = ("rad", "deg", named_columns.COUNTS)
+ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
+TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microseconds", "µs", "μs"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+}
+"""Words in the name of a column of times, and the unit they tell."""
+SINCE_1970 = (0.9e9, 4.2e9)
+"""Seconds since 1970 in the years 1998 to 2103: stamps between them tell their unit."""
+LONGEST_STEP = 100.0
+"""Longest time between rows [s] with which such stamps are believed: a counter may run through the same numbers."""
+USUAL_STEP, USUAL_RATE = 0.02, 0.5
+"""Times between rows [s] and rates of motion [Hz] that recordings of soft robots have, to within decades."""
+FASTEST_MOTION = 20.0
+"""Rate of motion [Hz] that no soft robot has: the mean rate, by its speed over its spread."""
+NOT_TOLD, NOT_WHOLE = 2.0, 4.0
+"""How much speaks for seconds that no name tells another unit, and that stamps have decimals, in squared decades."""
+RESTING = 3e-3
+"""Share of the largest coordinate: markers that spread by less rest, and show the rate of noise."""
+MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
+"""A soft arm moves by less than so many metres, and its drives turn by less than so many radians."""
+METRES_UP_TO = 0.2
+"""No cable of a soft arm is pulled by more metres."""
+
+
+BENT, UPRIGHT = 2.0, 1.1
+"""By which factor two markers may be nearer than on the undeformed robot, and a single marker's distance may differ
+from its height: its origin need not be the base."""
+
+
+class Unit(NamedTuple):
+    """A unit of columns.
+
+    Attributes:
+        unit: of most of them.
+        others: columns in other units, which convert to it.
+        evidence: why it was guessed; empty if the names or a line of units tell it.
+    """
+
+    unit: str
+    others: Mapping[str, str] = {}
+    evidence: str = ""
+
+
+def told_unit(table: CsvTable, names: Sequence[str], known: Collection[str] = frozenset(UNITS.values())) -> Unit | None:
+    """The unit, one of ``known``, that columns carry in their names, as ``x1_mm``, or in a line of units below them.
+
+    None if no column tells a unit.
+
+    Raises:
+        InputError: units of several kinds, such as a length and an angle.
+    """
+    found = {name: unit for name in names if (unit := _of_column(table, name, known)) is not None}
+    if not found:
+        return None
+    common = Counter(found.values()).most_common(1)[0][0]
+    kinds = {_kind(unit): name for name, unit in found.items()}
+    if len(kinds) > 1:
+        one, other = list(kinds.values())[:2]
+        raise InputError(
+            f"columns of one kind are in several units: {one} in {found[one]}, {other} in {found[other]}",
+            where=str(table.path),
+            remedy="bring all to lengths of cable or to angles of motors, or write [data.columns] for some of them",
+        )
+    silent = [name for name in names if name not in found]
+    evidence = f"{next(iter(found))} tells it, and {silent[0]} tells none" if silent else ""
+    return Unit(common, {name: unit for name, unit in found.items() if unit != common}, evidence)
+
+
+def _of_column(table: CsvTable, name: str, known: Collection[str]) -> str | None:
+    below = {UNITS[word] for word in WORD.findall(table.units.get(name, "").lower()) if UNITS.get(word) in known}
+    told = below or {UNITS[word] for word in WORD.findall(name.lower()) if UNITS.get(word) in known}
+    return told.pop() if len(told) == 1 else None
+
+
+def _kind(unit: str) -> str:
+    return "rad" if unit == named_columns.COUNTS else COMMAND_UNITS[unit][0]
+
+
+def foreign_unit(table: CsvTable, names: Sequence[str]) -> str | None:
+    """The unit of commands that is neither a length nor an angle, if all of some columns tell it."""
+    for unit, words in FOREIGN.items():
+        if names and all(words.search(table.units.get(name, "")) or words.search(name) for name in names):
+            return unit
+    return None
+
+
+def length_unit(values: pd.DataFrame) -> Unit:
+    """The unit of positions by their size."""
+    largest = float(np.nanmax(np.abs(values.to_numpy())))
+    return Unit("mm" if largest > MILLIMETRES_ABOVE else "m", evidence=f"positions reach {largest:.3g}")
+
+
+def unit_of_places(start: Float[np.ndarray, "marker 3"], heights: Mapping[str, float]) -> Unit | None:
+    """The unit in which markers are as far apart, or a single marker as far from the base, as on the robot.
+
+    None if no unit brings them near.
+
+    Args:
+        start: where each marker is first seen, in the unit that is looked for.
+        heights: of the same markers on the robot [m], in their order.
+    """
+    names, height = list(heights), np.array(list(heights.values()))
+    i, j = int(np.argmin(height)), int(np.argmax(height))
+    single = i == j
+    found = float(np.linalg.norm(start[j] - (0.0 if single else start[i])))
+    known = float(height[j] - (0.0 if single else height[i]))
+    if not (np.isfinite(found) and found > 0.0 and known > 0.0):
+        return None
+    unit = min(METRES, key=lambda unit: abs(np.log(found * METRES[unit] / known)))
+    if abs(np.log(found * METRES[unit] / known)) > np.log(BENT if not single else UPRIGHT):
+        return None
+    words = f"{names[j]} is {found:.3g} from " + ("the origin" if single else names[i])
+    return Unit(unit, evidence=f"{words}, and {1e3 * known:.4g} mm on the robot")
+
+
+def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) -> Unit:
+    """The unit of commands by their names, or else by their size."""
+    told = told_unit(table, names)
+    if told is not None or not names:
+        return told or Unit("mm")
+    foreign = foreign_unit(table, names)
+    if foreign is not None:
+        return Unit(foreign)
+    if all(ANGLE.search(name) for name in names):
+        return angle_unit(values, names)
+    largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
+    whole = all(pd.api.types.is_integer_dtype(values[name]) for name in names)
+    evidence = f"{_span(names)} reach {largest:.3g}" + (" in whole numbers, as counts do" if whole else "")
+    return Unit("mm" if largest > METRES_UP_TO else "m", evidence=evidence)
+
+
+def angle_unit(values: pd.DataFrame, names: Sequence[str]) -> Unit:
+    """The unit of angles by their size."""
+    largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
+    return Unit("deg" if largest > DEGREES_ABOVE else "rad", evidence=f"{_span(names)} reach {largest:.3g}")
+
+
+def _span(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+
+
+def told_time_units(table: CsvTable, name: str) -> set[str]:
+    """Units of time that words in a column's name tell, or the line of units below it."""
+    words = re.findall(r"[^\W_]+", f"{table.units.get(name, '')}".lower()) or re.findall(r"[^\W_]+", name.lower())
+    return {TIME_UNITS[word] for word in words if word in TIME_UNITS}
+
+
+def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = None) -> Unit:
+    """The unit of times that a name or a line of units tells, or else their size and the motion between rows.
+
+    Args:
+        table: that has them.
+        time: their column; None without times.
+        places: of the markers in any unit, a row of coordinates for each time; None if they are not known.
+    """
+    if time is None or len(table) < 2:
+        return Unit("s")
+    stamps = table.stamps(time, "s")
+    told = told_time_units(table, time)
+    if stamps.dated or len(told) == 1:
+        return Unit("s" if stamps.dated else told.pop())
+    interval, first = pace(stamps.since(stamps, str(table.path))), float(stamps.ticks[0])
+    count = float(stamps.ticks[-1] - stamps.ticks[0])
+    since = [
+        unit
+        for unit, ticks in PER_SECOND.items()
+        if SINCE_1970[0] < first / ticks < SINCE_1970[1] and interval / ticks < LONGEST_STEP
+    ]
+    unit = since[0] if since else _likeliest(interval, bool((stamps.ticks % 1 != 0).any()), _rate(places))
+    seconds = interval / PER_SECOND[unit]
+    rate = f"{1.0 / seconds:.4g} a second" if seconds <= 1.0 else f"one every {seconds:.3g} s"
+    words = f"{count / PER_SECOND[unit]:.3g} s of {len(table)} rows, {rate}"
+    return Unit(unit, evidence=words + (", counted from 1970" if since else ""))
+
+
+def command_time_unit(table: CsvTable, time: str | None, duration: float) -> Unit:
+    """The unit of the commands' own times: as told, or the unit in which they last as long as the recording [s]."""
+    found = time_unit(table, time)
+    if time is None or not found.evidence or duration <= 0.0 or "1970" in found.evidence:
+        return found
+    stamps = table.stamps(time, "s")
+    count = float(stamps.ticks[-1] - stamps.ticks[0])
+    unit = min(PER_SECOND, key=lambda unit: abs(np.log10(max(count, 1e-9) / PER_SECOND[unit] / duration)))
+    return Unit(unit, evidence=f"commands over {count / PER_SECOND[unit]:.3g} s, the recording over {duration:.3g} s")
+
+
+def _rate(places: np.ndarray | None) -> float:
+    """Mean rate of motion, in turns a row: the speed of the markers over their spread; zero if they rest."""
+    if places is None or len(places) < 3:
+        return 0.0
+    step, spread = np.sqrt(np.nanmean(np.diff(places, axis=0) ** 2)), np.sqrt(np.nanmean(np.nanvar(places, axis=0)))
+    return float(step / (2.0 * np.pi * spread)) if spread > RESTING * np.nanmax(np.abs(places)) else 0.0
+
+
+def _likeliest(interval: float, decimals: bool, rate: float) -> str:
+    """The unit in which time between rows and rate of motion are most like those of soft robots.
+
+    Motion that would be faster than any soft robot's rules a unit out: rows between which markers go to and fro are
+    poses at rest, seconds apart.
+    """
+
+    def unlikely(unit: str) -> tuple[bool, float]:
+        seconds = interval / PER_SECOND[unit]
+        motion = rate / seconds
+        far = np.log10(seconds / USUAL_STEP) ** 2 + (np.log10(motion / USUAL_RATE) ** 2 if rate else 0.0)
+        return motion > FASTEST_MOTION, far + (unit != "s") * (NOT_TOLD + NOT_WHOLE * decimals)
+
+    return min(PER_SECOND, key=unlikely)

@@ -1,0 +1,225 @@
+"""What is doubtful of recordings as they were read, said once: by ``check``, and on the page of every later answer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.cautions import Caution, Code, read_cautions
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import Workpiece
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.motion_check import Motion, motion_cautions
+from rfdropo_bayes.verbs.motion_direction import Paths, direction_of
+from rfdropo_bayes.verbs.motion_size import size_of
+from rfdropo_bayes.verbs.placement import NEAR, placement_hints
+
+DOUBTS = "doubts"
+"""Attribute of a posterior: cautions of the recordings that it is of."""
+MILLIMETRES = 1e3
+MOST_NAMES = 12
+FEWEST_DRAWS = 8
+"""Of the prior, whose median stands for the nominal model."""
+
+
+def recording_cautions(
+    robot: Workpiece, recordings: Sequence[Trajectory], columns: CsvColumns | None = None
+) -> list[Caution]:
+    """What is doubtful of recordings: how they were read, where they begin, and what was asked of the robot.
+
+    Args:
+        robot: that they are of.
+        recordings: as they were read.
+        columns: the table by which they were read; None for formats that have none.
+    """
+    found = [
+        Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
+        for recording in recordings
+        for note in recording.notes
+    ]
+    for recording in recordings:
+        found += _misnamed(recording, robot.marker_names)
+    if isinstance(robot, Robot):
+        for recording in recordings:
+            found += _unasked(recording, robot) + _beyond_the_body(recording, robot)
+        found += _placements(robot, recordings, columns)
+    return found + _copies(recordings)
+
+
+def cautions_of_fit(
+    model: Model, recordings: Sequence[Trajectory], predictions: Iterable[RecordingPrediction]
+) -> list[Caution]:
+    """The same of what was fitted and tested, and what the motion under the prior says of frame, size and commands.
+
+    Args:
+        model: that was fitted.
+        recordings: fitted ones first, then test recordings.
+        predictions: of them, with predictions under the prior.
+    """
+    paths = [each for prediction in predictions for each in _prior_paths(prediction)]
+    return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
+
+
+def cautions_of_audit(model: Model, recordings: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
+    """The same of an audit, whose ``paths`` are those of the nominal model."""
+    return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
+
+
+def cautions_after(fit: PosteriorRecord, model: Model, recordings: Sequence[Trajectory]) -> list[Caution]:
+    """What is doubtful of recordings that a fit is brought to, and of those that it is from; each once."""
+    return list(dict.fromkeys([*recorded_doubts(fit), *_read(model, recordings)]))
+
+
+def with_doubts(record: PosteriorRecord, cautions: Sequence[Caution]) -> PosteriorRecord:
+    """A posterior that says what is doubtful of its recordings, so that all later answers from it say so."""
+    return replace(record, attrs={**record.attrs, DOUBTS: [caution.as_dict() for caution in cautions]})
+
+
+def recorded_doubts(record: PosteriorRecord) -> list[Caution]:
+    """What a posterior says of its recordings."""
+    return read_cautions(record.attrs.get(DOUBTS, []))
+
+
+def _read(model: Model, recordings: Sequence[Trajectory]) -> list[Caution]:
+    return recording_cautions(model.spec.robot, recordings, columns_of(model))
+
+
+def columns_of(model: Model) -> CsvColumns | None:
+    """The table by which recordings of a model's experiment are read."""
+    return None if model.settings.data is None else model.settings.data.columns
+
+
+def _moved(model: Model, first: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
+    """What motions say; of a robot alone, whose base has a z axis along the body."""
+    if not (isinstance(model.spec.robot, Robot) and paths):
+        return []
+    motion = Motion(direction_of(paths), size_of(paths))
+    return motion_cautions(motion, columns_of(model), first[0].cable_names, first[0].command_unit)
+
+
+def _prior_paths(prediction: RecordingPrediction) -> list[Paths]:
+    """A fitted recording beside the median of its predictions under the prior; empty where too few were made."""
+    drawn = prediction.prior_predicted
+    if drawn is None:
+        return []
+    whole = np.asarray(drawn)[np.isfinite(drawn).all(axis=(1, 2, 3))]
+    if len(whole) < FEWEST_DRAWS:
+        return []
+    return [Paths(np.median(whole, axis=0), np.asarray(prediction.observed), np.asarray(prediction.mask))]
+
+
+def _misnamed(recording: Trajectory, markers: Sequence[str]) -> list[Caution]:
+    """Markers of a recording under names that the robot does not have, while it lacks markers of the robot's."""
+    unknown = [name for name in recording.marker_names if name not in markers]
+    unseen = [name for name in markers if name not in recording.marker_names]
+    if not (unknown and unseen) or len(unseen) == len(markers):
+        return []
+    sentence = (
+        f"{recording.name}: {shortened(unknown)} of the recording is no marker of the robot, and {shortened(unseen)} "
+        "of the robot is not in the recording: where both are the same point, give it one name, in markers under "
+        "[data.columns] or in the robot file"
+    )
+    return [Caution(Code.RECORDING_DOUBTFUL, sentence)]
+
+
+def _unasked(recording: Trajectory, robot: Robot) -> list[Caution]:
+    """Markers that go on moving while no command changes: a step into the recording has come to rest by its middle."""
+    if np.ptp(recording.command, axis=0).any():
+        return []
+    middle = len(recording.time) // 2
+    late = np.where(recording.position_mask[middle:, :, None], recording.position[middle:], np.nan)
+    seen = late[:, np.isfinite(late).any(axis=(0, 2))]
+    way = float((np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0)).max(initial=0.0))
+    if way <= NEAR * robot.length:
+        return []
+    sentence = (
+        f"{recording.name}: no command changes, and in the second half of the recording a marker still moves by "
+        f"{MILLIMETRES * way:.3g} mm: look at the columns of the commands"
+    )
+    return [Caution(Code.RECORDING_DOUBTFUL, sentence)]
+
+
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
+"""Factor and unit in which what drives a cable or a chamber is shown."""
+
+
+def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows cable"] | None:
+    """Demand on each cable or chamber, in SI units of its drive; None for commands that do not fit the robot."""
+    if len(recording.cable_names) != len(robot.channel_names) or recording.command_unit != robot.command_unit:
+        return None
+    try:
+        travel = robot.travel(recording.name, recording.initial_command)
+    except InputError:
+        return None
+    command = recording.command if travel is None else travel.follow(recording.initial_command, recording.command)
+    return np.asarray(command @ np.asarray(robot.channel_matrix({})).T)
+
+
+def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
+    """Cables and chambers that are asked for more than they are allowed, in words; empty if there are none."""
+    low, high = asked.min(axis=0), asked.max(axis=0)
+    least, most = np.array(robot.drive_limits()).T
+    factor, unit = SHOWN[robot.actuators[0].unit]
+    return ", ".join(
+        f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
+        f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
+        for k in np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
+    )
+
+
+def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
+    """Cables that are asked for more than a body has."""
+    asked = asked_pulls(robot, recording)
+    length = robot.length
+    if (
+        robot.actuators[0].unit != "m"
+        or asked is None
+        or asked.max(initial=0.0) <= length
+        or not cables_beyond(robot, asked)
+    ):
+        return []
+    sentence = (
+        f"{recording.name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: "
+        f"{cables_beyond(robot, asked)}: look at command_unit, at counts_per_turn, and at spool_radius and gain of the "
+        "robot file"
+    )
+    return [Caution(Code.UNIT_DOUBTFUL, sentence)]
+
+
+def _placements(robot: Robot, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> list[Caution]:
+    """First rows far from the undeformed robot, with a cause; recordings alike share one caution."""
+    shared: dict[str, list[str]] = {}
+    for recording in recordings:
+        for hint in placement_hints(robot, recording, columns):
+            shared.setdefault(hint, []).append(recording.name)
+    return [Caution(Code.FRAME_DOUBTFUL, f"{shortened(names)}: {hint}") for hint, names in shared.items()]
+
+
+def _copies(recordings: Sequence[Trajectory]) -> list[Caution]:
+    """Recordings of the same content: noise never repeats, so that one of them is a copy."""
+    alike: dict[str, list[str]] = {}
+    for recording in recordings:
+        alike.setdefault(recording.sha256, []).append(recording.name)
+    return [
+        Caution(
+            Code.RECORDING_DOUBTFUL,
+            f"{shortened(names)} are the same to the last digit: a copy is no second measurement, and tests nothing; "
+            "list one of them",
+        )
+        for names in alike.values()
+        if len(names) > 1
+    ]
+
+
+def shortened(names: Sequence[str]) -> str:
+    """Names with commas; of many the first and the last."""
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:3])}, ..., {names[-1]} ({len(names)})"

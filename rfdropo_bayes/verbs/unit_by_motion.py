@@ -1,0 +1,111 @@
+"""Which unit of the commands makes cables bend a robot as far as its markers moved: constant curvature, no simulation.
+
+A cable that is pulled by :math:`d` at radius :math:`r` turns the body at its end by :math:`d / r` towards itself. The
+turn of all cables of a segment is the one that fits their displacements in least squares. It adds up from segment to
+segment, and a marker follows the mean turn below it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data.named_columns import COMMAND_UNITS
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.column_units import Unit
+from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
+
+MOST_TURN = np.pi
+"""Of a body [rad]: no cable bends a body farther."""
+MISREAD = 5.0
+"""Ratio of the measured motion and this estimate from which on a guessed unit is given up for one that explains it."""
+STEPS = 81  # along the body
+
+
+def driven_motion(
+    robot: Robot, command: Float[np.ndarray, "row channel"], heights: Sequence[float]
+) -> Float[np.ndarray, "row marker 2"] | None:
+    """Where markers at these heights go across the body [m] under commands [m or rad]; None if no body turns so far."""
+    place = np.linspace(min(cable.anchor_z_m for cable in robot.cables), max(heights), STEPS)
+    pull = _pulls(robot, command)
+    if np.linalg.norm(_turns(robot, pull, place), axis=2).max() > MOST_TURN:
+        return None
+    turn = _turns(robot, np.clip(pull, *np.array(robot.drive_limits()).T), place)
+    slope = turn * np.sinc(np.linalg.norm(turn, axis=2, keepdims=True) / np.pi)
+    between = 0.5 * np.diff(place)[:, None, None] * (slope[1:] + slope[:-1])
+    across = np.concatenate([np.zeros_like(slope[:1]), np.cumsum(between, axis=0)])
+    return np.stack([across[np.argmin(np.abs(place - height))] for height in heights], axis=1)
+
+
+def _turns(
+    robot: Robot, pull: Float[np.ndarray, "row cable"], place: Float[np.ndarray, " place"]
+) -> Float[np.ndarray, "place row 2"]:
+    """How far the body has turned at each height, towards x and y [rad]."""
+    ends = np.array([cable.guide_z_m[-1] for cable in robot.cables])
+    azimuth = np.radians([cable.azimuth_deg for cable in robot.cables])
+    radius = np.array([np.mean([cable.anchor_radius_m, *cable.guide_radius_m]) for cable in robot.cables])
+    arm = radius[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    turn, below, reached = np.zeros((len(place), len(pull), 2)), float(place[0]), np.zeros((len(pull), 2))
+    for end in np.unique(ends):
+        own = ends == end
+        whole = pull[:, own] @ np.linalg.pinv(arm[own]).T
+        share = np.clip((place - below) / (end - below), 0.0, 1.0)
+        turn += share[:, None, None] * (whole - reached)
+        below, reached = float(end), whole
+    return turn
+
+
+def _pulls(robot: Robot, command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row cable"]:
+    """How far each cable is asked to be pulled [m]."""
+    return command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
+
+
+def spread(position: Float[np.ndarray, "row marker axis"]) -> float:
+    """Root mean square motion of markers about their mean [m]; 0 if none is seen."""
+    lost = ~np.isfinite(position).all(axis=2)
+    places = [own[~gone] for own, gone in zip(np.moveaxis(position, 1, 0), lost.T, strict=True) if not gone.all()]
+    squares = [np.sum((own - own.mean(axis=0)) ** 2, axis=1) for own in places]
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
+
+
+def unit_of_motion(
+    robot: Robot,
+    command: Float[np.ndarray, "row channel"],
+    position: Float[np.ndarray, "row marker 3"],
+    heights: Mapping[str, float],
+    guessed: Unit,
+) -> Unit:
+    """A guessed unit of commands, or the one that explains the motion where that does not, with the evidence.
+
+    Args:
+        robot: whose cables impose lengths or angles.
+        command: values in the unit that is looked for.
+        position: of the markers [m], in any frame.
+        heights: of the same markers on the robot [m].
+        guessed: the unit by the size of the commands.
+    """
+    kind, size = COMMAND_UNITS.get(guessed.unit, ("", 1.0))
+    if kind not in IMPOSED or kind != robot.command_unit or not np.isfinite(command).all():
+        return guessed
+    seen = np.where((position == 0.0).all(axis=2, keepdims=True), np.nan, position)  # how some trackers lose a marker
+    measured, moved = spread(seen), dict[str, Size]()
+    if measured == 0.0:
+        return guessed
+    for name, (other, own) in COMMAND_UNITS.items():
+        driven = driven_motion(robot, own * command, list(heights.values())) if other == kind else None
+        if driven is not None:
+            moved[name] = Size(measured, spread(driven))
+    explaining = [name for name in moved if moved[name].within(EXPLAINED)]
+    chosen = guessed.unit
+    if explaining and not (chosen in moved and moved[chosen].within(MISREAD)):
+        chosen = min(explaining, key=lambda name: abs(np.log(COMMAND_UNITS[name][1] / size)))
+    said = [_driven_words(moved.get(name), name) for name in dict.fromkeys((chosen, guessed.unit))]
+    words = f"the markers move by {1e3 * measured:.3g} mm, by the cables {', '.join(said)}"
+    return Unit(chosen, guessed.others, f"{guessed.evidence}; {words}")
+
+
+def _driven_words(size: Size | None, unit: str) -> str:
+    """How far the cables move the markers, in words."""
+    return f"in {unit} " + ("farther than any body bends" if size is None else f"{1e3 * size.nominal:.3g} mm")

@@ -1,0 +1,112 @@
+"""Tables of text as other laboratories have them: separators, no names, a line of units, rows without time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.data import CsvColumns, read_plain_csv
+from rfdropo_bayes.data.csv_layout import dialect_of, units_above, without_names
+from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.errors import InputError
+
+NAMES = ["t", "u", "x", "y", "z"]
+ROWS = [[0.0, 1.5, 100.5, 0.25, 0.0], [0.5, 2.0, 100.0, 1.0, 2.5], [1.0, 2.0, 100.0, 2.0, 5.25]]
+COLUMNS = {"time": "t", "commands": ["u"], "command_unit": "mm", "positions": [["x", "y", "z"]], "position_unit": "mm"}
+
+
+def text(separator: str = ",", decimal: str = ".", head: str | None = None) -> str:
+    lines = [separator.join(str(value).replace(".", decimal) for value in row) for row in ROWS]
+    return "\n".join([separator.join(NAMES) if head is None else head, *lines]).lstrip("\n") + "\n"
+
+
+def read(path, written: str, **changes):
+    path.write_text(written)
+    return read_plain_csv(path, CsvColumns.model_validate(COLUMNS | changes))
+
+
+def check(found) -> None:
+    np.testing.assert_allclose(found.time, [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(found.position[:, 0], 1e-3 * np.array(ROWS)[:, 2:])
+    np.testing.assert_allclose(found.command[:, 0], [1.5e-3, 2e-3, 2e-3])
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|", " ", ", ", " | "])
+@pytest.mark.parametrize("named", [True, False])
+def test_every_separator_is_seen_with_names_and_without(tmp_path, separator, decimal, named):
+    if separator.strip() == decimal == ",":
+        pytest.skip("nothing tells them apart")
+    written = text(separator, decimal, None if named else "")
+    check(read(tmp_path / "run.csv", written, **({} if named else {"names": NAMES})))
+
+
+def test_a_file_without_names_shows_its_first_rows_and_asks_for_names(tmp_path):
+    with pytest.raises(InputError, match=r"not the names of its 5 columns: row 0: 0\.0,1\.5.*names = \[\.\.\.\]"):
+        read(tmp_path / "run.csv", text(head=""))
+    with pytest.raises(InputError, match="has 5 columns, and names has 4"):
+        read(tmp_path / "run.csv", text(head=""), names=NAMES[1:])
+    with pytest.raises(InputError, match="begin in line 3, and no line names them"):
+        read(tmp_path / "run.csv", text(head="# logger 3\n# noon"))
+
+
+@pytest.mark.parametrize(
+    ("first", "unnamed"),
+    [
+        ("t,1,2,3", False),  # channels called by their numbers
+        ("0,1,2,3", False),  # pandas writes so what has no names
+        ("0.0,1.5,2,3", True),
+        ("2024-05-01T10:00:00,1.5,2,3", True),
+        ("0.0,pull,1.5,2", True),
+        ("t,label,x,y", False),
+        ("0,0,0,0", True),
+    ],
+)
+def test_names_are_told_from_values(first, unnamed):
+    below = ["0.5,pull,2.5,2", "1.0,rest,2.5,2"] if "pull" in first or "label" in first else ["1,2.5,2,3", "2,2.5,2,3"]
+    assert without_names([first, *below], ",") == unnamed
+
+
+@pytest.mark.parametrize("line", ["s,mm,mm,mm,mm", "[s],[mm],[mm],[mm],[mm]", "s,,mm,mm,mm", '"s","mm","mm","mm","mm"'])
+def test_a_line_of_units_is_no_row(tmp_path, line):
+    path = tmp_path / "run.csv"
+    check(read(path, text().replace("\n", f"\n{line}\n", 1)))
+    assert CsvTable(path, (), machine_written=False).units["x"] == "mm"
+
+
+@pytest.mark.parametrize("row", ["0.0,1.5,100,0,0", "a,b,c,d,e", ",,,,", "nan,nan,nan,nan,nan"])
+def test_a_row_of_values_or_words_is_no_line_of_units(row):
+    assert units_above([row, "0.5,2.0,100,1,2"], ",") is None
+
+
+def test_decimal_commas_that_come_late_are_seen():
+    assert dialect_of(["a;b", *["1;2"] * 100, "1,5;2"]) == (";", ",")
+
+
+def test_rows_without_time_are_a_second_apart_and_doubtful(tmp_path):
+    found = read(tmp_path / "run.csv", text(), time="rows")
+    np.testing.assert_array_equal(found.time, [0.0, 1.0, 2.0])
+    assert any("rows have no times" in note for note in found.notes)
+
+
+def test_columns_have_units_of_their_own(tmp_path):
+    found = read(tmp_path / "run.csv", text(), units={"u": "cm", "z": "cm"})
+    np.testing.assert_allclose(found.command[:, 0], [1.5e-2, 2e-2, 2e-2])
+    np.testing.assert_allclose(found.position[:, 0], np.array(ROWS)[:, 2:] * [1e-3, 1e-3, 1e-2], atol=1e-12)
+    with pytest.raises(InputError, match="no column of commands or positions"):
+        read_plain_csv(tmp_path / "run.csv", parsed(units={"t": "ms"}))
+    with pytest.raises(InputError, match="gives 'u' in 'rad', which cannot be brought to 'mm'"):
+        read_plain_csv(tmp_path / "run.csv", parsed(units={"u": "rad"}))
+
+
+def parsed(**changes) -> CsvColumns:
+    from rfdropo_bayes.tables import parse_table
+
+    return parse_table(CsvColumns, COLUMNS | changes, where="[data.columns]")
+
+
+def test_axes_of_a_left_handed_file_are_taken(tmp_path):
+    found = read(tmp_path / "run.csv", text(), axes=["x", "-y", "z"])
+    np.testing.assert_allclose(found.position[:, 0], 1e-3 * np.array(ROWS)[:, 2:] * [1.0, -1.0, 1.0])
+    with pytest.raises(InputError, match="quaternions have no mirror image"):
+        parsed(axes=["x", "-y", "z"], object_pose=list("abcdefg"))

@@ -1,0 +1,86 @@
+"""Audits of models whose rollouts are rough, or end: what counts as fitted, and what is asked all the same."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.discrepancy import held_out, pipeline
+from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
+from rfdropo_bayes.discrepancy.forward import Lanes
+from rfdropo_bayes.discrepancy.pipeline import audit
+from rfdropo_bayes.errors import NoLikelihoodError
+from rfdropo_bayes.report.audit_page import render_audit, shown
+
+from .toys import NOISE, Toy, problem
+
+TRUTH = {"gain": 1.3, "bend": -0.4}
+
+
+def said(answer):
+    """What audit.json has of an audit."""
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    return content
+
+
+class Rough(Toy):
+    """Motion whose slope promises, everywhere, what a jump takes back: markers are 100 to 300 deviations of the noise
+    away, however far the gain goes down its saw teeth."""
+
+    def rollout(self, parameters, commands, steps=None):
+        observed = super().rollout(parameters, commands, steps)
+        jump = 0.5 + (1e5 * parameters["gain"]) % 1.0
+        return observed._replace(position=observed.position + 200.0 * NOISE * jump)
+
+
+@pytest.mark.slow
+def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
+    answer = audit(replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
+    assert answer.verdict == "no_verdict"
+    content = said(answer)
+    assert not content["base_fit_converged"]
+    assert content["findings"] == []
+    assert "the fit of the base model has not converged" in content["sentence"]
+    assert "--from" in content["next_experiment"]["sentence"]
+    assert "has not converged" in render_audit(shown(answer), content, "rough", "")
+
+
+def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it(monkeypatch):
+    """What a base model lacks may drive it to where motion is rough: a cause counts if the model with it is fitted."""
+    fitted = pipeline._fitted_or_not
+
+    def unfitted(*given):
+        target, fit = fitted(*given)
+        return target, replace(fit, promise=np.inf)
+
+    monkeypatch.setattr(pipeline, "_fitted_or_not", unfitted)
+    answer = audit(problem({**TRUTH, "play": 1.0}, 1))
+    assert (answer.base.converged, answer.converged) == (False, True)
+    content = said(answer)
+    assert [finding["mechanism"] for finding in content["findings"]] == ["play"]
+    assert content["verdict"] == "explained"
+    assert "of the base model alone has not converged" in content["sentence"]
+
+
+@pytest.mark.parametrize("kept_aside", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_model_that_cannot_simulate_unseen_recordings_is_not_supported(monkeypatch, kept_aside):
+    """Its motion ends there; the audit goes on without it. Unseen are test recordings, or fitted ones in turn."""
+    asked, predict, lines = problem({**TRUTH, "play": 1.0}, 1), held_out._predict, []
+    if not kept_aside:
+        asked = replace(asked, model=replace(asked.model, recordings=asked.model.recordings.of(range(4))))
+    play = asked.candidate("play").indices[0]
+
+    def stops(target, fit, seed):
+        if play in fit.free:
+            raise NoLikelihoodError("a rollout at the optimum did not end well", where="audit", remedy="none")
+        return predict(target, fit, seed)
+
+    monkeypatch.setattr(held_out, "_predict", stops)
+    answer = audit(asked, report=lines.append)
+    assert (answer.causes.unsupported, answer.causes.steps) == (["play"], [])
+    assert said(answer)["verdict"] in ("unexplained", "described")
+    assert any("with play, an unseen recording cannot be simulated" in line for line in lines)

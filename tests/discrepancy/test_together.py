@@ -1,0 +1,71 @@
+"""Effects that pay only together, and effects that the base model has already. Seeds are fixed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.discrepancy import extension
+from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
+from rfdropo_bayes.discrepancy.fit import climb
+from rfdropo_bayes.discrepancy.pipeline import audit, base_model
+
+from .toys import Geared, Opposed, problem_of
+
+TRUTH = {"gain": 1.3, "bend": -0.4}
+
+
+@pytest.fixture(scope="module")
+def opposed():
+    """Stretch and slack of opposite signs, each of which alone takes next to nothing of what the base model leaves."""
+    return problem_of(Opposed(), {**TRUTH, "stretch": 25.0, "slack": -25.0}, 3)
+
+
+@pytest.mark.slow
+def test_two_effects_that_pay_only_together_are_named_together(opposed):
+    lines: list[str] = []
+    answer = audit(opposed, lines.append)
+    assert {step.name for step in answer.causes.steps} == {"stretch", "slack"}
+    assert any(line.startswith("refit with slack and stretch: ") for line in lines)
+    alone, beside = (step.log_bayes_factor for step in answer.causes.steps)
+    assert alone < opposed.rules.evidence < 30.0 < beside
+    assert answer.verdict == "explained"
+    values = opposed.coordinates.values(answer.draws)
+    for name, true in (("stretch", 25.0), ("slack", -25.0)):
+        sizes = values[:, opposed.coordinates.names.index(name)]
+        assert abs(sizes.mean() - true) < 4 * sizes.std()
+
+
+@pytest.mark.slow
+def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
+    monkeypatch.setattr(ExtensionSearch, "_pair", lambda *given: [])
+    assert audit(opposed).causes.steps == []
+
+
+def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drums_does_the_same(monkeypatch):
+    """A base fit that stopped at half the radius, and gains of the cables that make up for it. Climbs that do not move
+    at all show where they start: the base model at what imitates the gains, which is as good as they are."""
+    asked = problem_of(Geared(), {"radius": 1.0, **TRUTH}, 4, base=3)
+    target, right = base_model(asked, 0)
+    screen, _ = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(right)
+    radius, *gains = (asked.coordinates.names.index(name) for name in ("radius", "gain_a", "gain_b"))
+    stuck = partial(climb, evaluations=0)
+    half = 0.5 * asked.coordinates.named(right.x)["radius"]
+    halved, made_up = right.x.copy(), right.x.copy()
+    halved[radius] = made_up[radius] = asked.coordinates.encode_one(radius, (half,))[0]
+    made_up[gains] = half  # in deviations of a prior of one
+    stopped, extended = stuck(target, halved, right.free), stuck(target, made_up, np.array([*right.free, *gains]))
+    gained = extended.log_evidence - stopped.log_evidence
+    assert gained > 100.0
+    step = Added("cable_gains", ("cable_gains",), replace(screen, fit=stopped), extended, gained, {}, target)
+    monkeypatch.setattr(extension, "climb", stuck)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    again = search._climbed_again(step)
+    assert again is not None
+    assert again.x[radius] == pytest.approx(right.x[radius], rel=1e-3)
+    assert again.log_evidence > extended.log_evidence
+    # Where the base model is at its optimum, none is better.
+    assert search._climbed_again(replace(step, before=replace(screen, fit=right))) is None
