@@ -120,7 +120,7 @@ def pulls(channels: int, steps: int) -> np.ndarray:
 
 def bar() -> Assembly:
     """The uniform bar with cables on a circle, guided at every other station."""
-    body = fem.uniform_body(LENGTH, HALF_WIDTH, HALF_WIDTH, LAYERS)
+    body = fem.uniform_rod(LENGTH, HALF_WIDTH, HALF_WIDTH, LAYERS)
     angle = 2 * np.pi * np.arange(CABLES) / CABLES
     circle = 0.009 * np.stack([np.cos(angle), np.sin(angle), np.zeros(CABLES)], axis=1)
     height = np.array([0.0, 0.0, 1.0])

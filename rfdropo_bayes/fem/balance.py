@@ -38,8 +38,8 @@ class Energies(NamedTuple):
 
 
 def energies(system: System, prepared: Prepared, state: State) -> Energies:
-    """Kinetic energy with that of the sections' spin, elastic energy of the sections, and gravity's. What a Prony branch,
-    a wall and stretched cables hold is left out, and softening too."""
+    """Kinetic energy with that of the sections' spin, elastic energy of the sections, and gravity's. What a Prony
+    branch, a wall and stretched cables hold is left out, and softening too."""
     twist, length = twist_of(state), jnp.asarray(np.diff(system.body.station))
     return Energies(
         kinetic=0.5 * jnp.sum(twist * momentum(prepared, state, twist)),

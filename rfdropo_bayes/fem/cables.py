@@ -76,7 +76,10 @@ def routes(layout: CableLayout, body: Rod) -> list[Float[np.ndarray, "points 3"]
     """Anchor and guides of every cable on the undeformed body [m]."""
     height = np.einsum("cgs,cgs->cg", layout.weight, body.station[layout.station])
     place = layout.arm.sum(axis=2) + height[..., None] * [0.0, 0.0, 1.0]
-    return [np.vstack([anchor, points[used]]) for anchor, points, used in zip(layout.anchor, place, layout.used)]
+    return [
+        np.vstack([anchor, points[used]])
+        for anchor, points, used in zip(layout.anchor, place, layout.used, strict=True)
+    ]
 
 
 class Threads(NamedTuple):

@@ -318,10 +318,10 @@ def step(
 ) -> tuple[State, StepInfo]:
     """One time step to the commanded cable displacements [m] (pull > 0) at its end.
 
-    ``external_force`` are forces [N] and moments [N m] on the stations throughout the step. With a ``scene`` and a ``cube`` the body touches them;
-    the state says where the cube is. A step that is not finite leaves everything where it was, at rest and without
-    tension, and says so: a batch goes on. With a scene, effects that have a memory, or several stages a step,
-    the state comes from ``remembering``.
+    ``external_force`` are forces [N] and moments [N m] on the stations throughout the step. With a ``scene`` and a
+    ``cube`` the body touches them; the state says where the cube is. A step that is not finite leaves everything where
+    it was, at rest and without tension, and says so: a batch goes on. With a scene, effects that have a memory, or
+    several stages a step, the state comes from ``remembering``.
     """
     take = partial(take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
     return in_stages(take, state, displacement, STAGES[integrator])

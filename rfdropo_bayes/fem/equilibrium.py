@@ -24,10 +24,9 @@ from rfdropo_bayes.fem.integrators import Stage
 from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Way, all_rows, linearised, solved_stage
 
 ITERATIONS = 60
-SETTLED = 1e-9
-"""Largest motion in the last iteration, in body lengths and radians."""
-TOLERANCE = 1e-6
-"""Largest force out of balance, relative to the loads, that counts as equilibrium."""
+SETTLED, ROW_SETTLED = 1e-10, 1e-6
+"""Largest motion in the last iteration, in body lengths and radians: of the start of a rollout, and of a row of
+quasi-static motion."""
 LONGEST_STEP = 0.1
 """No station moves further than this many body lengths in an iteration."""
 WIDEST_TURN = 0.5
@@ -41,7 +40,7 @@ class EquilibriumInfo(NamedTuple):
     """How well the body is in equilibrium."""
 
     residual: Float[Array, ""]  # largest force on a station out of balance / sum of the loads
-    converged: Bool[Array, ""]  # residual within TOLERANCE, cable problem solved
+    converged: Bool[Array, ""]  # the body came to rest, cable problem solved
     diverged: Bool[Array, ""]
     iterations: Float[Array, ""]  # linear solves
 
@@ -62,7 +61,7 @@ class Found(NamedTuple):
     position: Float[Array, "stations 3"]
     orientation: Float[Array, "stations 4"]
     impulse: Float[Array, " rows"]  # tensions, and forces of friction [N]
-    solved: Float[Array, ""]  # 1 if the last constraint problem was
+    solved: Float[Array, ""]  # 1 if the body came to rest and the last constraint problem was solved
     iterations: Float[Array, ""]
     softness: Float[Array, " cables"]  # of the constraints [m/N]
 
@@ -107,7 +106,7 @@ def _bonds(system: System, task: Task, place: State, previous: Float[Array, " ca
     return bonds._replace(rows=rows, base=length - before, compliance=weight, slips=slips)
 
 
-def _find(system: System, iterations: int, task: Task) -> Found:
+def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
     """Newton's method. The increments are limited in length, and relaxed more whenever two in a row point against each
     other, which makes soft bodies far from straight converge, too."""
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
@@ -126,16 +125,21 @@ def _find(system: System, iterations: int, task: Task) -> Found:
         scale = jnp.minimum(relaxation, 1.0 / jnp.maximum(jnp.maximum(*far), 1e-300))
         moved = displaced(current.place, scale * increment)
         count = current.iterations + 1.0
-        return _Iterate(
-            moved, found.impulse, increment, relaxation, largest > SETTLED, found.converged, count, softness
-        )
+        return _Iterate(moved, found.impulse, increment, relaxation, largest > bound, found.converged, count, softness)
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
     none, whole = jnp.zeros((len(task.start.position), 6)), jnp.ones(())
     first = _Iterate(task.start, impulse, none, whole, jnp.array(True), whole, jnp.zeros(()), jnp.zeros(cables))
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
-    return Found(last.place.position, last.place.orientation, last.impulse, last.solved, last.iterations, last.softness)
+    return Found(
+        last.place.position,
+        last.place.orientation,
+        last.impulse,
+        jnp.where(last.moving, 0.0, last.solved),
+        last.iterations,
+        last.softness,
+    )
 
 
 def _unbalanced(
@@ -157,15 +161,15 @@ def _unbalanced(
     return forces[:, system.clamped_stations :], lacking
 
 
-def _balanced(system: System, iterations: int, task: Task) -> Found:
+def _balanced(system: System, iterations: int, bound: float, task: Task) -> Found:
     """The equilibrium, with derivatives by the implicit function theorem."""
 
     @jax.custom_jvp
     def solution(task: Task) -> Found:
-        return _find(system, iterations, task)
+        return _find(system, iterations, bound, task)
 
     def rule(primals: Any, tangents: Any) -> tuple[Found, Found]:
-        found = lax.stop_gradient(_find(system, iterations, *primals))
+        found = lax.stop_gradient(_find(system, iterations, bound, *primals))
         held, stations = system.clamped_stations, len(found.position)
         free = 6 * (stations - held)
 
@@ -193,9 +197,11 @@ def settled(
     displacement: Float[Array, " cables"],
     external_force: Float[Array, "stations 6"] | float = 0.0,
     iterations: int = ITERATIONS,
+    bound: float = ROW_SETTLED,
 ) -> tuple[State, EquilibriumInfo]:
     """The equilibrium that a state comes to under commanded cable displacements [m] and forces [N] and moments [N m] on
-    the stations: a row of quasi-static motion.
+    the stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
+    radians.
 
     Friction of the cables that the state's memory holds goes on; what flows has relaxed. Needs a clamped station.
     """
@@ -206,7 +212,7 @@ def settled(
         )
     external = jnp.broadcast_to(jnp.asarray(external_force, dtype=float), (len(state.position), 6))
     task = Task(prepared, state._replace(memory=memory._replace(slip=None, segment=None)), displacement, external, slip)
-    found = _balanced(system, iterations, task)
+    found = _balanced(system, iterations, bound, task)
     cables, unknown = len(displacement), jnp.zeros((len(state.position), 6))
     forces = _unbalanced(system, task, found, unknown, found.impulse)[0]
     loads = jnp.sum(jnp.abs(prepared.weight)) + jnp.sum(jnp.abs(external)) + jnp.sum(jnp.abs(found.impulse))
@@ -221,7 +227,7 @@ def settled(
         position=found.position, orientation=found.orientation, velocity=none, spin=none, tension=tension, memory=memory
     )
     taken, info = accept(system, state, moved, found.solved > 0.5)
-    converged = (residual < TOLERANCE) & info.converged & ~info.diverged
+    converged = info.converged & ~info.diverged
     return taken, EquilibriumInfo(residual, converged, info.diverged, found.iterations)
 
 
@@ -234,7 +240,7 @@ def static_equilibrium(
 ) -> tuple[State, EquilibriumInfo]:
     """Body at rest under its weight, forces [N] and moments [N m] on the stations, and the commanded cable
     displacements [m], from the undeformed body; see `settled`. Cables enter without friction."""
-    return settled(system, prepared, state_at_rest(system), displacement, external_force, iterations)
+    return settled(system, prepared, state_at_rest(system), displacement, external_force, iterations, SETTLED)
 
 
 def quasi_static_step(

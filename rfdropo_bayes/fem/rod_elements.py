@@ -5,7 +5,8 @@ q_v the vector part of the quaternion from one section to the other (Simo and Vu
 Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
 forces turn: under guided cables those of the rod and of the cables cancel nearly.
 
-An arc is longer than its chord: the stretch of an element is that of its chord and h^2 / 24 times its squared curvature.
+An arc is longer than its chord: the stretch of an element is that of its chord, and h^2 / 24 times its squared
+curvature. Without that an element that is pressed together between its ends would be too stiff in bending.
 
 Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
 moment, or velocity and spin, in space.

@@ -243,7 +243,8 @@ def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bond
     problem = kept.problem._replace(time_step=bonds.follows)
     if bonds.rows is not None:
         velocity = velocity.at[cables:].add(bonds.compliance @ found.impulse[cables:])
-        problem = problem._replace(slips=bonds.slips, contacts=bonds.contacts)
+        given = {"slips": bonds.slips, "contacts": bonds.contacts}
+        problem = problem._replace(**{name: part for name, part in given.items() if part is not None})
     return forces[:, way.held :], found.impulse - answers(problem, velocity)[0]
 
 

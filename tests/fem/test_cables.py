@@ -1,4 +1,4 @@
-"""Cables: geometry, the complementarity problem, and what a cable does to a body."""
+"""Cables: geometry, and the complementarity problem by both of its solutions."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import pytest
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.cables import guide_matrix, lengths_and_jacobian
+from rfdropo_bayes.fem.cable_problem import settle_cables
+from rfdropo_bayes.fem.cables import courses, lengths, rest_lengths, routes, station_rows, threads
+from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import CABLE_SOFTNESS, solve_constraints
+from rfdropo_bayes.fem.lanes import laned
 
 solve_tensions = jax.jit(lambda compliance, slack, start: solve_constraints(compliance, slack, start, 1.0))
 
@@ -60,53 +63,54 @@ def test_many_nearly_dependent_cables_never_fail(seed):
     assert np.all(np.abs(left + longest)[tension > 1e-9 * tension.max()] < 1e-12)
 
 
-def test_jacobian_is_the_derivative_of_the_lengths(trunk):
-    position = fem.rest_positions(trunk.body)
-    position = jnp.asarray(position + 1e-3 * np.random.default_rng(0).normal(size=position.shape))
-    guides = jnp.asarray(guide_matrix(trunk.cables, trunk.body.nodes))
-    length, jacobian = lengths_and_jacobian(trunk.cables, guides, position)
-    expected = jax.jacobian(lambda x: lengths_and_jacobian(trunk.cables, guides, x)[0])(position)
-    assert np.all(np.asarray(length) > 0.0)
-    np.testing.assert_allclose(jacobian, expected, atol=1e-14)
+def test_a_batch_of_cables_is_solved_as_each():
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(40, 5, 4))
+    compliance, slack = factor @ np.swapaxes(factor, 1, 2), rng.normal(size=(40, 5))
+    start = np.maximum(rng.normal(size=(40, 5)), 0.0)
+    softness = CABLE_SOFTNESS * np.einsum("bii->bi", compliance)
+    found, converged = jax.jit(jax.vmap(laned(settle_cables)))(compliance, slack, softness, start)
+    expected = jax.vmap(solve_tensions)(compliance, slack, start).cable
+    assert np.all(np.asarray(converged) == 1.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
-def test_pulled_cable_shortens_by_its_displacement_and_the_others_stay_slack(trunk, prepare, settle):
-    material = fem.material(trunk, young_modulus=1e6, poisson_ratio=0.4, density=1000.0)
-    prepared = prepare(trunk, material)
-    pull = 1e-5
-    state, info = settle(trunk, material, [pull, 0.0, -1e-4])
-    assert info.converged
-    length, _ = lengths_and_jacobian(trunk.cables, prepared.guides, state.position)
-    assert prepared.rest_length[0] - length[0] == pytest.approx(pull, rel=1e-6)
-    assert state.tension[0] > 0.0
-    # The second has grown by nothing yet is commanded to keep its length: it is taut or slack, never in compression.
-    assert state.tension[1] >= 0.0
-    assert state.tension[2] == 0.0
-    left = prepared.rest_length - jnp.array([pull, 0.0, -1e-4]) - length
-    assert np.all(np.asarray(left) > -1e-10)
-    assert np.abs(np.asarray(left * state.tension)).max() < 1e-10
+BODY = fem.uniform_rod(0.1, 0.01, 0.01, 4)
+ANCHORS = np.array([[0.01, 0.0, -0.01], [0.0, 0.008, 0.0], [-0.008, 0.0, 0.0]])
+GUIDES = {
+    "at the same stations": [[[0.01, 0.0, 0.05], [0.01, 0.0, 0.1]], [[0.0, 0.008, 0.05], [0.0, 0.008, 0.1]]],
+    "anywhere": [[[0.01, 0.0, 0.03], [0.009, 0.0, 0.06], [0.008, 0.0, 0.1]], [[0.0, 0.008, 0.07]]],
+}
 
 
-def test_tension_bends_towards_the_cable_and_falls_to_zero_on_release(trunk, trace):
-    material = fem.material(
-        trunk, young_modulus=1e6, poisson_ratio=0.4, density=1000.0, rayleigh_mass=5.0, rayleigh_stiffness=0.02
-    )
-    pull = 2e-3 * np.minimum(np.arange(1, 101) / 20.0, 1.0) * (np.arange(100) < 60)
-    commands = np.stack([pull, np.full(100, -0.02), np.full(100, -0.02)], axis=1)
-    states, info, _, _ = trace(material, fem.state_at_rest(trunk), commands, 0.01)
-    assert not np.any(info.diverged)
-    assert np.all(info.converged)
-    assert np.all(np.asarray(states.tension) >= 0.0)
-    tip = np.asarray(states.position)[:, -4:].mean(axis=1)
-    assert np.all(np.asarray(states.tension)[:60, 0] > 0.0)
-    assert tip[59, 0] > 5e-3
-    assert np.all(np.asarray(states.tension)[60:63, 0] == 0.0)
-    assert abs(tip[-1, 0]) < 0.5 * tip[59, 0]
-    # While taut, the cable has the commanded length: the linearised step misses it by the square of a step's motion.
-    guides = jnp.asarray(guide_matrix(trunk.cables, trunk.body.nodes))
-    rest = lengths_and_jacobian(trunk.cables, guides, fem.state_at_rest(trunk).position)[0]
-    held = lengths_and_jacobian(trunk.cables, guides, states.position[59])[0]
-    assert rest[0] - held[0] == pytest.approx(2e-3, rel=1e-3)
+@pytest.mark.parametrize("places", list(GUIDES))
+def test_rows_are_the_derivatives_of_the_lengths(places):
+    guides = [np.array(points) for points in GUIDES[places]]
+    layout = fem.cable_layout(BODY, ANCHORS[:2], guides)
+    rng = np.random.default_rng(0)
+    straight = np.stack([np.zeros(5), np.zeros(5), BODY.station])
+    position = jnp.asarray(straight + 2e-3 * rng.normal(size=(3, 5)))
+    quaternion = turned(jnp.eye(4)[:, :1] + jnp.zeros((4, 5)), jnp.asarray(0.2 * rng.normal(size=(3, 5))))
+    thread = threads(layout)
+
+    def length(change):
+        frame = rotation(turned(quaternion, change[3:]))
+        return lengths(courses(layout, thread, position + change[:3], frame))
+
+    course = courses(layout, thread, position, rotation(quaternion))
+    rows = station_rows(layout, thread, course.lever, course.pull, 5)
+    expected = jax.jacobian(length)(jnp.zeros((6, 5)))
+    np.testing.assert_allclose(jnp.moveaxis(rows, 2, 0), jnp.swapaxes(expected, 1, 2), atol=1e-13)
+    on_lanes = jax.vmap(laned(lambda p, q, t: courses(layout, t, p, rotation(q))), (0, 0, None))
+    many = on_lanes(position[None], quaternion[None], thread)
+    np.testing.assert_allclose(many.length[0], course.length, rtol=1e-14)
+    listed = laned(lambda lever, pull, t: station_rows(layout, t, lever, pull, 5))(course.lever, course.pull, thread)
+    np.testing.assert_allclose(listed, rows, atol=1e-15)
+    for route, points, anchor, rest in zip(
+        routes(layout, BODY), guides, ANCHORS, rest_lengths(layout, BODY), strict=False
+    ):
+        np.testing.assert_allclose(route, np.vstack([anchor, points]), atol=1e-12)
+        assert rest == pytest.approx(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
 
 
 @pytest.mark.parametrize(
@@ -117,6 +121,6 @@ def test_tension_bends_towards_the_cable_and_falls_to_zero_on_release(trunk, tra
         ([np.array([[0.0, 0.0, 0.05]])] * 2, "anchors"),
     ],
 )
-def test_impossible_cables_are_refused(trunk, guides, message):
+def test_impossible_cables_are_refused(guides, message):
     with pytest.raises(InputError, match=message):
-        fem.cable_layout(trunk.body, np.array([[0.01, 0.0, 0.0]]), guides)
+        fem.cable_layout(BODY, np.array([[0.01, 0.0, 0.0]]), guides)

@@ -1,4 +1,4 @@
-"""Rod elements: energy, forces, rates and tangent agree; rigid motions strain nothing; sections answer by their laws."""
+"""Rod elements: energy, forces, rates and tangent agree, with all laws; rigid motions strain nothing."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""SOFA's own recordings of the trunk: mesh, cables and commands of the paper's scene, both engines."""
+"""SOFA's own recordings of the trunk: mesh, cables and commands of the paper's scene."""
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
@@ -38,7 +37,7 @@ def scene_guides(pairs: int) -> list[np.ndarray]:
 
 
 class Scene:
-    """The trunk of the SOFA scene, ready for both engines."""
+    """The trunk of the SOFA scene, ready for the compiled engine."""
 
     def __init__(self, folder) -> None:
         mesh = read_tetrahedra(folder / "trunk.vtk", "mm")
@@ -95,20 +94,6 @@ def test_single_precision_stays_close(scene, datasets):
     error = error_mm(scene.fast(command, np.float32), recorded)
     assert error.mean() < 0.001
     assert error.max() < 0.01
-
-
-@pytest.mark.slow
-def test_reference_engine_gives_the_same_trajectory(scene, datasets):
-    command, recorded = recording(datasets, "reach_1")
-    command, recorded = command[:20], recorded[:20]
-    system = tetrahedral_system(scene.body, scene.cables, scene.limits)
-    values = {name: jnp.asarray(value) for name, value in PARAMETERS.items()}
-    material = TetrahedralMaterial(
-        **values, node_mass=jnp.asarray(scene.mass), stiffness_scale=jnp.ones(len(scene.body.element))
-    )
-    result = simulate(system, material, state_at_rest(system), jnp.asarray(command), TIME_STEP, scene.points)
-    assert error_mm(result.position, recorded).max() < ROUNDING
-    np.testing.assert_allclose(result.position, scene.fast(command), atol=1e-9)
 
 
 def test_commands_include_the_sixth_update_of_rounded_clocks():
