@@ -32,12 +32,7 @@ def _new_library(state: Any) -> CPUCodeLibrary:
 
 
 def _link_all(library: CPUCodeLibrary) -> None:
-    """Link what a library calls, directly or not, each once: what was deferred has linked nothing itself.
-
-    What is linked is visible to nothing else, so that LLVM may pass it the arguments it needs and no others: records
-    have tens of fields, and a function on a few numbers took most of its time to be handed them.
-    """
-    own = {function.name for function in library._final_module.functions}
+    """Link what a library calls, directly or not, each once: what was deferred has linked nothing itself."""
     called: dict[CPUCodeLibrary, None] = {}
     waiting = list(library._linking_libraries)
     while waiting:
@@ -47,9 +42,6 @@ def _link_all(library: CPUCodeLibrary) -> None:
             waiting.extend(other._linking_libraries)
     for other in called:
         library._final_module.link_in(CPUCodeLibrary._get_module_for_linking(other), preserve=True)
-    for function in library._final_module.functions:
-        if not function.is_declaration and function.name not in own:
-            function.linkage = "internal"
     library._linking_libraries = []
 
 

@@ -115,9 +115,9 @@ def _within(gap, reach, token):
 def _place_spheres(scene, touch, position, velocity, time_step, token):
     """The spheres' centres, and how far they may reach."""
     for sphere in range(scene.spheres):
-        x, y, z = centre_of(scene, scene.arm, touch, sphere, position, token)
+        x, y, z = centre_of(scene, scene.gradient, scene.arm, touch, sphere, position, token)
         store(touch.middle, 3 * sphere, x, y, z)
-        u, v, w = centre_velocity(scene, scene.arm, touch, sphere, velocity, token)
+        u, v, w = centre_velocity(scene, scene.gradient, scene.arm, touch, sphere, velocity, token)
         store(touch.reach, sphere, 2.0 * time_step * _length(u, v, w) + ALARM)
 
 
@@ -194,7 +194,7 @@ def _list_pushing(scene, touch, position, slot, reach, token):
             # The contact lies on the cube, below the sphere's centre.
             x, y, z = fnma(distance, nx, x), fnma(distance, ny, y), fnma(distance, nz, z)
             _list(touch, slot, CORNERS + sphere, _within(gap, near, token), x, y, z, nx, ny, nz, token)
-            place_offset(scene, scene.arm, touch, slot, sphere, position, token)
+            place_offset(scene, scene.gradient, scene.arm, touch, slot, sphere, position, token)
             slot += 1
     return slot
 
@@ -210,7 +210,7 @@ def _list_lying(scene, touch, position, slot, token):
         if any_greater(near, gap):
             pair, gap = CORNERS + scene.spheres + sphere, _within(gap, near, token)
             _list(touch, slot, pair, gap, zero, zero, zero, nx, ny, nz, token)
-            place_offset(scene, scene.arm, touch, slot, sphere, position, token)
+            place_offset(scene, scene.gradient, scene.arm, touch, slot, sphere, position, token)
             slot += 1
     return slot
 
@@ -247,9 +247,9 @@ def trunk_velocity(scene, touch, slot, kind, field, token):
     sphere = sphere_of(scene, touch.pair[slot])
     for k in range(scene.first[sphere], scene.first[sphere + 1]):
         value = load3(field, scene.place[k], token)
-        u = u + dot(row_entry(scene, scene.arm, touch, slot, k, 0, token), value)
-        v = v + dot(row_entry(scene, scene.arm, touch, slot, k, 1, token), value)
-        w = w + dot(row_entry(scene, scene.arm, touch, slot, k, 2, token), value)
+        u = u + dot(row_entry(scene, scene.gradient, scene.arm, touch, slot, k, 0, token), value)
+        v = v + dot(row_entry(scene, scene.gradient, scene.arm, touch, slot, k, 1, token), value)
+        w = w + dot(row_entry(scene, scene.gradient, scene.arm, touch, slot, k, 2, token), value)
     return u, v, w
 
 

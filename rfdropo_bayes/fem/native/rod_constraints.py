@@ -75,7 +75,7 @@ def _contact_panel(scene, touch, slot, border, panel, panels, token):
         place = scene.place[k]
         t = ((place // SIZE * panels + panel) * SIZE + place % SIZE) * 3
         for r in range(3):
-            entry = row_entry(scene, scene.arm, touch, slot, k, r, token)
+            entry = row_entry(scene, scene.gradient, scene.arm, touch, slot, k, r, token)
             for i in range(3):
                 store(border, t + 3 * i + r, load(border, t + 3 * i + r, token) + entry[i])
 
@@ -197,7 +197,7 @@ def _add_forces(scene, touch, impulses, lines, contacts, accepted, field, token)
         for k in range(scene.first[sphere], scene.first[sphere + 1]):
             push = zero, zero, zero
             for r in range(3):
-                entry = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                entry = row_entry(scene, scene.gradient, scene.arm, touch, slot, k, r, token)
                 push = added(entry, load(impulses, i + r, token), push)
             for j in range(3):
                 row = scene.place[k] + j

@@ -2,7 +2,8 @@
 
 A sphere of a mesh follows the affine motion of nodes around it; that of a rod is bound to sections. An entry of a
 sphere is a triple of the body's velocities. Entries of a rod come in pairs, translation and spin of a section.
-``arm``, of the scene, is None for a mesh: what is None is no part of the kernel that is compiled.
+``gradient``, of the scene, is None for a rod and ``arm`` for a mesh: what is None is no part of the kernel that is
+compiled.
 """
 
 from __future__ import annotations
@@ -28,24 +29,28 @@ def _on_sections(scene, touch, sphere, position, token):
 
 
 @kernel
-def centre_of(scene, arm, touch, sphere, position, token):
+def centre_of(scene, gradient, arm, touch, sphere, position, token):
     """Centre of a sphere; ``position``: of nodes, or frames of stations."""
-    if arm is None:
-        return weighted(scene.place, scene.centre, scene.first[sphere], scene.within[sphere], position, token)
-    return _on_sections(scene, touch, sphere, position, token)
+    zero = fill(0.0, position, token)
+    centre = zero, zero, zero
+    if gradient is not None:
+        centre = weighted(scene.place, scene.centre, scene.first[sphere], scene.within[sphere], position, token)
+    if arm is not None:
+        centre = _on_sections(scene, touch, sphere, position, token)
+    return centre
 
 
 @kernel
-def centre_velocity(scene, arm, touch, sphere, velocity, token):
+def centre_velocity(scene, gradient, arm, touch, sphere, velocity, token):
     """Velocity of a sphere's centre."""
-    first, last = scene.first[sphere], scene.within[sphere]
-    if arm is None:
-        return weighted(scene.place, scene.centre, first, last, velocity, token)
-    zero = fill(0.0, velocity, token)
+    first, last, zero = scene.first[sphere], scene.within[sphere], fill(0.0, velocity, token)
     total = zero, zero, zero
-    for k in range(first, last, 2):
-        total = added(load3(velocity, scene.place[k], token), scene.centre[k], total)
-        total = plus(total, cross(load3(velocity, scene.place[k + 1], token), load3(touch.lever, 3 * k, token)))
+    if gradient is not None:
+        total = weighted(scene.place, scene.centre, first, last, velocity, token)
+    if arm is not None:
+        for k in range(first, last, 2):
+            total = added(load3(velocity, scene.place[k], token), scene.centre[k], total)
+            total = plus(total, cross(load3(velocity, scene.place[k + 1], token), load3(touch.lever, 3 * k, token)))
     return total
 
 
@@ -70,32 +75,46 @@ def _gradient_offset(scene, touch, slot, sphere, position, token):
 
 
 @kernel
-def place_offset(scene, arm, touch, slot, sphere, position, token):
+def place_offset(scene, gradient, arm, touch, slot, sphere, position, token):
     """Where the sphere of a candidate touches, from its centre: in the body at rest for a mesh, in space for a rod."""
-    if arm is None:
+    if gradient is not None:
         _gradient_offset(scene, touch, slot, sphere, position, token)
-    else:
+    if arm is not None:
         back = fill(-scene.radius[sphere], touch.cube, token)
         put(touch.offset, 3 * slot, scaled(load3(touch.frame, 9 * slot, token), back))
 
 
 @kernel
-def row_entry(scene, arm, touch, slot, k, r, token):
+def _mesh_entry(scene, offset, way, centre, k, r):
+    """Entry of a node."""
+    if r == 0:
+        return scaled(way, centre)
+    x, y, z = offset
+    around = fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2]))
+    return scaled(way, around + centre)
+
+
+@kernel
+def _rod_entry(scene, touch, offset, way, entry, k, r, token):
+    """Entry of a section: of its translation as it is, else of its spin."""
+    if scene.place[k] % SIZE == 0:
+        return entry
+    lever = load3(touch.lever, 3 * (k - 1), token)
+    if r > 0:
+        lever = added(offset, scene.centre[k], lever)
+    return cross(lever, way)
+
+
+@kernel
+def row_entry(scene, gradient, arm, touch, slot, k, r, token):
     """Derivative of the velocity along row r of a candidate by entry k of its sphere.
 
     Normal impulses act at the sphere's centre, friction on its surface.
     """
     way, centre = load3(touch.frame, 9 * slot + 3 * r, token), fill(scene.centre[k], touch.cube, token)
-    if arm is None:
-        if r > 0:
-            x, y, z = load3(touch.offset, 3 * slot, token)
-            centre = (
-                fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2])) + centre
-            )
-        return scaled(way, centre)
-    if scene.place[k] % SIZE == 0:
-        return scaled(way, centre)
-    lever = load3(touch.lever, 3 * (k - 1), token)
-    if r > 0:
-        lever = added(load3(touch.offset, 3 * slot, token), centre, lever)
-    return cross(lever, way)
+    offset, entry = load3(touch.offset, 3 * slot, token), scaled(way, centre)
+    if gradient is not None:
+        entry = _mesh_entry(scene, offset, way, centre, k, r)
+    if arm is not None:
+        entry = _rod_entry(scene, touch, offset, way, entry, k, r, token)
+    return entry

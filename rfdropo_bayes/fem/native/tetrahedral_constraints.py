@@ -53,7 +53,7 @@ def _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, fre
             reached[node] = 1
             t = 9 * (panels * node + c - touch.count[3])
             for r in range(3):
-                entry = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                entry = row_entry(scene, scene.gradient, scene.arm, touch, slot, k, r, token)
                 add_to(rows.border, t + 3 * r, entry, token)
 
 
@@ -173,7 +173,7 @@ def add_forces(pattern, scene, touch, work, p, cables, contacts, free, token):
                 continue
             t = 9 * (pattern.first[node + 1] - pattern.border)
             for r in range(3):
-                push = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                push = row_entry(scene, scene.gradient, scene.arm, touch, slot, k, r, token)
                 add_to(work.lower, t, scaled(push, load(p.impulse, cables + 3 * c + r, token)), token)
 
 
@@ -190,7 +190,7 @@ def _add_impacts(scene, touch, work, p, cables, contacts, free, token):
                 continue
             total = load3(work.sudden, row, token)
             for r in range(3):
-                push = row_entry(scene, scene.arm, touch, slot, k, r, token)
+                push = row_entry(scene, scene.gradient, scene.arm, touch, slot, k, r, token)
                 total = added(push, load(p.before, cables + 3 * c + r, token), total)
             for j in range(3):
                 store(work.sudden, row + j, where_greater(taken, zero, total[j], zero))
