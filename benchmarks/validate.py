@@ -26,7 +26,6 @@ GROUPS = (
     references.large_deflections,
     references.bar,
     references.modes,
-    references.benchmarks,
     references.sliding,
     references.recordings,
 )
