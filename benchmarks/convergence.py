@@ -1,6 +1,6 @@
 """How near the motion comes to the converged one, for implicit Euler and SDIRK2, and what a millimetre costs.
 
-    python benchmarks/convergence.py [--layers | --prior N] [--robots NAME [NAME ...]] [--motions N] [--seconds S]
+    python benchmarks/convergence.py [--elements | --prior N] [--robots NAME [NAME ...]] [--motions N] [--seconds S]
 
 Every robot is pulled about at random: one command moves its cable by 5 mm every 50 ms, within its range. The error is
 the root mean square over motions and time of the tip's distance from the converged motion, that of SDIRK2 with the
@@ -8,8 +8,8 @@ shortest step. Usual damping is the robot's nominal one, small damping a stiffne
 that of one rollout on one thread; between two steps, and beyond the shortest, it follows the line through the last two
 points of error against time, in logarithms.
 
-With `--layers` the mesh is refined instead, every layer cut into 1, 2 and 4, with SDIRK2 at 10 ms: distances from the
-motion of 8 times the layers, in mm and in percent of the tip's root mean square way from its mean place.
+With `--elements` the rod is refined instead, every element cut into 1, 2 and 4, with SDIRK2 at 10 ms: distances from
+the motion of 8 times the elements, in mm and in percent of the tip's root mean square way from its mean place.
 
 With `--prior N` parameters are drawn N times from the robot's default priors, each with a motion of its own: the median
 and the 90 % quantile of the draws' errors, and how many lie beyond half a millimetre.
@@ -46,8 +46,8 @@ CONVERGED_MS = 0.3125
 SMALL_DAMPING = 0.002  # [s]
 ALLOWED = 1.0  # [mm]
 REFINED, FINEST = (1, 2, 4), 8
-"""Layers for each of the robot's own; the finest stands for the converged mesh."""
-LAYERS_MS = 10.0
+"""Elements for each of the robot's own; the finest stands for the converged rod."""
+ELEMENTS_MS = 10.0
 REPEATS = 3
 PRIOR_MS, PRIOR_CONVERGED_MS = (20.0, 10.0, 5.0), 1.25
 WANTED = 0.5  # [mm]
@@ -64,11 +64,11 @@ class Row(NamedTuple):
     cpu_s_for_1_mm: float
 
 
-class MeshRow(NamedTuple):
-    """One robot with more layers, by how many for each of its own."""
+class ElementRow(NamedTuple):
+    """One robot with more elements, by how many for each of its own."""
 
     robot: str
-    layers: int  # its own
+    elements: int  # its own
     error_mm: dict[str, float]
     share: dict[str, float]  # of the tip's way
     cpu_s: dict[str, float]  # of one rollout
@@ -165,30 +165,32 @@ def rows_of(robot: str, damping: float | None, motions: int, seconds: float) -> 
     return rows
 
 
-def mesh_row(robot: str, motions: int, seconds: float) -> MeshRow:
-    """A robot with more layers beside the one with the most."""
-    finest, _ = tip(robot, "sdirk2", LAYERS_MS, None, motions, seconds, FINEST)
+def element_row(robot: str, motions: int, seconds: float) -> ElementRow:
+    """A robot with more elements beside the robot with the most."""
+    finest, _ = tip(robot, "sdirk2", ELEMENTS_MS, None, motions, seconds, FINEST)
     way = error(finest, finest.mean(axis=1, keepdims=True))
-    found = MeshRow(robot, len(simulator(Robot.load(robot), "euler", LAYERS_MS).assembly.station_of) - 1, {}, {}, {})
+    found = ElementRow(
+        robot, len(simulator(Robot.load(robot), "euler", ELEMENTS_MS).assembly.system.body.station) - 1, {}, {}, {}
+    )
     for refine in REFINED:
-        path, cost = tip(robot, "sdirk2", LAYERS_MS, None, motions, seconds, refine)
+        path, cost = tip(robot, "sdirk2", ELEMENTS_MS, None, motions, seconds, refine)
         away = error(path, finest)
         found.error_mm[str(refine)], found.share[str(refine)], found.cpu_s[str(refine)] = away, away / way, cost
     return found
 
 
-def print_meshes(robots: list[str], motions: int, seconds: float) -> list[MeshRow]:
-    """Print the table of meshes."""
-    print("| robot | layers | " + " | ".join(f"{n} x: mm, % of the way, CPU ms" for n in REFINED) + " |")
+def print_elements(robots: list[str], motions: int, seconds: float) -> list[ElementRow]:
+    """Print the table of elements."""
+    print("| robot | elements | " + " | ".join(f"{n} x: mm, % of the way, CPU ms" for n in REFINED) + " |")
     print("|" + "---|" * (2 + len(REFINED)))
     rows = []
     for robot in robots:
-        row = mesh_row(robot, motions, seconds)
+        row = element_row(robot, motions, seconds)
         rows.append(row)
         cells = [
             f"{row.error_mm[n]:.2f}, {100.0 * row.share[n]:.1f}, {1e3 * row.cpu_s[n]:.1f}" for n in map(str, REFINED)
         ]
-        print("| " + " | ".join([row.robot, str(row.layers), *cells]) + " |", flush=True)
+        print("| " + " | ".join([row.robot, str(row.elements), *cells]) + " |", flush=True)
     return rows
 
 
@@ -227,16 +229,16 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
     parser.add_argument("--motions", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=3.0, help="of every motion")
-    parser.add_argument("--layers", action="store_true", help="refine the mesh instead of the time step")
+    parser.add_argument("--elements", action="store_true", help="refine the rod instead of the time step")
     parser.add_argument("--prior", type=int, metavar="N", help="draw so many times from the robot's default priors")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     chosen = parser.parse_args()
     if chosen.prior:
         return print_priors(chosen.robots, chosen.prior, chosen.seconds)
-    if chosen.layers:
-        meshes = print_meshes(chosen.robots, chosen.motions, chosen.seconds)
+    if chosen.elements:
+        refined = print_elements(chosen.robots, chosen.motions, chosen.seconds)
         if chosen.json:
-            chosen.json.write_text(json.dumps([row._asdict() for row in meshes], indent=1))
+            chosen.json.write_text(json.dumps([row._asdict() for row in refined], indent=1))
         return
     names = [f"{step:g}" for step in (*STEPS_MS, *FURTHER_MS)]
     steps = " | ".join(f"{name} ms" for name in names)

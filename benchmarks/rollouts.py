@@ -50,7 +50,7 @@ TIME_STEP = 0.01  # [s]
 TRUNK = "trunk_sofa"
 CUBE = " + cube"
 MESH = "mesh"
-LENGTH, HALF_WIDTH, LAYERS, CABLES = 0.195, 0.01, 20, 8
+LENGTH, HALF_WIDTH, ELEMENTS, CABLES = 0.195, 0.01, 20, 8
 SAG = 0.0948  # [m] of the tip, heavy elastica of the bar's length, section, modulus and density
 MESH_FILE = "sofa_trunk/trunk.vtk"
 MANY = 10_000
@@ -120,13 +120,13 @@ def pulls(channels: int, steps: int) -> np.ndarray:
 
 def bar() -> Assembly:
     """The uniform bar with cables on a circle, guided at every other station."""
-    body = fem.uniform_rod(LENGTH, HALF_WIDTH, HALF_WIDTH, LAYERS)
+    body = fem.uniform_rod(LENGTH, HALF_WIDTH, HALF_WIDTH, ELEMENTS)
     angle = 2 * np.pi * np.arange(CABLES) / CABLES
     circle = 0.009 * np.stack([np.cos(angle), np.sin(angle), np.zeros(CABLES)], axis=1)
     height = np.array([0.0, 0.0, 1.0])
     guides = [place + height * body.station[2::2, None] for place in circle]
     system = fem.System(body, fem.cable_layout(body, circle - 0.01 * height, guides))
-    return Assembly(system, fem.attach(body, LENGTH * height[None]), np.arange(LAYERS + 1))
+    return Assembly(system, fem.attach(body, LENGTH * height[None]), np.arange(ELEMENTS + 1))
 
 
 def bar_material(young_modulus: jax.Array, density: jax.Array, **changes: Any) -> fem.Material:

@@ -3,7 +3,7 @@
     python benchmarks/unknown_effects.py [--out reports/unknown_effects] [--effects crosstalk,bouc_wen] [--seeds 0,1]
                                          [--rho 1.0] [--null 0] [--alone | --force] [--body arm]
 
-Effects are those of `studies/unknown_effects.py`, hidden in recordings of the layered arm, or, with
+Effects are those of `studies/unknown_effects.py`, hidden in recordings of the arm, or, with
 ``--body mesh``, of SOFA's trunk on its own mesh, whose data and audits have one mesh and one time step; ``--null`` is
 the number of data sets with nothing hidden. A line of the ledger for each data set: verdict, port, law, unseen errors,
 and seconds. All share compiled simulators. A data set in the ledger is not run again. One takes one to four minutes on

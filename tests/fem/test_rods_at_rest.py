@@ -121,7 +121,7 @@ def rows_at_rest():
 
 @pytest.mark.slow
 def test_quasi_static_rows_keep_the_path_of_friction_and_have_derivatives(rows_at_rest):
-    (position, tension, converged), moved, back = rows_at_rest(0.2, 4e5)
+    (_, tension, converged), moved, back = rows_at_rest(0.2, 4e5)
     assert converged
     there, again = np.asarray(tension)[[1, 2]]
     assert there > again > 0.0

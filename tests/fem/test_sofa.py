@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.fem.cable_drive import DriveLimits, animated_commands

@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.errors import InputError

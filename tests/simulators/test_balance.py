@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.mesh_points import NodePoints
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.fem.mesh_points import NodePoints
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.body_engine import Backend, Engine
