@@ -19,6 +19,7 @@ from rfdropo_bayes.bayes.noise.autoregression import (
     rows_before,
 )
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.repeat_noise import deviations
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import Rules
@@ -80,11 +81,11 @@ def test_the_score_statistic_is_the_drop_of_the_sum_of_squares():
 
 def test_a_constrained_effect_counts_on_one_side_only():
     mark = signature(span(BASE), EFFECT, 1)
-    lm, surprise = statistic(mark, np.stack([EFFECT[:, 0], -EFFECT[:, 0]]))
-    assert lm[0] > 0.0
-    assert lm[1] == 0.0
+    seen = 2.0 * mark.basis[:, 0]
+    lm, surprise = statistic(mark, np.stack([seen, -seen]))
+    assert lm == pytest.approx([4.0, 0.0])
     assert surprise[1] == 0.0
-    assert np.exp(-surprise[0]) == pytest.approx(0.5 * stats.chi2.sf(lm[0], 1))
+    assert np.exp(-surprise[0]) == pytest.approx(0.5 * stats.chi2.sf(4.0, 1))
 
 
 def test_what_the_base_parameters_can_imitate_is_not_visible():
@@ -162,6 +163,22 @@ def test_whitening_is_the_inverse_of_the_covariance_across_gaps_as_well():
     expected = sum(series[p, 0] @ np.linalg.solve(covariance[p, p], series[p, 0]) for p in parts)
     assert np.sum(noise.whiten(series, valid) ** 2) == pytest.approx(expected)
     assert rows_before(valid)[13, 0] == 0
+
+
+def test_a_mean_of_four_repeats_has_half_the_noise():
+    noise = Autoregression(np.array([2.0]), np.ones(1), STATED, np.inf)
+    white = noise.whiten(np.full((3, 1), 6.0), np.ones((3, 1), dtype=bool), np.array([[1.0], [4.0], [9.0]]))
+    np.testing.assert_allclose(white[:, 0], [3.0, 6.0, 9.0])
+
+
+def test_the_mean_of_repeats_takes_one_degree_of_freedom_of_each_value():
+    """Three repeats of ten values, one of which two alone have; a recording without repeats says nothing."""
+    errors, valid = np.random.default_rng(3).normal(size=(4, 5, 2)), np.ones((4, 5, 2), dtype=bool)
+    valid[1, 2, 0] = False
+    about, counted, share = deviations(errors, valid, ((0, 1, 3), (2,)))
+    assert (about.shape, int(counted.sum())) == ((3, 5, 2), 29)
+    assert share == pytest.approx((29 - 10) / 29)
+    np.testing.assert_allclose(np.where(counted, about, 0.0).sum(axis=0), 0.0, atol=1e-12)
 
 
 def test_the_noise_is_found_from_deviations_of_repeats():

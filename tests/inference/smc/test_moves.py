@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 
 from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.space import build_space
-from rfdropo_bayes.inference.smc.moves import StraightProblem, distinct_size, fit_reference, propose
+from rfdropo_bayes.inference.smc.moves import Reference, StraightProblem, distinct_size, fit_reference, propose
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SIZES = np.array([1e-9, 1.0, 1e6])
@@ -52,6 +53,17 @@ def test_proposals_shaped_by_copies_of_one_particle_are_finite(where):
         proposal, ratio = propose(generator, draws(50) / SIZES, reference, 1.0 - 1e-3, 5.0)
     assert np.isfinite(proposal).all()
     assert np.isfinite(ratio).all()
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0])
+def test_proposals_are_reversible_under_the_students_t_of_their_reference(scale):
+    """Where it is the target, all are accepted: the ratio takes back what the density changes by."""
+    rng = np.random.default_rng(2)
+    factor = np.array([[1.0, 0.0], [0.7, 0.5]])
+    target = multivariate_t(loc=[1.0, -2.0], shape=factor @ factor.T, df=5.0, seed=rng)
+    position = target.rvs(40)
+    proposal, ratio = propose(rng, position, Reference(np.array([1.0, -2.0]), factor), scale, 5.0)
+    np.testing.assert_allclose(ratio, target.logpdf(position) - target.logpdf(proposal), atol=1e-9)
 
 
 class DaysApart(ProblemDefaults):
