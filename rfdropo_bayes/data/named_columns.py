@@ -234,11 +234,11 @@ class CsvColumns(BaseModel):
             raise ValueError("object_pose needs axes of a right-handed frame: quaternions have no mirror image")
         for name in self.units:
             self._factor(name)
-        for name, turn in self.unwrap.items():
+        for name, period in self.unwrap.items():
             if name not in (*self.commands, *(self.motor_angles or ())):
                 raise ValueError(f"unwrap names {name!r}, which is no column of commands or motor_angles")
-            if not (np.isfinite(turn) and turn > 0.0):
-                raise ValueError(f"unwrap gives {name!r} a turn of {turn:g}, which must be positive")
+            if not (np.isfinite(period) and period > 0.0):
+                raise ValueError(f"unwrap gives {name!r} a turn of {period:g}, which must be positive")
         return self
 
     def sized(self, unit: CommandUnit) -> tuple[str, float]:

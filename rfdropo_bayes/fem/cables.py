@@ -180,11 +180,11 @@ def station_rows(
         ((layout.weight != 0.0) | (layout.arm != 0.0).any(axis=-1))[:, :, : lever.shape[3]],
     )
     if len(index) == cables:  # every cable has its own
-        rows = [
+        each = [
             _at_stations(parts[:, cable], index[cable], bound[cable] & layout.used[cable, :, None], stations)
             for cable in range(cables)
         ]
-        return jnp.stack(rows, axis=2) if rows else jnp.zeros((stations, 6, 0, *lanes))
+        return jnp.stack(each, axis=2) if each else jnp.zeros((stations, 6, 0, *lanes))
     rows = parts.reshape(6 * cables, *parts.shape[2:])
     return _at_stations(rows, index[0], bound.any(axis=0), stations).reshape(stations, 6, cables, *lanes)
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 def pushed_forward(function: Callable[..., Any], primals: Any, tangents: Any) -> Any:
     """Tangent of a function. Nothing is computed for tangents that are symbolic zeros."""
     values, structure = jax.tree.flatten(primals)
-    changes = structure.flatten_up_to(tangents)
+    changes = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     moving = [i for i, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
 
     def moved(chosen: list[Array]) -> Any:

@@ -125,7 +125,7 @@ def linearised(body: StageBody) -> Linearised:
     slope = slopes(body.section, elements.strain)
     rates = rod_elements.strain_rates(elements, body.twist)
     resultant = answer(body.section, elements.strain) + body.behind * linear(slope, rates)
-    if body.branch is not None:
+    if body.branch is not None and body.gain is not None:
         resultant = resultant + body.gain * linear(body.section, elements.strain - body.branch)
     frame = rotation(body.orientation)
     momentum = inertia_times(body, frame, body.twist)
@@ -241,10 +241,12 @@ def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bond
     velocity = free_velocities(way, body, bonds, along(rows, body.twist), reached) + along(rows, found.change)
     velocity = velocity.at[:cables].add(bonds.give / body.span**2 * found.impulse[:cables])
     problem = kept.problem._replace(time_step=bonds.follows)
-    if bonds.rows is not None:
+    if bonds.compliance is not None:
         velocity = velocity.at[cables:].add(bonds.compliance @ found.impulse[cables:])
-        given = {"slips": bonds.slips, "contacts": bonds.contacts}
-        problem = problem._replace(**{name: part for name, part in given.items() if part is not None})
+    if bonds.slips is not None:
+        problem = problem._replace(slips=bonds.slips)
+    if bonds.contacts is not None:
+        problem = problem._replace(contacts=bonds.contacts)
     return forces[:, way.held :], found.impulse - answers(problem, velocity)[0]
 
 

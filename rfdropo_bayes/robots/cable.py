@@ -98,8 +98,8 @@ class Channels(RobotTable):
         description="the command channels, in the order of the columns of gain",
     )
     gain: tuple[tuple[float, ...], ...] = Field(
-        description="one row per cable, one column per channel: displacement [m] or tension [N] = gain @ command, times "
-        "the radius if commands are angles; pull > 0",
+        description="one row per cable, one column per channel: displacement [m] or tension [N] = gain @ command, "
+        "times the radius if commands are angles; pull > 0",
     )
     radius_parameter: Name | None = Field(
         default=None,

@@ -63,7 +63,7 @@ EFFECT_SIZES = BodyEffects(
     capstan_friction=0.1,
 )
 """Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
-QUASI_STATIC = "quasi-static"
+QUASI_STATIC: Literal["quasi-static"] = "quasi-static"
 """Motion of a body that is at rest in every row."""
 FAR_WOUND = 10.0
 """[m] No cable is wound in so far."""
@@ -88,9 +88,6 @@ class EngineBody(Protocol):
     @property
     def markers(self) -> PointMap | NodePoints:
         """Recorded points."""
-
-    def _replace(self, *, markers: PointMap | NodePoints = ...) -> Any:
-        """The same with other points."""
 
 
 class Backend(NamedTuple):
@@ -206,8 +203,9 @@ class Engine:
 
     def recording(self, points: PointMap | NodePoints) -> Engine:
         """The same engine in double precision, recording these points of the body in place of the markers."""
-        body, backend = self.body._replace(markers=points), self.backend._replace(precision="float64")
-        return replace(self, body=body, backend=backend)
+        body: Any = self.body
+        backend = self.backend._replace(precision="float64")
+        return replace(self, body=body._replace(markers=points), backend=backend)
 
     def motion(
         self,
@@ -272,7 +270,7 @@ class Engine:
         rollout = simulate(system, prepared, state, rows, self.time_step, markers, **options)
         first = point_positions(markers, state.position, state.orientation)
         pose = None
-        if cube is not None:
+        if cube is not None and rollout.pose is not None:
             begin = jnp.concatenate([cube.start.position, cube.start.orientation])
             pose = jnp.concatenate([begin[None], rollout.pose])
         return Motion(

@@ -81,7 +81,8 @@ class LanesBeforeCube:
         markers: Any = engine.body.markers
         spheres: Any = scene.spheres
         self._shown, self._count = len(markers.weight), count
-        body: Any = engine.body._replace(markers=joined([markers, spheres.centre]))
+        body: Any = engine.body
+        body = body._replace(markers=joined([markers, spheres.centre]))
         self._bodies = kind(replace(engine, body=body), count)
         self.save, self.restore = self._bodies.save, self._bodies.restore
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.pushing import PushGeometry, mesh_spheres, push_scene, rod_spheres
+from rfdropo_bayes.fem.pushing import MeshSpheres, PushGeometry, Spheres, mesh_spheres, push_scene, rod_spheres
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 from rfdropo_bayes.fem.rod import Rod
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
@@ -43,6 +43,7 @@ def scene_of(robot: Robot, body: Rod | TetrahedralBody) -> PushGeometry:
         InputError: the robot has no cube.
     """
     table = push_table(robot)
+    spheres: Spheres | MeshSpheres
     if isinstance(body, Rod):
         spheres = rod_spheres(body)
     else:

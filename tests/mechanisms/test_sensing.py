@@ -35,3 +35,10 @@ def test_at_zero_nothing_turns_and_the_derivative_is_the_cross_product():
 def test_the_camera_scale_is_relative():
     scaled = REGISTRY["camera_scale"]().sense({"camera_scale_error": jnp.asarray(0.02)}, POINTS)
     np.testing.assert_allclose(scaled, 1.02 * POINTS)
+
+
+def test_the_camera_drifts_from_the_first_row_whatever_its_clock_says():
+    values = {f"camera_drift_{axis}": jnp.asarray(speed) for axis, speed in zip("xyz", (0.01, 0.0, -0.02), strict=True)}
+    moved = REGISTRY["camera_drift"]().sense_over_time(values, POINTS, jnp.array([7.0, 7.5, 8.0, 9.0])) - POINTS
+    np.testing.assert_allclose(moved[0], 0.0, atol=1e-15)
+    np.testing.assert_allclose(moved[3], np.broadcast_to([0.02, 0.0, -0.04], (3, 3)), atol=1e-12)

@@ -20,6 +20,12 @@ def test_a_held_command_acts_in_the_step_that_starts_with_it():
     np.testing.assert_array_equal(commands.step[:, 0], [1.0, 1.0, 3.0, 3.0])
 
 
+def test_an_observation_that_jitters_by_nanoseconds_belongs_to_the_step_that_ends_there():
+    commands = grid([0.0], [1.0], [0.0, 0.05 - 2e-9, 0.1 + 3e-9], time_step=0.01)
+    np.testing.assert_array_equal(commands.sample_step, [0, 5, 10])
+    np.testing.assert_array_equal(commands.sample_fraction, 0.0)
+
+
 def test_a_ramp_spreads_a_change_over_its_duration():
     """SOFA's trunk: an action of 5 mm is carried out as 1 mm over each of 5 updates."""
     commands = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=0.01, ramp=0.05)

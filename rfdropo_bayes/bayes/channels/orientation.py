@@ -61,7 +61,8 @@ class Orientation(WhiteSeries):
                 does not have.
         """
         known, named = tuple(getattr(simulator, "section_names", ())), None
-        readings, valid = [], []
+        readings: list[np.ndarray] = []
+        valid: list[np.ndarray] = []
         for index, trajectory in enumerate(trajectories):
             if trajectory.orientation is None:
                 if needed is not None and index >= needed and readings:
