@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from rfdropo_bayes.report import build_summary, render_page
 from rfdropo_bayes.report import page as page_module
 from rfdropo_bayes.report.robot_figure import robot_figure
-from rfdropo_bayes.report.style import Panel, Picture, embed
+from rfdropo_bayes.report.style import Panel, embed
 from rfdropo_bayes.robots import Robot, known_robots, robot_shape
+from tests.undrawn import without_panels
 
 
 def grid(rows: int, columns: int, *, legend: bool = False) -> Figure:
@@ -89,7 +90,7 @@ def test_every_robot_has_a_picture(name):
 def test_the_verdict_comes_first_and_has_its_colour(run, monkeypatch):
     summary = build_summary(run.record, run.facts)
     monkeypatch.setattr(page_module, "_recording_views", lambda record, summary: [])
-    monkeypatch.setattr(page_module, "embed", lambda figure, alt, *_, **__: Picture((), alt, "", 0))  # draws nothing
+    monkeypatch.setattr(page_module, "embed", without_panels)
     for verdict, tone in (("safe", "safe"), ("with care", "with-care"), ("unsafe", "unsafe")):
         judged = {"verdict": verdict, "sentence": "So it is: for a reason.", "reasons": ["a reason"], "advice": []}
         page = render_page(run.record, {**summary, "randomisation": judged}, "")

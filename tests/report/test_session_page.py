@@ -11,7 +11,7 @@ import xarray as xr
 from rfdropo_bayes.data import GOAL_AXES, Trajectory
 from rfdropo_bayes.report import session_page
 from rfdropo_bayes.report.session_page import MotorSession, distance_to_goal, drive_rows, render_session, session_steps
-from rfdropo_bayes.report.style import Picture
+from tests.undrawn import without_panels
 
 GOAL = {"x": 0.0, "y": 0.0, "z": 0.2}
 
@@ -64,7 +64,7 @@ def session(cause: str = "finished", missed: int = 0, simulated: bool = False, *
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page's words alone: its pictures take seconds."""
-    monkeypatch.setattr(session_page, "embed", lambda figure, alt: Picture((), alt, "", 0))
+    monkeypatch.setattr(session_page, "embed", without_panels)
 
 
 def test_rows_of_drives_are_those_of_the_recording():

@@ -22,10 +22,10 @@ from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.report import page
-from rfdropo_bayes.report.style import Picture
 from rfdropo_bayes.verbs import adapt as adaptation
 from rfdropo_bayes.verbs import design_day as day_design
 from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
+from tests.undrawn import without_panels
 from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
@@ -137,8 +137,8 @@ def known():
 def adapted(known, zeros, tmp_path_factory):
     out = tmp_path_factory.mktemp("adapted") / "out"
     run = recorded(["morning"], zeros[9:10], 30)[0]
-    with pytest.MonkeyPatch.context() as patch:  # a page without its pictures, which take half of the time
-        patch.setattr(page, "embed", lambda figure, alt, *_, **__: Picture((), alt, "", 0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "embed", without_panels)
         return rb.adapt(known, run, seconds=0.5, group="today", seed=1, out=out, show=False)
 
 

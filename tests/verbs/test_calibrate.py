@@ -14,14 +14,18 @@ import arviz
 import numpy as np
 import pytest
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.report import page
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.calibrate import calibrate, earlier_draws, implausible_fit
+from tests.undrawn import without_panels
+from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEMO = REPOSITORY / "experiments" / "demo.toml"
@@ -44,6 +48,25 @@ def test_a_fitted_stiffness_that_nothing_has_is_a_caution():
         assert [caution.code for caution in found] == [Code.IMPLAUSIBLE] * cautions
     (found,) = implausible_fit(arm, {"trunk_mass": 9.0}, record)
     assert found.sentence.startswith("trunk_mass is 9 kg")
+
+
+def test_a_black_box_is_calibrated_and_its_run_is_read_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "embed", without_panels)
+    walk = {"duration": 1.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
+    truth, noise = {"gain": 1.4, "time_constant": 0.25, "zero": 0.0}, {"standard_deviation": SIGMA}
+    model = rb.Model(BOX, noise="white", priors=PRIORS)
+    runs = rb.simulate(model, walk | {"recordings": ["one", "two"]}, parameters=truth, noise=noise, seed=1)
+    quick = rb.Laplace(draws=200, starts=2, screen=16)
+    found = rb.calibrate(model, runs[:1], quick, test=runs[1:], seed=0, show=False, out=tmp_path / "run")
+    for name in ("gain", "time_constant"):
+        row = found.summary.loc[name]
+        assert abs(row["mean"] - truth[name]) < 5.0 * row["sd"] < 0.2 * truth[name]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["status"], summary["method"]) == ("done", "laplace")
+    assert summary["rmse"]["test"]["tip"] < 3.0 * 1e3 * SIGMA
+    assert "two" in (tmp_path / "run" / "report.html").read_text()
+    back = rb.load(tmp_path / "run", model=model)
+    np.testing.assert_array_equal(back.record.flat("gain"), found.record.flat("gain"))
 
 
 @pytest.mark.slow
