@@ -221,7 +221,7 @@ def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkey
         look_through(path, ["robot=leg.toml"])
 
 
-COMMANDS = [
+REFUSED = [
     ["calibrate", "none.toml"],
     ["audit", "none.toml"],
     ["design", "none.toml"],
@@ -247,11 +247,11 @@ for arguments in json.loads(sys.argv[1]):
 
 def test_nothing_heavy_is_imported_before_inputs_are_looked_at(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    program = [sys.executable, "-c", TRIED, json.dumps(COMMANDS)]
+    program = [sys.executable, "-c", TRIED, json.dumps(REFUSED)]
     done = subprocess.run(program, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-    assert [json.loads(line) for line in done.stdout.splitlines()] == [[2, []]] * len(COMMANDS), done.stderr
+    assert [json.loads(line) for line in done.stdout.splitlines()] == [[2, []]] * len(REFUSED), done.stderr
     lines = done.stderr.splitlines()
-    assert len(lines) == len(COMMANDS)
+    assert len(lines) == len(REFUSED)
     assert all("none" in line for line in lines)
 
 

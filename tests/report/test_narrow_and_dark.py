@@ -91,6 +91,8 @@ def test_the_verdict_comes_first_and_has_its_colour(run, monkeypatch):
     summary = build_summary(run.record, run.facts)
     monkeypatch.setattr(page_module, "_recording_views", lambda record, summary: [])
     monkeypatch.setattr(page_module, "embed", without_panels)
+    drawn = page_module._run_figures(run.record, summary)  # once, not for each page
+    monkeypatch.setattr(page_module, "_run_figures", lambda record, summary: drawn)
     for verdict, tone in (("safe", "safe"), ("with care", "with-care"), ("unsafe", "unsafe")):
         judged = {"verdict": verdict, "sentence": "So it is: for a reason.", "reasons": ["a reason"], "advice": []}
         page = render_page(run.record, {**summary, "randomisation": judged}, "")

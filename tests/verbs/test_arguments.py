@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -82,7 +83,8 @@ def test_a_prediction_takes_one_recording(fitted, commands, message):
 def fitted() -> rb.Calibration:
     """A calibration of three draws."""
     modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
-    return rb.Calibration(PosteriorRecord((modulus,), {"young_modulus": np.full((1, 3), 2e6)}), {}, "", MODEL)
+    draws = {"young_modulus": np.full((1, 3), 2e6)}
+    return rb.Calibration(PosteriorRecord((modulus,), draws, attrs={INTEGRATOR: "sdirk2"}), {}, "", MODEL)
 
 
 def test_a_method_by_name_is_answered_with_the_calls_that_make_one():
