@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import shlex
 import subprocess
@@ -44,6 +45,7 @@ def commands() -> list[tuple[str, str, bool]]:
 COMMANDS = commands()
 
 
+@functools.cache
 def parsed(command: str) -> tuple[str, dict]:
     """The command's name and its options, as the command line understands them."""
     words, group = shlex.split(command, comments=True)[1:], typer.main.get_command(app)

@@ -149,3 +149,12 @@ def test_an_earlier_posterior_of_recordings_of_two_rates_says_how_long_errors_la
     assert left.step == pytest.approx(0.01)
     assert left.memory[0] == 1.0
     assert left.memory[1] > 0.9
+
+
+def test_an_error_that_the_draws_expect_is_none_of_the_day_s(prior):
+    """Draws two centimetres to either side, and a day that lies on one of them."""
+    aside = np.full_like(PATH, 0.02)
+    day = RecordingPrediction(
+        "a", "test", TIME, ("tip",), PATH + aside, MASK, np.stack([PATH + aside, PATH - aside]), PATH
+    )
+    assert day_error(prior, {"day": [day]}).times == pytest.approx(TIMES * np.sqrt(FREEDOM / (FREEDOM + 1)))

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rfdropo_bayes.report import build_summary, render_page
 from rfdropo_bayes.report import page as page_module
 from rfdropo_bayes.report.robot_figure import robot_figure
-from rfdropo_bayes.report.style import Panel, embed
+from rfdropo_bayes.report.style import Panel, Picture, embed
 from rfdropo_bayes.robots import Robot, known_robots, robot_shape
 
 
@@ -36,7 +36,7 @@ def width(panel: Panel) -> float:
     return float(found[1]) / 72.0
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(1, 2), (2, 3), (3, 4)])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 2), (2, 4)])
 def test_cells_of_a_row_fill_the_width_and_each_holds_its_own_panel(rows, columns):
     picture = embed(grid(rows, columns, legend=True), "Lines")
     legend, *cells = picture.panels
@@ -54,7 +54,7 @@ def test_cells_of_a_row_fill_the_width_and_each_holds_its_own_panel(rows, column
 
 def test_a_figure_of_one_piece_stays_one():
     assert [panel.kind for panel in embed(grid(1, 1), "One").panels] == ["whole"]
-    assert [panel.kind for panel in embed(grid(5, 5), "Too fine").panels] == ["whole"]
+    assert [panel.kind for panel in embed(grid(1, 5), "Too fine").panels] == ["whole"]
     assert [panel.kind for panel in embed(grid(2, 2), "Together", whole=True).panels] == ["whole"]
 
 
@@ -88,9 +88,8 @@ def test_every_robot_has_a_picture(name):
 
 def test_the_verdict_comes_first_and_has_its_colour(run, monkeypatch):
     summary = build_summary(run.record, run.facts)
-    for name in ("_run_figures", "_recording_views"):  # drawn once, not for each page
-        drawn = getattr(page_module, name)(run.record, summary)
-        monkeypatch.setattr(page_module, name, lambda record, summary, drawn=drawn: drawn)
+    monkeypatch.setattr(page_module, "_recording_views", lambda record, summary: [])
+    monkeypatch.setattr(page_module, "embed", lambda figure, alt, *_, **__: Picture((), alt, "", 0))  # draws nothing
     for verdict, tone in (("safe", "safe"), ("with care", "with-care"), ("unsafe", "unsafe")):
         judged = {"verdict": verdict, "sentence": "So it is: for a reason.", "reasons": ["a reason"], "advice": []}
         page = render_page(run.record, {**summary, "randomisation": judged}, "")

@@ -46,7 +46,7 @@ LEAP = {"budget_exhausted": True, "progress": 1.0, "ess": 0.1, "correlation": fl
 
 
 def said(stages):
-    return [caution.as_dict() for caution in stage_cautions(stages, 10.0, 0.3)]
+    return [caution.as_dict() for caution in stage_cautions(stages, 10.0)]
 
 
 def test_without_grounds_against_it_is_safe(run, summary):

@@ -9,7 +9,9 @@ import pytest
 import xarray as xr
 
 from rfdropo_bayes.data import GOAL_AXES, Trajectory
+from rfdropo_bayes.report import session_page
 from rfdropo_bayes.report.session_page import MotorSession, distance_to_goal, drive_rows, render_session, session_steps
+from rfdropo_bayes.report.style import Picture
 
 GOAL = {"x": 0.0, "y": 0.0, "z": 0.2}
 
@@ -59,6 +61,12 @@ def session(cause: str = "finished", missed: int = 0, simulated: bool = False, *
     return MotorSession("session_1", summary, events, "robot = 'arm'", GOAL, made)
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's words alone: its pictures take seconds."""
+    monkeypatch.setattr(session_page, "embed", lambda figure, alt: Picture((), alt, "", 0))
+
+
 def test_rows_of_drives_are_those_of_the_recording():
     (row,) = drive_rows(recording(lag=0.002))
     assert row["rms"] == pytest.approx(2.0)
@@ -68,6 +76,7 @@ def test_rows_of_drives_are_those_of_the_recording():
     assert row["silent"] == 50.0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_distance_is_that_where_the_policys_time_ended():
     found = recording()
     time, distance = distance_to_goal(found, GOAL)
@@ -78,6 +87,7 @@ def test_the_distance_is_that_where_the_policys_time_ended():
     assert len(distance_to_goal(found, {})[0]) == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_object_that_is_pushed_is_judged_along_its_plate():
     """It ends 4 mm from the goal along the plate, of which x and z are the axes, and 30 mm below it."""
     found = recording()
@@ -100,13 +110,14 @@ def test_commands_that_no_drive_carried_out_are_no_data():
     assert not any("under fit" in step for step in steps)
 
 
-@pytest.mark.parametrize(("channels", "rows"), [(1, 20), (3, 20), (5, 20), (9, 20), (2, 6)])
+@pytest.mark.parametrize(("channels", "rows"), [(1, 20), (9, 20), (2, 6)])
 def test_a_page_is_drawn_for_any_number_of_drives(channels, rows):
     page = render_session(session(channels=channels, rows=rows))
     assert page.count("<td>a very long") == channels
     assert "2.50</td><td>stop" in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_session_that_was_stopped_says_why_and_what_to_do():
     stopped = session("markers_lost", missed=3)
     page = render_session(stopped)
