@@ -77,8 +77,8 @@ def test_small_loads_follow_timoshenko_and_saint_venant(settled):
 
 
 def rolled_up(elements: int) -> np.ndarray:
-    """Tip of a rod of length 1 under the moment of a whole turn: equal elements, each turned by p with sin p = M h / E I,
-    whose chords are as much shorter than h as a chord is than its arc."""
+    """Tip of a rod of length 1 under the moment of a whole turn. Every element turns by p, sin p = M h / E I, and its
+    chord is as much shorter than h as a chord is than its arc."""
     length = 1.0 / elements
     turn = np.arcsin(2.0 * np.pi * length)
     chord = length * (1.0 - np.sin(turn / 2.0) ** 2 / 6.0)
