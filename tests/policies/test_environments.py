@@ -51,7 +51,7 @@ def episodes():
 @pytest.fixture
 def robot_arm():
     """Options of an arm that moves fast in tests."""
-    return {"robot": "smooth_arm", "precision": "float32"}
+    return {"robot": "smooth_arm"}
 
 
 @pytest.fixture
