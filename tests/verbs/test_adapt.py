@@ -21,6 +21,8 @@ from rfdropo_bayes.data import RecordingEntry
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
+from rfdropo_bayes.report import page
+from rfdropo_bayes.report.style import Picture
 from rfdropo_bayes.verbs import adapt as adaptation
 from rfdropo_bayes.verbs import design_day as day_design
 from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
@@ -135,7 +137,9 @@ def known():
 def adapted(known, zeros, tmp_path_factory):
     out = tmp_path_factory.mktemp("adapted") / "out"
     run = recorded(["morning"], zeros[9:10], 30)[0]
-    return rb.adapt(known, run, seconds=0.5, group="today", seed=1, out=out, show=False)
+    with pytest.MonkeyPatch.context() as patch:  # a page without its pictures, which take half of the time
+        patch.setattr(page, "embed", lambda figure, alt, *_, **__: Picture((), alt, "", 0))
+        return rb.adapt(known, run, seconds=0.5, group="today", seed=1, out=out, show=False)
 
 
 def test_a_short_recording_moves_the_day_and_not_the_body(known, adapted, zeros):

@@ -134,12 +134,23 @@ def test_what_is_no_model_is_told_so():
 REPORTS = sorted(path.parent for path in (REPOSITORY / "reports").rglob("posterior.nc"))
 
 
-@pytest.mark.parametrize("folder", [pytest.param(f, id=str(f.relative_to(REPOSITORY / "reports"))) for f in REPORTS])
-def test_every_calibration_among_the_reports_predicts_commands(folder):
+OF_REPORTS = pytest.mark.parametrize(
+    "folder", [pytest.param(f, id=str(f.relative_to(REPOSITORY / "reports"))) for f in REPORTS]
+)
+
+
+@OF_REPORTS
+def test_every_calibration_among_the_reports_has_a_model_of_its_parameters(folder):
     """An audit's answer that lies beside it changes nothing."""
     fit = rb.load(folder)
     assert isinstance(fit, rb.Calibration)
     assert set(fitted_parts(fit)[1].names) == {info.name for info in fit.record.free}
+
+
+@pytest.mark.slow
+@OF_REPORTS
+def test_every_calibration_among_the_reports_predicts_commands(folder):
+    fit = rb.load(folder)
     rest = np.zeros((3, len(fit.model.simulator.channel_names)))
     ahead = rb.predict(fit, (0.1 * np.arange(3), rest), draws=2)
     assert np.isfinite(ahead.bands["mean"]).all()
