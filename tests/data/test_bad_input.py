@@ -291,7 +291,6 @@ def test_a_folder_is_no_recording(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"orientations": [["qx", "qy", "qz", "qw"]]}, "unknown key 'orientations'; a marker is a position"),
         ({"imu": ["ax", "ay", "az"]}, "unknown key 'imu'; a marker is a position"),
         (
             {"positions": [["x", "y", "z", "qx", "qy", "qz", "qw"]]},
