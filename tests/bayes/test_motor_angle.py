@@ -191,7 +191,7 @@ def test_angles_tell_a_slow_drive_from_a_damped_body():
 
 @dataclass(frozen=True)
 class Drives(RobotSimulator):
-    pushes = False
+    pushes = at_rest = False
     robot: Robot
     mechanisms: tuple[Mechanism, ...] = field(default_factory=tuple)
 

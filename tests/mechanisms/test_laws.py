@@ -80,29 +80,32 @@ PORTS = ["cable left", "every cable", "command delay", "force x at the tip", "st
          "observation delay"]  # fmt: skip
 
 
-@pytest.mark.parametrize("port", PORTS)
-def test_a_law_of_zero_changes_no_bit_and_another_one_acts(port):
-    plain, acting = (
-        build_robot_simulator(spec()),
-        build_robot_simulator(spec(law(port, "magnitude", commands=["left"]))),
-    )
+@pytest.fixture(scope="module")
+def without_law():
+    """The arm without a law, its commands, and how it moves."""
+    plain = build_robot_simulator(spec())
     given = commands(plain)
-    still = plain.rollout({}, given)
+    return plain, given, np.asarray(plain.rollout({}, given).position)
+
+
+@pytest.mark.parametrize("port", PORTS)
+def test_a_law_of_zero_changes_no_bit_and_another_one_acts(without_law, port):
+    _, given, still = without_law
+    acting = build_robot_simulator(spec(law(port, "magnitude", commands=["left"])))
     null = acting.rollout({"c": jnp.asarray(0.0)}, given)
-    assert np.array_equal(still.position, null.position)
+    assert np.array_equal(still, null.position)
     moved = acting.rollout({"c": jnp.asarray(3.0)}, given)
-    assert np.abs(moved.position - still.position).max() > 1e-6
+    assert np.abs(moved.position - still).max() > 1e-6
 
 
 @pytest.mark.parametrize("axis", ["x", "z"])
-def test_a_base_tilt_at_a_port_is_the_mechanism_of_the_other_sign(axis):
+def test_a_base_tilt_at_a_port_is_the_mechanism_of_the_other_sign(without_law, axis):
     """The port turns gravity, the mechanism the base: docs/mechanisms.md says how the signs relate."""
-    angle, plain = 1e-4, build_robot_simulator(spec())
+    _, given, still = without_law
+    angle = 1e-4
     acting = build_robot_simulator(spec(law(f"base tilt {axis}", "constant")))
     tables = {"robot": "smooth_arm", "model": {"mechanisms": ["base_tilt"]}, "simulator": {"time_step": STEP}}
     tilted = build_robot_simulator(spec_of(parse_table(Experiment, tables, where="test"), Path()))
-    given = commands(plain)
-    still = np.asarray(plain.rollout({}, given).position)
     port = np.asarray(acting.rollout({"c": jnp.asarray(angle)}, given).position) - still
     level = {f"base_tilt_{other}": jnp.asarray(0.0) for other in "xz"}
     mechanism = tilted.rollout(level | {f"base_tilt_{axis}": jnp.asarray(-angle)}, given).position - still
@@ -218,10 +221,9 @@ def by_hand(simulator, given, port, signal, rollouts):
         ),
     ],
 )
-def test_a_law_of_the_motion_is_given_the_motion_that_it_makes(port, term, size, signal):
-    plain, acting = build_robot_simulator(spec()), build_robot_simulator(spec(law(port, **term)))
-    given = commands(plain)
-    still = np.asarray(plain.rollout({}, given).position)
+def test_a_law_of_the_motion_is_given_the_motion_that_it_makes(without_law, port, term, size, signal):
+    plain, given, still = without_law
+    acting = build_robot_simulator(spec(law(port, **term)))
     assert np.array_equal(still, acting.rollout({"c": jnp.asarray(0.0)}, given).position)
     seen = np.asarray(acting.rollout({"c": jnp.asarray(size)}, given).position)
     assert np.abs(seen - by_hand(plain, given, port, signal, PASSES)).max() < 1e-9
