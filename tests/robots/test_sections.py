@@ -87,7 +87,7 @@ def test_a_force_at_the_tip_bends_disks_as_a_stepped_beam():
     body = section_profile([Disks(length_m=length, disks=5, radius_m=0.01, thickness_m=0.01, backbone_radius_m=0.003)])
     system = fem.System(fem.profile_rod(**body.arrays()), fem.without_cables())
     material = fem.material(system, young_modulus=young, poisson_ratio=0.45, density=1.0, gravity=(0.0, 0.0, 0.0))
-    acting = jnp.zeros((len(body.station_m), 3)).at[-1, 0].set(force)
+    acting = jnp.zeros((len(body.station_m), 6)).at[-1, 0].set(force)
     found, info = fem.static_equilibrium(system, fem.prepare(system, material), jnp.zeros(0), acting)
     assert bool(info.converged)
     tip = float(found.position[-1, 0])
