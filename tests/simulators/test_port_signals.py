@@ -127,7 +127,7 @@ def test_signals_on_a_body_with_a_cube_are_refused():
     rows = len(given.step) + 1
     body = BodySignals(np.zeros((rows, 3, 3)), np.zeros(rows), np.zeros(rows), np.zeros((rows, 3)))
     port = PortSignals(np.zeros((rows, 8)), np.zeros(rows), body)
-    with pytest.raises(InputError, match="layers without a cube"):
+    with pytest.raises(InputError, match="without a cube"):
         simulator.rollout({}, given._replace(signals=port))
     assert not simulator.engine.carries_loads
     assert replace(simulator.engine, scene=None).carries_loads
