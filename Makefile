@@ -130,5 +130,5 @@ $(ALL): pyproject.toml constraints.txt studies/requirements.txt | $(BIN)/python
 	@touch $(CORE) $(DEV) $@
 
 $(SITE): pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable '.[site]'
+	$(PIP) --editable '.[dev,site]'
 	@touch $(CORE) $@
