@@ -1,4 +1,4 @@
-"""The error a user's input can raise: it says what is wrong, where, and what to do."""
+"""The error for unusable input: fault, location and remedy."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ class InputError(ValueError):
     """Input that cannot be used.
 
     Args:
-        what: what is wrong, in one clause.
-        where: the file, row, column, table or key it was found in.
-        remedy: what the user can do about it.
+        what: the fault, in one clause.
+        where: file, row, column, table or key of the fault.
+        remedy: advice to the user.
 
     ``str(error)`` is a single line, so that the command line can print it as it is.
     """
@@ -30,8 +30,8 @@ class Interrupted(KeyboardInterrupt):
     """Ctrl-C in the middle of a run.
 
     Args:
-        folder: where the run writes.
-        going_on: what to add to its command to go on with it, may be nothing; None where it has to start again.
+        folder: folder of the run.
+        going_on: options that continue the run, possibly empty; None if it has to start again.
     """
 
     def __init__(self, folder: str, going_on: str | None) -> None:
