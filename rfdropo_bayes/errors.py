@@ -11,7 +11,7 @@ class InputError(ValueError):
         where: file, row, column, table or key of the fault.
         remedy: advice to the user.
 
-    ``str(error)`` is a single line, so that the command line can print it as it is.
+    ``str(error)`` is a single line.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
@@ -23,7 +23,7 @@ class InputError(ValueError):
 
 
 class NoLikelihoodError(InputError):
-    """No parameter set that was tried has a positive likelihood: the prior excludes the data, or more must be tried."""
+    """No tried parameter set has a positive likelihood: the prior excludes the data, or more draws are needed."""
 
 
 class Interrupted(KeyboardInterrupt):

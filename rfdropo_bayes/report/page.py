@@ -324,7 +324,7 @@ def limits(summary: Mapping[str, Any]) -> list[str]:
     if masked:
         total = sum(r["positions"] for r in summary["recordings"])
         sentences.append(
-            f"{masked} of {total} marker positions are left out as recording faults; the motion at those "
+            f"{masked} of {total} marker positions are left out as recording faults; the motion at these "
             "times is unknown."
         )
     chains = [row.get("r_hat") for row in summary["parameters"].values()]

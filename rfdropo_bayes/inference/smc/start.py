@@ -76,7 +76,7 @@ def run(
         return sampler.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
         raise InputError(
-            'start = "optimum" needs a problem with residuals',
+            'start = "optimum" needs residuals, but this problem has no residuals',
             where="[inference] start",
             remedy='start = "prior", or method = "bridge"',
         )
