@@ -145,7 +145,7 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert set(law["by_trajectory"]) == set(answer.causes.described.held_out.unseen.names)
     described = replace(answer.causes.described, holds=False)  # as if unseen recordings did not support it
     refused = ports_sentence(replace(answer, causes=replace(answer.causes, described=described)))
-    for words in ("a law that unseen ones do not support", "mm without it", "at marker m3 x", "u_a u_b"):
+    for words in ("a law that unseen recordings do not support", "mm without it", "at marker m3 x", "u_a u_b"):
         assert words in refused
     (table,) = law_tables(answer)
     assert table["port"] == "marker m3 x"
