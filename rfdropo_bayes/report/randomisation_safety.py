@@ -36,8 +36,8 @@ class Safety:
     Attributes:
         verdict: "safe", "with care" or "unsafe".
         sentence: the same in words.
-        reasons: against, worst first.
-        advice: what to observe when drawing.
+        reasons: reasons against it, worst first.
+        advice: recommendations for drawing.
     """
 
     verdict: str
@@ -51,7 +51,7 @@ class Safety:
 
 
 def judge(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
-    """Judge a posterior by the numbers of its summary (without its key "randomisation")."""
+    """Rate a posterior by the numbers of its summary (without its key "randomisation")."""
     against = [*_bands(summary), *_against_baselines(summary), *_sampling(summary), *_conflicts(record)]
     slight = [*_systematic(summary), *_reservations(summary)]
     verdict = "unsafe" if against else "with care" if slight else "safe"
@@ -125,8 +125,9 @@ def _systematic(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> list[str]:
-    """Markers whose error, without its noise, is most of the best baseline's. Noise is what repeats differ by, or,
-    without repeats, the share of the squared error that does not last from row to row."""
+    """Markers whose error, without its noise, is most of the best baseline's. Noise is the spread between repeats or,
+    without repeats, the uncorrelated share of the squared error.
+    """
     floor, correlation, places = summary["noise_floor_mm"] or {}, summary["error_correlation"]["test"], []
     for marker, error in errors.items():
         best = best_baseline(summary, "test", marker)
@@ -156,7 +157,7 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _conflicts(record: PosteriorRecord) -> list[str]:
-    """Parameters whose posterior lies where the prior hardly is: the data contradict the prior, or the model."""
+    """Parameters whose posterior has little prior mass: the data contradict the prior, or the model."""
     known = [info.name for info in record.free if info.name in record.prior]
     names = [name for name in known if contradicts(record.flat(name), record.prior[name])]
     return [contradiction(names)] if names else []

@@ -34,12 +34,12 @@ class ParameterRow:
     """One line of the posterior table; physical (SI) units.
 
     Attributes:
-        name, unit, description: of the parameter.
-        mean, sd, q05, median, q95: of the draws.
+        name, unit, description: facts of the parameter.
+        mean, sd, q05, median, q95: statistics of the draws.
         at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
-        bound: which one, "low" or "high"; None if neither.
-        prior_q05, prior_q95: of the prior draws, None without them.
-        contraction: posterior over prior standard deviation, of the logarithm where the prior is logarithmic and for
+        bound: "low", "high" or None.
+        prior_q05, prior_q95: quantiles of the prior draws, None without them.
+        contraction: posterior over prior standard deviation, of the logarithm if the prior is logarithmic and for
             derived products.
         ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain.
         derived: a function of other parameters.
@@ -107,8 +107,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
     """The end of its prior, "low" or "high", that a posterior is piled up at; None if it is not.
 
-    Where the prior is logarithmic the comparison
-    is in logarithms; see `piled_at`.
+    If the prior is logarithmic, the comparison is in logarithms; see `piled_at`.
     """
     return piled_at(draws, *info.ends, logarithmic=info.logarithmic)
 
@@ -137,7 +136,7 @@ class ParameterSummary(_Open):
 
 
 class Evidence(_Open):
-    """Log evidence in nats; null where the method has none."""
+    """Log evidence in nats; null if the method has none."""
 
     value: float | None
     sd: float | None
@@ -164,7 +163,9 @@ class Summary(_Open):
 
 
 def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
-    """The content of summary.json, ready for JSON: what is not finite is null, its reason under ``not_available``."""
+    """The content of summary.json, ready for JSON: values that are not finite become null, with the reason under
+    ``not_available``.
+    """
     figures = model_errors(record)
     shares = coverage(record.recordings)
     summary = {
