@@ -23,6 +23,7 @@ from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_engine import NativeRod, Records, Run
 from rfdropo_bayes.fem.native.rod_records import RodSamples
+from rfdropo_bayes.fem.native.rod_tables import as_kernel_array
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads
@@ -158,7 +159,7 @@ class RodSession:
         if displacement.ndim != 3 or displacement.shape[::2] != (self.count, engine.tables.cables):
             expected = f"({self.count}, steps, {engine.tables.cables})"
             raise InputError(f"displacement has shape {displacement.shape}, expected {expected}", where="advance")
-        moves = np.ascontiguousarray(displacement, dtype=engine.dtype).reshape(self.count, -1)
+        moves = as_kernel_array(np.asarray(displacement, float).reshape(self.count, -1), engine.dtype.type)
         batch = self._run.batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
         if bool(batch.present[LOADED]) != (loads is not None):
             raise InputError(
