@@ -57,8 +57,7 @@ AT_REST = {"float64": (1e-9, 1e-6), "float32": (1e-5, 1e-5)}
 """Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest: at the start,
 and in a row of a quasi-static motion. What is left is a tenth of it at most: iterations converge faster and faster."""
 
-# When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
-# resolves them.
+# Limits of convergence, of a missed contact, and of rest, by precision.
 _NUMERICS = {name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")}
 
 
