@@ -1,5 +1,6 @@
-"""How long an audit may take, and where its time goes: when it is up, the audit stops between two batches of rollouts,
-and says what it knows."""
+"""Time limit and time profile of an audit: after the limit it stops between two batches of rollouts, and reports its
+present results.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,7 @@ class Deadline:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the time within as that of a stage; of stages within one another, as that of the innermost."""
+        """Count the time within for a stage; nested stages count for the innermost."""
         self._charge()
         self._stages.append(name)
         try:
@@ -60,7 +61,7 @@ class Deadline:
             self._stages.pop()
 
     def recall(self, seconds: float) -> None:
-        """Count what an earlier part of the run has spent on what is now looked up."""
+        """Count the time that an earlier part of the run spent on a result that is now looked up."""
         self._spent[self._stages[-1]] = self._spent.get(self._stages[-1], 0.0) + seconds
 
     @property
@@ -115,7 +116,7 @@ class Deadline:
 
     @contextmanager
     def reserve(self) -> Iterator[None]:
-        """Use the time that is kept for the gain, too."""
+        """Also use the time reserved for the gain."""
         share, self.share = self.share, 1.0
         try:
             yield
