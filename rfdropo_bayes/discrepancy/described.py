@@ -67,11 +67,11 @@ class Described:
 def describe(
     problem: AuditProblem, model: Named, held_out: HeldOut | None, report: Callable[[str], None] = lambda line: None
 ) -> Iterator[Described]:
-    """Where something acts that the library does not have, and by what law; nothing where nobody asks.
+    """Port and law of an effect that the library lacks; nothing if not requested.
 
     Args:
-        problem: with the ports of its simulator.
-        model: the base model, and what the library named.
+        problem: problem with the ports of its simulator.
+        model: the base model with the named mechanisms.
         held_out: predictions of unseen recordings by the base model and after each step; None without steps.
         report: called with a line of words now and then.
     """
@@ -119,7 +119,7 @@ def _without_stand_ins(
 
 
 def _without(model: Named, gone: Sequence[str]) -> Named:
-    """A model less some of its mechanisms, judged anew."""
+    """A model without some of its mechanisms, with a new noise model."""
     for name in gone:
         model = model.extended(without(model.asked, model.steps, model.names.index(name), model.base))
     judge, fit = fit_with_noise(model.judge.measured, model.fit.x, model.fit.free)

@@ -99,13 +99,13 @@ class Added:
 
 @dataclass(frozen=True)
 class Refits:
-    """The candidates that were fitted beside a model so far.
+    """The candidates refitted beside a model so far.
 
     Attributes:
-        rows: of the screen, those that are significant.
-        drops: what each of these may take from the sum of squares.
-        fits: of the model with each candidate that was refitted.
-        waiting: leading candidates that were not refitted yet.
+        rows: significant rows of the score tests.
+        drops: possible drop of the sum of squares for each of them.
+        fits: fit of the model with each refitted candidate.
+        waiting: leading candidates without a refit.
     """
 
     rows: tuple[ScreenRow, ...]
@@ -114,7 +114,7 @@ class Refits:
     waiting: tuple[str, ...]
 
     def with_fit(self, name: str, fit: Fit) -> Refits:
-        """The same with one more fit, or with a better one."""
+        """The same with one more fit, or with a better fit."""
         waiting = tuple(each for each in self.waiting if each != name)
         return replace(self, fits={**self.fits, name: fit}, waiting=waiting)
 
@@ -125,14 +125,14 @@ class Refits:
 
 @dataclass(frozen=True)
 class ExtensionSearch:
-    """What may be asked of one model: which of the candidates does it lack?
+    """The search for candidates that a model lacks.
 
     Attributes:
-        target: data, noise and simulator; every candidate is in the simulator, at its null value. Its noise
-            is that under which the present model is judged, see `inadequacy`; its simulator that of the present model.
-        candidates: that may be named.
+        target: data, noise and simulator; every candidate is in the simulator, at its null value. Noise and simulator
+            are the present model's, see `inadequacy`.
+        candidates: mechanisms that may be named.
         rules: see `Rules`.
-        seed: of all bootstraps.
+        seed: seed of all bootstraps.
         finer: the simulator on a finer mesh and time step, for the candidate `DISCRETISATION`; None without it.
         report: called with a line of words as the search goes on.
     """
@@ -248,9 +248,9 @@ class ExtensionSearch:
         """The best of the refitted candidates with its class; None if no candidate is worth it.
 
         Args:
-            found: the screen of the model without it.
+            found: score tests of the model without it.
             tried: the refits so far.
-            further: whether the model has mechanisms already, so that one more must bring more.
+            further: whether the model has mechanisms already, so that another needs more evidence.
         """
         gains = tried.gains(found.fit)
         price = np.log(len(self.candidates)) if further else 0.0
@@ -276,8 +276,9 @@ class ExtensionSearch:
         return lead(self.target, fit, row.probe, row.lm)
 
     def _leading(self, significant: Sequence[ScreenRow], drops: Mapping[str, float], fit: Fit) -> list[ScreenRow]:
-        """The best candidates of the leading classes, and further members of these while there is room; those that
-        cannot bring what a mechanism must are left out, and those whose rollouts are slow come last."""
+        """The best candidates of the leading classes, and further members of these while there is room; candidates that
+        cannot reach the required evidence are skipped, and candidates with slow rollouts come last.
+        """
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
         able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
         heads: list[ScreenRow] = []

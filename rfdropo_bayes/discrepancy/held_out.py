@@ -205,13 +205,13 @@ def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray,
 
 @dataclass(frozen=True)
 class Kept:
-    """What unseen recordings say of named causes.
+    """Named causes after the test on unseen recordings.
 
     Attributes:
-        named: the steps that they support, all of them where they support none, and the screen of the model with them.
-        held_out: their predictions by the base model and after each of these steps; None where no step can be
-            simulated, or there is none.
-        unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
+        named: supported steps (all steps if none is supported), with score tests of the model.
+        held_out: predictions of these recordings by the base model and after each step; None without a step that can be
+            simulated.
+        unsupported: mechanisms supported by fitted but not by unseen recordings.
     """
 
     named: Named
@@ -220,8 +220,9 @@ class Kept:
 
 
 def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
-    """The steps that recordings which no fit has seen support: first as all steps are predicted, then without those
-    that a later one carried."""
+    """The steps supported by unseen recordings: first from predictions of all steps, then without steps that depend on
+    a later step.
+    """
     report, clock = named.search.report, named.search.target.forward.deadline
     if not named.steps:
         yield Kept(named, None)
@@ -257,10 +258,10 @@ def _kept(asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
 
 
 def _without_carried(problem: AuditProblem, named: Named, held_out: HeldOut) -> tuple[Named, HeldOut]:
-    """Steps less those that were supported beside a later one only, and without which that one does as well.
+    """Steps without any step supported only together with a later step that does equally well alone.
 
-    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
-    it were the last step, must clearly predict unseen recordings better than the model without it.
+    Two mechanisms may pay only together. To test this, the first is removed: the model with it must predict unseen
+    recordings clearly better than the model without it.
     """
     for index in range(len(named.steps) - 1):
         if held_out.gain(index, index + 1).clear or named.steps[index].name == DISCRETISATION:

@@ -222,7 +222,7 @@ class InferenceTable(BaseModel):
         default=None,
         gt=0.0,
         description="budget in minutes on the machine that calibrates, predictions and report included; rollouts are "
-        "timed, and as many are allowed as fit in",
+        "timed, and their number is limited accordingly",
     )
 
     @model_validator(mode="after")
