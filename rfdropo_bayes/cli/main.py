@@ -75,7 +75,7 @@ def calibrate(
     as_json: AsJson = False,
     fit: Annotated[
         Path | None,
-        typer.Option("--from", help="folder of an earlier calibration of this robot, to start climbs from"),
+        typer.Option("--from", help="folder of an earlier calibration of this robot, at which optimisations start"),
     ] = None,
     overrides: Overrides = None,
 ) -> None:
