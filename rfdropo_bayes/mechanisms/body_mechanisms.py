@@ -58,6 +58,31 @@ class StiffnessGradient:
         )
 
 
+class AxialStiffness:
+    """The body is stiffer or softer in tension than its bending says; zero is the base simulator."""
+
+    name = "axial_stiffness"
+    stage = "body"
+    bodies = ("rod",)
+    cause = "a hollow, notched or reinforced section, whose stiffness in tension does not follow from its bending"
+    remedy = "hang a known weight on the body and measure how much longer it gets"
+    parameters = (
+        ParameterSpec(
+            "axial_stiffness",
+            "-",
+            -4.0,
+            4.0,
+            0.0,
+            normal(1.0),
+            "log ratio of the stiffness in tension and its value by the section profile",
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
+        """Scale the stiffness in tension of every layer."""
+        return material._replace(axial_scale=material.axial_scale * jnp.exp(values["axial_stiffness"]))
+
+
 class BaseTilt:
     """The base is mounted at an angle: gravity turns about axes of the base; zero is the base simulator.
 

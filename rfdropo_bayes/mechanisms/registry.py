@@ -31,6 +31,7 @@ from rfdropo_bayes.mechanisms.actuation import (
     TravelStop,
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
+    AxialStiffness,
     BaseTilt,
     BendTwistCoupling,
     CableCompliance,
@@ -75,6 +76,7 @@ REGISTRY: dict[str, type] = {
         DriveCreep,
         DriveDrift,
         Payload,
+        AxialStiffness,
         StiffnessGradient,
         BaseTilt,
         CoulombFriction,

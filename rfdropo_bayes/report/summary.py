@@ -162,6 +162,19 @@ class Summary(_Open):
     rmse: Errors
 
 
+def effective_draws(record: PosteriorRecord, details: Mapping[str, Any]) -> float | None:
+    """Number of independent draws that a posterior is worth; None for draws that are no posterior.
+
+    At most as many as there are distinct draws: a sampler that ran out of its budget repeats a few.
+    """
+    if record.log_likelihood is None:
+        return None
+    drawn = np.stack([record.flat(info.name) for info in record.free], axis=1)
+    distinct = len(np.unique(drawn, axis=0))
+    weighed = details.get("effective_draws")
+    return float(distinct if weighed is None else min(distinct, weighed))
+
+
 def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
     """The content of summary.json, ready for JSON: values that are not finite become null, with the reason under
     ``not_available``.
@@ -176,6 +189,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "rollouts": facts.rollouts,
         "evaluations": facts.evaluations,
         "excluded": dict(facts.excluded),
+        "effective_draws": effective_draws(record, facts.details),
         "parameters": {row.name: row.as_dict() for row in posterior_table(record)},
         "log_evidence": dict(zip(("value", "sd"), facts.log_evidence or (None, None), strict=True)),
         "rmse": {role: dict(errors.over_time) if errors else {} for role, errors in figures.items()},

@@ -292,12 +292,13 @@ def _parameters(o: RobotOutline) -> list[str]:
         prior = log_normal("spool_radius", o.spool_radius)
         bounds = (o.spool_radius / 10.0, o.spool_radius * 10.0)
         add("spool_radius", "m", o.spool_radius, bounds, prior, "cable wound up per angle of the motor")
-    prior = 'distribution = "Normal", loc = 0.0, scale = 0.001'
-    add("initial_displacement", "m", 0.0, (-0.05, 0.05), prior, "cable displacement at zero command")
-    prior = 'distribution = "Normal", loc = 0.0, scale = 0.005'
+    prior = f'distribution = "Normal", loc = 0.0, scale = {0.005 * o.length:.6g}'
+    half = 0.5 * o.length
+    add("initial_displacement", "m", 0.0, (-half, half), prior, "cable displacement at zero command")
+    prior = f'distribution = "Normal", loc = 0.0, scale = {0.025 * o.length:.6g}'
     for axis in "xyz":
         words = f"shift of the measured positions along {axis}"
-        add(f"offset_{axis}", "m", 0.0, (-1.0, 1.0), prior, words)
+        add(f"offset_{axis}", "m", 0.0, (-5.0 * o.length, 5.0 * o.length), prior, words)
     return lines
 
 

@@ -44,7 +44,7 @@ from rfdropo_bayes.fem.native.rod_records import (
     runs_of,
 )
 from rfdropo_bayes.fem.native.rod_rollout import Batch, RodOutput, RodSchedule, compile_rollout, storage
-from rfdropo_bayes.fem.native.rod_tables import SIZE, rod_tables
+from rfdropo_bayes.fem.native.rod_tables import SIZE, as_kernel_array, rod_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rod import PointMap
@@ -292,7 +292,7 @@ class NativeRod:
         modulus = rows["young_modulus"]
         shear = modulus / (2.0 * (1.0 + rows["poisson_ratio"]))
         arrays = {
-            "moduli": np.stack([modulus, shear], axis=1),
+            "moduli": np.stack([modulus, shear, rows["axial_scale"] * modulus], axis=1),
             "density": rows["density"][:, None],
             "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
             "gravity": rows["gravity"],
@@ -302,7 +302,7 @@ class NativeRod:
             "effects": effect_rows(effects, count, STAGES[self._steps], self.time_step),
             **commands,
         }
-        arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
+        arrays = {name: as_kernel_array(array, self.dtype.type) for name, array in arrays.items()}
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in commands.items()}
         nowhere = np.zeros(1, dtype=np.int64)
         return Batch(**arrays, present=effect_flags(effects), place=nowhere, places=0, count=count, **pitches)

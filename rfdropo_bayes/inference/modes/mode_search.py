@@ -569,7 +569,7 @@ def run(
         exact = reweighted(problem, modes, weights, left, draw_key, ledger, config.draws, by_evidence)
         position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
         draws = chains(problem, [position])
-        rows = exact.rows[None] if exact is not None and problem is whole else None
+        rows = exact.rows[None] if exact is not None and exact.rows is not None and problem is whole else None
     best, seconds = modes[0], found.climbs.seconds + time.monotonic() - began
     return InferenceResult(
         method="laplace",
