@@ -110,14 +110,14 @@ class ArcSearch:
         moving = np.ptp(self.command, axis=0) > 0.0
         table = np.zeros((columns, kinds, AZIMUTHS))
         for _ in range(int(moving.sum())):
-            waiting = [c for c in np.flatnonzero(moving) if not use[c]]
+            waiting = [int(c) for c in np.flatnonzero(moving) if not use[c]]
             found = {c: self._scan(c, kind, azimuth, sign, use) for c in waiting}
             best = max(waiting, key=lambda c: found[c].max())
             kind[best], azimuth[best] = self._argmax(found[best])
             use[best] = True
         score = -1.0
         for _ in range(SWEEPS):
-            for c in np.flatnonzero(moving):
+            for c in map(int, np.flatnonzero(moving)):
                 table[c] = self._scan(c, kind, azimuth, sign, use)
                 kind[c], azimuth[c] = self._argmax(table[c])
             if table[c].max() <= score + GAIN:
@@ -169,14 +169,14 @@ class ArcSearch:
     def turned(self, arrangement: Arrangement) -> Arrangement:
         """The arrangement with its sections turned as explains the motion best."""
         for _ in range(2):
-            for section in range(self.sections.count):
+            for section in range(self.sections.number):
                 tried = [_with_turn(arrangement, section, angle) for angle in FINE]
                 arrangement = tried[int(np.argmax(self.score_of(tried)))]
         return arrangement
 
     def turned_far(self, arrangement: Arrangement) -> Arrangement:
         """The same, from wherever they are: each section in turn is tried all around."""
-        for section in range(self.sections.count):
+        for section in range(self.sections.number):
             tried = [_with_turn(arrangement, section, angle) for angle in self.azimuths]
             arrangement = tried[int(np.argmax(self.score_of(tried)))]
         return self.turned(arrangement)
@@ -184,7 +184,7 @@ class ArcSearch:
     def _assigned(self, placed: Placed, table: np.ndarray, sign: int) -> Arrangement:
         """Columns given to channels by what each scores at the place of each channel."""
         columns, own = len(table), np.arange(len(table))
-        turns = np.array([self._turn_of(placed, section) for section in range(self.sections.count)])
+        turns = np.array([self._turn_of(placed, section) for section in range(self.sections.number)])
 
         def assigned(turns: np.ndarray) -> tuple[float, tuple[int, ...]]:
             azimuth = self.channel_azimuth + turns[self.channel_section]
@@ -193,7 +193,7 @@ class ArcSearch:
             return float(value[column, channel].sum()), tuple(int(c) for c in column[np.argsort(channel)])
 
         for _ in range(2):
-            for section in range(self.sections.count):
+            for section in range(self.sections.number):
                 tried = [turns + angle * (np.arange(len(turns)) == section) for angle in self.azimuths]
                 turns = max(tried, key=lambda each: assigned(each)[0])
         return Arrangement(assigned(turns)[1], (sign,) * len(own), tuple(turns.tolist()))

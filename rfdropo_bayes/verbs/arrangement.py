@@ -58,7 +58,7 @@ class Sections(NamedTuple):
     of_channel: tuple[int, ...]
 
     @property
-    def count(self) -> int:
+    def number(self) -> int:
         """Of the sections."""
         return 1 + max(self.of_cable)
 
@@ -147,7 +147,7 @@ def neighbours(arrangement: Arrangement, sections: Sections) -> Iterator[Arrange
     channels = range(len(arrangement.columns))
     for i, j in combinations(channels, 2):
         yield arrangement.exchanged(i, j)
-    members = [[k for k in channels if sections.of_channel[k] == section] for section in range(sections.count)]
+    members = [[k for k in channels if sections.of_channel[k] == section] for section in range(sections.number)]
     for one, other in combinations(members, 2):
         if len(one) == len(other):
             changed = arrangement

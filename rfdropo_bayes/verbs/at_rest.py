@@ -159,7 +159,7 @@ class RestingRobot:
         own = self.simulator
 
         def start(values: Any, row: Any) -> Any:
-            still = Commands(row, jnp.zeros((0, len(row))), np.zeros(0, int), np.zeros(0))
+            still = Commands(row, jnp.zeros((0, len(row))), jnp.zeros(0, int), jnp.zeros(0))
             initial = own.actuated(values, still, own.time_step)[0]
             return own.exerted(values, own.unwound(values, initial).level)
 

@@ -140,9 +140,9 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
     units = other_units(columns, unit)
     here = _paths(robot, rows)
     if here.mask.any(axis=1).mean() < SOLVED * _paths(robot, rows, 0.0).mask.any(axis=1).mean():
-        found = _explained(robot, rows, likely_units(units, None))
+        smaller = _explained(robot, rows, likely_units(units, None))
         said = "the robot has no equilibrium under most of the commands as they were read"
-        words = f"{said}, and the markers moved by {1e3 * measured:.3g} mm; {unit_words(columns, found)}"
+        words = f"{said}, and the markers moved by {1e3 * measured:.3g} mm; {unit_words(columns, smaller)}"
         return Compared(said, [Caution(Code.UNIT_DOUBTFUL, words)])
     direction, found = direction_of([here]), find_arrangement(robot, rows)
     proposal = _proposal(found, robot.simulator.robot, columns, runs[0].cable_names)

@@ -87,7 +87,7 @@ def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
     """
     robot = resting.simulator.robot
     finder = _Finder(resting, robot, rows.of(spread_rows(rows, ROWS)))
-    start = as_written(len(robot.channel_names), finder.sections.count)
+    start = as_written(len(robot.channel_names), finder.sections.number)
     written = finder.agreement(start)
     if written.straight >= WELL:
         return Finding(written, start, written.straight)
@@ -134,7 +134,7 @@ class _Finder:
 
     def canonical(self, arrangement: Arrangement) -> Arrangement:
         """Of all arrangements that are the same robot, the one with most columns in place, then least turned."""
-        for section in range(self.sections.count):
+        for section in range(self.sections.number):
             arrangement = max(
                 self._equals(arrangement, section),
                 key=lambda each: (
@@ -182,7 +182,7 @@ class _Finder:
     def _differs(self, one: Arrangement, other: Arrangement) -> bool:
         """Whether a column that moves is sent elsewhere, or the other way round."""
         sent = [each.commands(self.rows.command - self.rows.command[:1]) for each in (one, other)]
-        return not np.array_equal(*sent)
+        return not np.array_equal(sent[0], sent[1])
 
 
 def arranged(resting: RestingRobot, arrangement: Arrangement) -> RestingRobot:
