@@ -84,7 +84,7 @@ def describe(
         if not model.steps:
             yield alone
             return
-        yield replace(alone, holds=False)  # until it is compared with what the library named
+        yield replace(alone, holds=False)  # until it is compared with the named mechanisms
         seen = alone.held_out if alone.holds else None
         if held_out is not None and seen is not None and seen.beside(held_out.after(len(model.steps))).clear:
             report(f"the law takes the place of {' and '.join(model.names)}")
@@ -169,7 +169,7 @@ def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) 
         found = found.cut(max(held_out.count - 1 - named, 0))
         if not found.terms:
             return Described(found, model.steps)
-    # As with what the library names, a law is cut to what unseen recordings support.
+    # Like named mechanisms, a law is cut to its supported terms.
     kept = held_out.supported_from(named) - named or len(found.terms)
     if kept < len(found.terms):
         report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")

@@ -163,7 +163,7 @@ class ExtensionSearch:
         of the finer simulator pass more easily, it is they that count. Too small is one that the screen does not see,
         or that moves the markers by no more than the noise: see `_below_the_noise`.
         """
-        # Of a family of parameters, some may be in the model by themselves.
+        # Some members of a family of parameters may be in the model already.
         left = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
         free = [
             c
@@ -258,10 +258,10 @@ class ExtensionSearch:
         best = max(worth, key=lambda name: gains[name] - WIDER * len(tried.fits[name].free))
         enough = self.rules.class_cosine**2 * tried.drops[best]
         able = [row for row in tried.rows if tried.drops[row.name] > enough]
-        # What looks the same near null may be another thing at the size that it has.
+        # Candidates with equal signatures near null may differ at their fitted size.
         able = [row for row in able if gains.get(row.name, np.inf) > gains[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
-        # What brings nearly as much, whatever it looks like, is no less likely a cause.
+        # A candidate of nearly equal gain is as likely a cause, for any signature.
         members += tuple(n for n in worth if n not in members and gains[n] > gains[best] - self.rules.evidence)
         judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
         return Added(best, members, found, tried.fits[best], gains[best], gains, judge)
@@ -288,7 +288,7 @@ class ExtensionSearch:
             elif alike:
                 rest.append(row)
         chosen = [*heads, *rest][: self.rules.members]
-        # A refit on a finer mesh costs as much as all others: only where it could win.
+        # A refit on a finer mesh costs as much as all others: only if it could win.
         chosen = [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
         return sorted(chosen, key=lambda row: self._costly(row.name))
 
@@ -329,7 +329,7 @@ class ExtensionSearch:
             found = self._climbed_from_all_sizes(candidate.indices[0], fit.x, start, free)
         else:
             found = climb(self.target, start, free)
-        # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
+        # The model without the candidate is a special case: a worse result is a failed optimisation.
         if found.residual @ found.residual > fit.residual @ fit.residual:
             found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
         return found

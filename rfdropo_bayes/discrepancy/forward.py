@@ -26,8 +26,8 @@ from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 # Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
-# computes what many lanes have in common once, be it padding or the value beside its slopes: of 16, 32, 48 and 64
-# lanes, 48 took the least time for the Jacobians of both real robots, two thirds of that of 16.
+# shares common work of lanes, such as padding and the value beside its slopes: of 16, 32, 48 and 64 lanes, 48 took the
+# least time for the Jacobians of both real robots, two thirds of the time with 16.
 WIDTH = 48
 NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
 
@@ -258,7 +258,7 @@ class Forward:
         self.count = len(chosen)
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
-        self.pace = 0.0  # seconds that a whole rollout took last, of different ones that fill a call
+        self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
 
     @cached_property
     def identity(self) -> str:
@@ -342,7 +342,7 @@ class Forward:
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
         flat, start, commands = self._per_lane(theta, points)
         along = tangent.reshape(flat.shape)
-        # Recordings that a direction does not touch, such as those of another group, stay as they are.
+        # Recordings that a direction does not affect, such as another group's, are unchanged.
         moved = np.flatnonzero(along.any(axis=1))
         moved = moved if len(moved) else np.arange(1)
         found = self.lanes.differentiate(

@@ -100,7 +100,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
     The base model of an answer is another one than before where a candidate has led to a better optimum of it.
     """
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
-    named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was climbed again: once each
+    named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
     while True:
         named = _judged(named)
         found = named.asked.screened(named.fit, named.names)

@@ -92,8 +92,8 @@ def climbed_again(search: ExtensionSearch, step: Added) -> Fit | None:
     free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
     emptied = step.fit.x.copy()
     emptied[added] = before.x[added]
-    # What base parameters can do, too, is theirs: a gain of all cables, beside the radius of their drums. Else it
-    # would be credited to the candidate.
+    # An effect that base parameters can also explain belongs to them, such as a gain of all cables and the radius of
+    # their drums. Otherwise it would be credited to the candidate.
     place = {index: k for k, index in enumerate(free)}
     own, others = ([place[index] for index in chosen] for chosen in (before.free, added))
     done = step.fit.jacobian[:, others] @ (step.fit.x[added] - before.x[added])

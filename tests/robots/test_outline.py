@@ -137,6 +137,4 @@ def test_segments_have_lengths_of_their_own():
     ends = [guides[-1, 2] for guides in robot.guides()]
     np.testing.assert_allclose(ends, np.repeat(np.cumsum(lengths), 3), atol=1e-6)
     with pytest.raises(InputError, match="do not make up the body"):
-        Robot.outline(
-            name="arm", length=0.2, radius=0.01, markers={"tip": 0.18}, segments=3, cables=3, segment_lengths=lengths
-        )
+        Robot.outline(**given, length=0.2, segment_lengths=lengths)

@@ -44,7 +44,7 @@ from rfdropo_bayes.fem.native.rod_records import (
     runs_of,
 )
 from rfdropo_bayes.fem.native.rod_rollout import Batch, RodOutput, RodSchedule, compile_rollout, storage
-from rfdropo_bayes.fem.native.rod_tables import SIZE, rod_tables
+from rfdropo_bayes.fem.native.rod_tables import SIZE, as_kernel_array, rod_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rod import PointMap
@@ -57,8 +57,7 @@ AT_REST = {"float64": (1e-9, 1e-6), "float32": (1e-5, 1e-5)}
 """Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest: at the start,
 and in a row of a quasi-static motion. What is left is a tenth of it at most: iterations converge faster and faster."""
 
-# When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
-# resolves them.
+# Limits of convergence, of a missed contact, and of rest, by precision.
 _NUMERICS = {name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")}
 
 
@@ -302,7 +301,7 @@ class NativeRod:
             "effects": effect_rows(effects, count, STAGES[self._steps], self.time_step),
             **commands,
         }
-        arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
+        arrays = {name: as_kernel_array(array, self.dtype.type) for name, array in arrays.items()}
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in commands.items()}
         nowhere = np.zeros(1, dtype=np.int64)
         return Batch(**arrays, present=effect_flags(effects), place=nowhere, places=0, count=count, **pitches)
