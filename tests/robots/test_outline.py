@@ -125,15 +125,8 @@ def test_drives_that_hold_forces_pull_by_tensions(unit, newtons):
 
 def test_segments_have_lengths_of_their_own():
     lengths = (0.06, 0.0625, 0.064)
-    robot = Robot.outline(
-        name="arm",
-        length=sum(lengths),
-        radius=0.01,
-        markers={"tip": 0.18},
-        segments=3,
-        cables=3,
-        segment_lengths=lengths,
-    )
+    given = {"name": "arm", "radius": 0.01, "markers": {"tip": 0.18}, "segments": 3, "cables": 3}
+    robot = Robot.outline(**given, length=sum(lengths), segment_lengths=lengths)
     ends = [guides[-1, 2] for guides in robot.guides()]
     np.testing.assert_allclose(ends, np.repeat(np.cumsum(lengths), 3), atol=1e-6)
     with pytest.raises(InputError, match="do not make up the body"):
