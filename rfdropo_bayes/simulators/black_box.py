@@ -67,7 +67,7 @@ class BlackBox:
         one_shape: whether a batched function always gets arrays of the same shape: ``lanes`` sets, padded by repeats,
             and whole commands. JAX then compiles it once for recordings of equal length.
         difference: relative step of derivatives; larger if the motion is rough on small scales.
-        stroke: size of usual commands, in their unit; known for cables and motors.
+        usual_command: size of usual commands, in their unit; by default that of a usual trunk.
         limits: least and greatest command of each channel for policies; none by default.
         families: parameters that are not inferred unless they have a prior, each with the quantity of which it is a
             local value; an audit tests whether they differ from their nominal values.
@@ -88,7 +88,7 @@ class BlackBox:
     lanes: int = 64
     one_shape: bool = False
     difference: float | None = None
-    stroke: float | None = None
+    usual_command: float | None = None
     families: Mapping[str, str] = field(default_factory=dict)
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -407,7 +407,7 @@ class BlackBoxSimulator(ExtendedSimulator):
             spec.name: SMALLEST_SHARE * (spec.high - spec.low) if np.isfinite(spec.high - spec.low) else 1e-12
             for spec in self.box.specs
         }
-        stroke = self.box.stroke or STROKES[self.command_unit]
+        stroke = self.box.usual_command or STROKES[self.command_unit]
 
         def size(inputs: tuple[dict[str, Array], Array]) -> tuple[dict[str, Array], Array]:
             own, command = inputs

@@ -341,7 +341,7 @@ class RobotSimulator(ExtendedSimulator):
             stiffness_scale=stiffness_scale,
             point_mass=point_mass,
         )
-        if self.robot.command_unit == "N":
+        if self.robot.held_by_force:
             material = material._replace(effects=material.effects._replace(cable_compliance=jnp.asarray(SOFT)))
         for mechanism in self.mechanisms:
             if self.at_rest and QUASI_STATIC not in motions_of(mechanism):
@@ -405,7 +405,7 @@ class RobotSimulator(ExtendedSimulator):
     def exerted(self, values: Values, level: Float[Array, " cable"]) -> Float[Array, " cable"]:
         """Displacements of the cables [m] at levels of their drives [m or N]: a drive that holds a tension winds a
         spring that is so soft that the cable's own length does not count."""
-        return SOFT * level if self.robot.command_unit == "N" else level + self.pretension(values)
+        return SOFT * level if self.robot.held_by_force else level + self.pretension(values)
 
     def wound(
         self, values: Values, commands: Commands, time_step: float

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
@@ -172,6 +175,10 @@ def write_first_files(
     plain = write(tables())
     first = _first_recording(plain, folder)
     if first is not None:
+        usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
+        if usual > 0.0:
+            robot.write_text(robot_text(replace(outline, usual_command=usual)), encoding="utf-8")
+            made = Robot.load(robot)
         slow, rows = slow_motion(made, first), rows_to_fit(first) if len(recordings) == 1 else None
         write(tables(frame=_frame(plain, made, guess), rows=rows), slow, first)
     return robot, experiment

@@ -115,7 +115,7 @@ def _adapter(tables: dict[str, Any], assumed: list[str]) -> list[str]:
 
 
 def _random(box: Any) -> list[str]:
-    step = 0.2 * (box.stroke or 1.0)
+    step = 0.2 * (box.usual_command or 1.0)
     return [
         "# No recording was given: simulate makes one from random commands. Put [data] in the place of this table.",
         "[commands]",

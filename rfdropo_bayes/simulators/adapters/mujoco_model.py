@@ -122,7 +122,7 @@ def MuJoCo(
         batched=True,
         lanes=lanes,
         difference=difference,
-        stroke=rollouts.stroke,
+        usual_command=rollouts.usual_command,
         families=families,
         limits=rollouts.limits,
     )
@@ -306,7 +306,7 @@ class MuJoCoRollouts:
         return ("N m" if turning else "N") if plain and np.isclose(gain * gear, 1.0) else "-"
 
     @property
-    def stroke(self) -> float:
+    def usual_command(self) -> float:
         """Size of usual commands: half the mean of their ranges, 1 without ranges."""
         ranges = [np.ptp(self.model.actuator_ctrlrange[k]) for k in self.actuators.values()]
         return 0.5 * float(np.mean([r if r > 0.0 else 2.0 for r in ranges]))
