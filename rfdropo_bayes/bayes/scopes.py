@@ -172,7 +172,7 @@ class Scopes:
             groups: which recordings belong together; each is a group of its own without.
         """
         known, shared = self.recordings_known(fitted), [p for p in self.parameters if not p.scope.owner]
-        like = {p.name: (p.name,) for p in shared}
+        like: dict[str, tuple[str, ...]] = {p.name: (p.name,) for p in shared}
         found = list(shared)
 
         def add(parameter: InferredParameter, owner: str, members: tuple[str, ...], sources: Iterable[str]) -> None:
@@ -363,11 +363,12 @@ def build_scopes(
                     where="[model.per_recording]",
                     remedy=f"recordings: {', '.join(recordings)}",
                 )
-        owned = [(Scope(recording), (recording,)) for recording in per_recording.get(name, ())]
-        owned += [(Scope(group, True), tuple(members)) for group, members in only_in.get(name, {}).items()]
-        shared = name not in per_recording and name not in only_in
         first = InferredParameter.of(by_name[name], table, where=where)
-        parameters += [first] if shared else [replace(first, scope=scope, members=own) for scope, own in owned]
+        if name not in per_recording and name not in only_in:
+            parameters.append(first)
+        parameters += [replace(first, scope=Scope(r), members=(r,)) for r in per_recording.get(name, ())]
+        groups = only_in.get(name, {})
+        parameters += [replace(first, scope=Scope(g, True), members=tuple(own)) for g, own in groups.items()]
         if name in pooled:
             known = [parameter.name for parameter in parameters]
             spread = [p for p in spread_of(by_name[name], pooled[name]) if p.name not in known]

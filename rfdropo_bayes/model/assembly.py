@@ -46,6 +46,7 @@ from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.compute_backend import backend
 from rfdropo_bayes.model.experiment import matching
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
+from rfdropo_bayes.posteriors import DrawsByOwner, ParameterInfo
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
