@@ -14,10 +14,10 @@ from rfdropo_bayes.bayes.trajectory_model import Measured
 
 
 def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key: PRNGKeyArray) -> Measured | None:
-    """What would be measured if ``truth`` held, at the times, markers and faults of the problem's own data.
+    """Simulated data under ``truth``, with the times, markers and faults of the problem's own data.
 
     Returns:
-        None where the rollout does not end well.
+        None after a failed rollout.
     """
     observed = problem.observe({name: jnp.array([truth[name]]) for name in problem.names})
     if observed.status[0] != 0:

@@ -173,11 +173,11 @@ def run(commands: typer.Typer, name: str) -> None:
 
 
 def _after(stop: BaseException, name: str) -> str:
-    """What an interrupted user can do next."""
+    """Next step for the user after an interrupt."""
     again = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
     if isinstance(stop, Interrupted) and stop.going_on is not None:
         command = shlex.join([*name.split(), *again, *stop.going_on.split()])
-        return f"interrupted; what is done is kept in {stop.folder}; to go on: {command}"
+        return f"interrupted; finished work is kept in {stop.folder}; to go on: {command}"
     if isinstance(stop, Interrupted):
         return f"interrupted; {stop.folder} holds no result; to start again: {shlex.join(['rfdropo', *again])}"
     return NOTHING_LOST

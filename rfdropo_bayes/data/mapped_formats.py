@@ -1,4 +1,4 @@
-"""Formats whose columns may be anything, so that the table [data.columns] says what each is; and what a file is."""
+"""Formats whose columns may be anything, described by the table [data.columns]; and the kind of a file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAGIC = {b"#ROSBAG": rosbag.FORMAT, b"\x89MCAP0": rosbag.FORMAT, b"SQLite forma
 
 
 class Observed(NamedTuple):
-    """A table of observations, and its columns with what the file itself tells of them."""
+    """A table of observations, and its columns, completed with facts from the file."""
 
     table: CsvTable
     columns: CsvColumns
@@ -112,9 +112,9 @@ def read_mapped(
     Args:
         format: one of `MAPPED`.
         path: file or folder with the observations, and the commands unless they have a file of their own.
-        columns: what each column is.
+        columns: mapping of the columns.
         commands: a CSV of the commands.
-        episode: of a LeRobotDataset.
+        episode: number of the episode in a LeRobotDataset.
         mask_missing: mask lost marker positions instead of rejecting the file.
 
     Raises:

@@ -55,10 +55,10 @@ class Node:
 
     @contextlib.contextmanager
     def sdo(self, what: str, where: str) -> Iterator[None]:
-        """Have the SDO client alone; its errors become those of the user.
+        """Lock the SDO client; its errors become InputErrors.
 
         Raises:
-            InputError: with ``what`` could not be done, and why.
+            InputError: names the failed action ``what`` and the reason.
         """
         try:
             with self._sdo:

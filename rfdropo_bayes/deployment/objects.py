@@ -65,7 +65,9 @@ PDOS_OF_AXIS = 64  # process data of the second axis follow so many numbers afte
 
 
 def of_axis(index: int, axis: int) -> int:
-    """Index of an object of the first axis on another one: 0x800 for each; what is not of the profile is the node's."""
+    """Index of a first-axis object on another axis, 0x800 further per axis. Objects outside the profile belong to the
+    node.
+    """
     return index + _AXIS * (axis - 1) if index >= _DEVICE else int(index)
 
 
@@ -97,7 +99,7 @@ _FREE = range(0x680, 0x6E0)  # CiA 301 gives them to nobody
 
 
 class Identifiers(NamedTuple):
-    """Of the frames of one axis: its set-points, its controlword alone, its status."""
+    """Frame identifiers of one axis: set-points, controlword alone, status."""
 
     set_point: int
     command: int
@@ -107,8 +109,7 @@ class Identifiers(NamedTuple):
 def identifiers(places: Sequence[tuple[int, int]]) -> list[Identifiers]:
     """Identifiers of axes, given as (node, axis); no two of them share one.
 
-    The predefined connection set has two RPDOs for each of two axes. Those of further axes are numbers that CiA 301
-    leaves free.
+    The predefined connection set has two RPDOs for each of two axes. Further axes use numbers that CiA 301 leaves free.
 
     Raises:
         InputError: if there are too many axes beyond the second.

@@ -4,14 +4,18 @@ and says what it knows."""
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import NoReturn
 
 from rfdropo_bayes.discrepancy.processor_wait import delay, thread_times
+from rfdropo_bayes.interrupts import interrupted
 from rfdropo_bayes.runtime import available_processors
 
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
+PATIENCE = 20.0  # seconds that the same may take after Ctrl-C
+TIME, INTERRUPT = "time", "interrupt"
 BETWEEN_STAGES = "preparation and report"
 
 
@@ -28,6 +32,7 @@ class Deadline:
         where: the setting that holds them.
         share: part of the time after which rollouts stop.
         reached: whether anything was left undone.
+        why: "time" or "interrupt" then.
         waited: seconds that the run has waited for processors which other programs held, see `delay`.
     """
 
@@ -36,6 +41,7 @@ class Deadline:
     share: float = 1.0 - KEPT
     began: float = field(default_factory=time.monotonic)
     reached: bool = False
+    why: str = ""
     waited: float = 0.0
     _spent: dict[str, float] = field(default_factory=dict)
     _stages: list[str] = field(default_factory=lambda: [BETWEEN_STAGES])
@@ -75,11 +81,37 @@ class Deadline:
         return self.share * self.minutes - (time.monotonic() - self.began) / 60.0
 
     def check(self) -> None:
-        """Raise OutOfTime once the time is up."""
+        """Raise OutOfTime once the time is up, or after Ctrl-C."""
         self._charge()
+        if self.why != INTERRUPT and interrupted():
+            self._stop(INTERRUPT)
         if self.left <= 0.0:
-            self.reached = True
-            raise OutOfTime
+            self._stop(TIME)
+
+    def _stop(self, why: str) -> NoReturn:
+        self.reached, self.why = True, self.why or why
+        raise OutOfTime
+
+    @contextmanager
+    def stopping(self, report: Callable[[str], None]) -> Iterator[None]:
+        """What may be stopped within, by the time or by Ctrl-C: it then ends here."""
+        try:
+            yield
+        except (OutOfTime, KeyboardInterrupt):
+            self.reached, self.why = True, self.why or INTERRUPT
+            report("the time is up" if self.why == TIME else "stopping: the answer is what is known by now")
+
+    @contextmanager
+    def granted(self, seconds: float | None = None) -> Iterator[None]:
+        """So much time from now on; by default what is kept for the end, once the time is up."""
+        minutes, share = self.minutes, self.share
+        if seconds is None:
+            seconds = 60.0 * KEPT * minutes if self.why == TIME else PATIENCE
+        self.minutes, self.share = (time.monotonic() - self.began + seconds) / 60.0, 1.0
+        try:
+            yield
+        finally:
+            self.minutes, self.share = minutes, share
 
     @contextmanager
     def reserve(self) -> Iterator[None]:

@@ -7,8 +7,7 @@ stands in for the law, and is not adopted as a cause.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
-from rfdropo_bayes.discrepancy.deadline import OutOfTime
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, Rules
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, Rules
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
 from rfdropo_bayes.discrepancy.gain import Gain
 from rfdropo_bayes.discrepancy.held_out import HeldOut, JudgedModel, predicted, stages_of
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.law_search import FoundLaw, Refit, law_search
+from rfdropo_bayes.discrepancy.naming import Named
+from rfdropo_bayes.discrepancy.repairs import without
 
 
 @dataclass(frozen=True)
@@ -65,32 +65,10 @@ class Described:
         return None if last is None else (widened(last.target, last.fit), last.target)
 
 
-@dataclass(frozen=True)
-class NamedModel:
-    """The base model with what the library named.
-
-    Attributes:
-        judge, base: the target under which the base model was fitted, and its fit under that.
-        steps: likewise.
-    """
-
-    judge: FitTarget
-    base: Fit
-    steps: tuple[Added, ...] = ()
-
-    @property
-    def last(self) -> tuple[FitTarget, Fit]:
-        """Target and fit with all steps."""
-        return (self.steps[-1].judge, self.steps[-1].fit) if self.steps else (self.judge, self.base)
-
-
 def describe(
-    problem: AuditProblem,
-    model: NamedModel,
-    held_out: HeldOut | None,
-    report: Callable[[str], None] = lambda line: None,
-) -> Described | None:
-    """Where something acts that the library does not have, and by what law; None where nobody asks, or no time is left.
+    problem: AuditProblem, model: Named, held_out: HeldOut | None, report: Callable[[str], None] = lambda line: None
+) -> Iterator[Described]:
+    """Where something acts that the library does not have, and by what law; nothing where nobody asks.
 
     Args:
         problem: with the ports of its simulator.
@@ -99,28 +77,27 @@ def describe(
         report: called with a line of words now and then.
     """
     if problem.ports is None or problem.compared is not None:
-        return None
-    answer: Described | None = None
-    clock = model.judge.forward.deadline
-    with clock.stage("ports and laws"), clock.reserve(), suppress(OutOfTime):
-        answer = _beside(problem, replace(model, steps=()), report)
+        return
+    clock = model.search.target.forward.deadline
+    with clock.stage("ports and laws"), clock.reserve():
+        alone = _beside(problem, model.extended(()), report)
         if not model.steps:
-            return answer
-        names = tuple(step.name for step in model.steps)
-        seen = answer.held_out if answer.holds else None
-        if held_out is not None and seen is not None and seen.beside(held_out.after(len(names))).clear:
-            report(f"the law takes the place of {' and '.join(names)}")
-            return replace(answer, stand_ins=names)
+            yield alone
+            return
+        yield replace(alone, holds=False)  # until it is compared with what the library named
+        seen = alone.held_out if alone.holds else None
+        if held_out is not None and seen is not None and seen.beside(held_out.after(len(model.steps))).clear:
+            report(f"the law takes the place of {' and '.join(model.names)}")
+            yield replace(alone, stand_ins=tuple(model.names))
+            return
         further = _beside(problem, model, report)
-        if not further.holds:
-            return replace(answer, holds=False)
-        alone, answer = answer, further
-        answer = _without_stand_ins(problem, model, alone, further, report)
-    return answer
+        if further.holds:
+            yield further
+            yield _without_stand_ins(problem, model, alone, further, report)
 
 
 def _without_stand_ins(
-    problem: AuditProblem, model: NamedModel, alone: Described, described: Described, report: Callable[[str], None]
+    problem: AuditProblem, model: Named, alone: Described, described: Described, report: Callable[[str], None]
 ) -> Described:
     """The law beside those mechanisms only that unseen recordings ask for once it is in the model.
 
@@ -132,21 +109,22 @@ def _without_stand_ins(
         described: the law beside all of the model's mechanisms.
     """
     needed = _needed(problem, described)
-    gone = tuple(step.name for step in model.steps if step.name not in needed)
+    gone = tuple(name for name in model.names if name not in needed)
     if not gone or described.held_out is None:
         return described
     report(f"with the law, unseen recordings do not ask for {' and '.join(gone)}: the law without them")
-    again = alone
-    if needed:
-        search, steps = ExtensionSearch(model.judge, problem.candidates, problem.rules, problem.seed), model.steps
-        for name in gone:
-            index = [step.name for step in steps].index(name)
-            steps = tuple(search.without(steps, index, model.base))
-        judge, fit = fit_with_noise(steps[-1].judge.measured, steps[-1].fit.x, steps[-1].fit.free)
-        again = _beside(problem, replace(model, steps=(*steps[:-1], replace(steps[-1], judge=judge, fit=fit))), report)
+    again = _beside(problem, _without(model, gone), report) if needed else alone
     if not again.holds or again.held_out is None or described.held_out.beside(again.held_out).clear:
         return described
     return replace(again, stand_ins=gone)
+
+
+def _without(model: Named, gone: Sequence[str]) -> Named:
+    """A model less some of its mechanisms, judged anew."""
+    for name in gone:
+        model = model.extended(without(model.asked, model.steps, model.names.index(name), model.base))
+    judge, fit = fit_with_noise(model.judge.measured, model.fit.x, model.fit.free)
+    return model.extended([*model.steps[:-1], replace(model.steps[-1], judge=judge, fit=fit)])
 
 
 def _needed(problem: AuditProblem, described: Described) -> list[str]:
@@ -172,20 +150,20 @@ def _needed(problem: AuditProblem, described: Described) -> list[str]:
     return needed
 
 
-def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], None]) -> Described:
+def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) -> Described:
     """The law beside a model, and what it is worth on unseen recordings."""
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    target, fit = model.last
+    target, fit = model.judge, model.fit
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups)
     found = law_search(target, *options).find(target, fit)
     if not found.terms:
         return Described(found, model.steps)
-    stages = stages_of(model.judge, model.base, model.steps)
+    stages = stages_of(model.search.target, model.base, model.steps)
     named = len(stages) - 1
     stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
-    held_out = predicted(problem, model.judge.measured, stages)
+    held_out = predicted(problem, model.search.target.measured, stages)
     if held_out.count < len(stages):
         report(f"with {len(found.terms)} terms, an unseen recording cannot be simulated")
         found = found.cut(max(held_out.count - 1 - named, 0))

@@ -88,6 +88,11 @@ class Lanes:
         return {name: part for name, part in found.items() if part is not None}, status
 
     @property
+    def costly(self) -> tuple[str, ...]:
+        """Parameters of which rollouts take longer than others."""
+        return ()
+
+    @property
     def difference(self) -> float | None:
         """Relative step of its derivatives; None where they are exact."""
         engine: Any = getattr(self.simulator, "engine", None)
@@ -164,6 +169,11 @@ class RoutedLanes(Lanes):
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
         self.null = null
         self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    @property
+    def costly(self) -> tuple[str, ...]:
+        """See `Lanes.costly`."""
+        return tuple(self.physical[i] for i in self._further)
 
     @property
     def difference(self) -> float | None:

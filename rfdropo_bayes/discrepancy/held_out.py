@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,14 +12,14 @@ from jaxtyping import Bool
 
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
-from rfdropo_bayes.discrepancy.deadline import OutOfTime
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, spread
 from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.naming import Named
 from rfdropo_bayes.discrepancy.port_rollouts import with_laws_of
-from rfdropo_bayes.discrepancy.screen import Screen
+from rfdropo_bayes.discrepancy.repairs import without
 from rfdropo_bayes.errors import NoLikelihoodError
 
 DRAWS = 60
@@ -94,44 +94,6 @@ class HeldOut:
         return last
 
 
-def _without_carried(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], held_out: HeldOut
-) -> tuple[list[Added], HeldOut]:
-    """Steps less those that were supported beside a later one only, and without which that one does as well.
-
-    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
-    it were the last step, must clearly predict unseen recordings better than the model without it. Where the time is
-    up, the steps stay that were supported together.
-    """
-    index, clock = 0, search.target.forward.deadline
-    with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
-        while index < len(steps) - 1:
-            if held_out.gain(index, index + 1).clear or steps[index].name == DISCRETISATION:
-                index += 1
-                continue
-            search.report(f"is {steps[index].name} needed? The model without it")
-            fewer = search.without(steps, index, base)
-            other = _predicted(problem, judge, search, base, fewer)
-            if other.count <= len(fewer) or held_out.beside(other).clear:
-                index += 1
-            else:
-                steps, held_out, index = fewer, other, 0
-    return steps, held_out
-
-
-def _held_out(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
-) -> HeldOut | None:
-    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
-    was up."""
-    if not steps:
-        return None
-    search.report("measuring the gain on recordings that no fit has seen")
-    with search.target.forward.deadline.stage("gain"), suppress(OutOfTime):
-        return _predicted(problem, judge, search, base, steps)
-    return None
-
-
 class JudgedModel(NamedTuple):
     """A model that predicts recordings which it has not seen.
 
@@ -144,13 +106,6 @@ class JudgedModel(NamedTuple):
     judge: FitTarget
     fit: Fit
     finer: bool
-
-
-def _predicted(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
-) -> HeldOut:
-    """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
-    return predicted(problem, search.target.measured, stages_of(judge, base, steps))
 
 
 def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[JudgedModel]:
@@ -246,20 +201,76 @@ def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray,
     return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
 
 
-def supported_steps(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], last: Screen
-) -> tuple[list[Added], Screen, HeldOut | None]:
-    """The steps that recordings which no fit has seen support, all of them where these support none; the screen
-    of the model with them; and the predictions of these recordings."""
-    held_out = _held_out(problem, judge, search, base, steps)
-    if held_out is not None and held_out.count <= len(steps):
-        name = steps[held_out.count - 1].name
-        search.report(f"with {name}, an unseen recording cannot be simulated: it is not supported")
-        steps, last = steps[: held_out.count - 1], steps[held_out.count - 1].before
-        if not steps:
-            return steps, last, None
-    if held_out is None or not (kept := held_out.supported()):
-        return steps, last, held_out
-    last = steps[kept].before if kept < len(steps) else last
-    steps, held_out = _without_carried(problem, judge, search, base, steps[:kept], held_out.after(kept))
-    return steps, last if len(steps) == kept else search.tested(steps[-1].fit, len(steps)), held_out
+@dataclass(frozen=True)
+class Kept:
+    """What unseen recordings say of named causes.
+
+    Attributes:
+        named: the steps that they support, all of them where they support none, and the screen of the model with them.
+        held_out: their predictions by the base model and after each of these steps; None where no step can be
+            simulated, or there is none.
+        unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
+    """
+
+    named: Named
+    held_out: HeldOut | None
+    unsupported: tuple[str, ...] = ()
+
+
+def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
+    """The steps that recordings which no fit has seen support: first as all steps are predicted, then without those
+    that a later one carried."""
+    report, clock = named.search.report, named.search.target.forward.deadline
+    if not named.steps:
+        yield Kept(named, None)
+        return
+    report("measuring the gain on recordings that no fit has seen")
+    with clock.stage("gain"), clock.reserve():
+        held_out = _predicted(problem, named)
+        if held_out.count <= len(named.steps):
+            last = named.steps[held_out.count - 1]
+            report(f"with {last.name}, an unseen recording cannot be simulated: it is not supported")
+            fewer = replace(named, steps=named.steps[: held_out.count - 1], screen=last.before, tried=None)
+        else:
+            fewer = named
+        supported = held_out.supported()
+        if not fewer.steps or not supported:
+            yield _kept(named, fewer, held_out if fewer.steps else None)
+            return
+        if supported < len(fewer.steps):
+            before = fewer.steps[supported].before
+            fewer = replace(fewer, steps=fewer.steps[:supported], screen=before, tried=None)
+        yield _kept(named, fewer, held_out.after(supported))
+        left, measured = _without_carried(problem, fewer, held_out.after(supported))
+        if len(left.steps) < len(fewer.steps):
+            left = replace(left, screen=left.asked.tested(left.fit, len(left.steps)))
+        yield _kept(named, left, measured)
+
+
+def _kept(asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
+    unsupported = tuple(name for name in asked.names if name not in named.names)
+    if unsupported:
+        asked.search.report(f"unseen recordings do not support {' and '.join(unsupported)}")
+    return Kept(named, held_out, unsupported)
+
+
+def _without_carried(problem: AuditProblem, named: Named, held_out: HeldOut) -> tuple[Named, HeldOut]:
+    """Steps less those that were supported beside a later one only, and without which that one does as well.
+
+    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
+    it were the last step, must clearly predict unseen recordings better than the model without it.
+    """
+    for index in range(len(named.steps) - 1):
+        if held_out.gain(index, index + 1).clear or named.steps[index].name == DISCRETISATION:
+            continue
+        named.search.report(f"is {named.steps[index].name} needed? The model without it")
+        fewer = named.extended(without(named.asked, named.steps, index, named.base))
+        other = _predicted(problem, fewer)
+        if other.count > len(fewer.steps) and not held_out.beside(other).clear:
+            return _without_carried(problem, fewer, other)
+    return named, held_out
+
+
+def _predicted(problem: AuditProblem, named: Named) -> HeldOut:
+    """Predictions of the base model and of the model after each step."""
+    return predicted(problem, named.judge.measured, stages_of(named.search.target, named.base, named.steps))

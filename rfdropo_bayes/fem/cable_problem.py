@@ -42,7 +42,7 @@ def settle_cables(
     softness: Float[Array, "n ..."],
     start: Float[Array, "n ..."],
 ) -> tuple[Float[Array, "n ..."], Float[Array, " ..."]]:
-    """Impulses, and 1 where they were found."""
+    """Impulses, and 1 if the solve succeeded."""
     size, lanes = free.shape
     if not size:
         return jnp.zeros((0, lanes)), jnp.ones(lanes)

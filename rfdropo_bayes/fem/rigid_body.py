@@ -27,7 +27,7 @@ class Cube(NamedTuple):
 
 
 class CubeState(NamedTuple):
-    """Where the cube is, and how it moves."""
+    """Pose and motion of the cube."""
 
     position: Float[Array, "3"]  # of the centre [m]
     orientation: Float[Array, "4"]  # unit quaternion (x, y, z, w)
@@ -41,7 +41,9 @@ def solid_gyration_radius(side: Scalar) -> Float[Array, ""]:
 
 
 def cube_at(position: Float[Array, "3"], yaw: Scalar, axis: Float[Array, "3"] | Float[np.ndarray, "3"]) -> CubeState:
-    """A cube at rest, turned by ``yaw`` [rad] about a unit vector from where its edges are parallel to the axes."""
+    """A cube at rest, turned by ``yaw`` [rad] about a unit vector from the orientation with edges parallel to the
+    axes.
+    """
     half = 0.5 * jnp.asarray(yaw)
     orientation = jnp.concatenate([jnp.sin(half) * jnp.asarray(axis), jnp.cos(half)[None]])
     return CubeState(jnp.asarray(position), orientation, jnp.zeros(3), jnp.zeros(3))

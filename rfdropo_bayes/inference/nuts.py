@@ -24,10 +24,10 @@ CHAINS, SCREEN = 2, 64  # chains, which start at the best of so many prior draws
 
 @dataclass(frozen=True, repr=False)
 class NutsConfig(MethodOptions, called="NUTS"):
-    """NUTS: the posterior by Hamiltonian Monte Carlo, where JAX can differentiate the likelihood.
+    """NUTS: the posterior by Hamiltonian Monte Carlo, if JAX can differentiate the likelihood.
 
     Attributes:
-        draws: of each of two chains, after as many to warm up.
+        draws: draws of each of two chains, after an equal number of warm-up steps.
     """
 
     draws: int = 500

@@ -200,6 +200,10 @@ class SimulatorTable(ExperimentTable):
         return self
 
 
+ROLLOUTS = 20000
+"""Budget of an experiment that states none."""
+
+
 class InferenceTable(BaseModel):
     """[inference]: method and budget; the method's own options are checked by the method."""
 
@@ -209,7 +213,21 @@ class InferenceTable(BaseModel):
         default="smc",
         description="see docs/reference/methods.md; options of the method stand beside it",
     )
-    rollouts: int = Field(default=20000, ge=1, description="budget in full-length rollouts")
+    rollouts: int | None = Field(
+        default=None, ge=1, description=f"budget in full-length rollouts; {ROLLOUTS} without minutes"
+    )
+    minutes: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="budget in minutes on the machine that calibrates, predictions and report included; rollouts are "
+        "timed, and as many are allowed as fit in",
+    )
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> InferenceTable:
+        if self.rollouts is not None and self.minutes is not None:
+            raise ValueError("rollouts and minutes are both given: leave out one of them")
+        return self
 
     @property
     def options(self) -> dict[str, Any]:

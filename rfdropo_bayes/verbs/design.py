@@ -20,13 +20,13 @@ from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
+from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime
 from rfdropo_bayes.discrepancy.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.inadequacy import seen_under
 from rfdropo_bayes.discrepancy.law_search import Refit, law_search
-from rfdropo_bayes.discrepancy.pipeline import base_model
 from rfdropo_bayes.discrepancy.screen import Screen
 from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.model.model import Model
@@ -135,7 +135,7 @@ def _design(
     search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed)
     found: Screen | None = None
     with clock.part(SCREENED_BY, SCREENING):
-        found, _ = search.screened(fitted)
+        found = search.screened(fitted)
     hypotheses = [] if found is None else _hypotheses(search, found, clock, report)
     wrong = found is not None and found.omnibus.p <= problem.rules.base_passes
     if wrong and (rivals := _rivals(problem, target, fitted, clock, report)):

@@ -38,14 +38,14 @@ def trunk(
     """The trunk that an experiment file describes, or the robot itself.
 
     Args:
-        robot: the robot with motors that is deployed.
+        robot: deployed robot with motors.
         experiment: file whose robot, [simulator], mechanisms and [model.fixed] are the truth; by default ``robot``.
         marker_noise: standard deviation of white noise on every coordinate of a marker, and on points of a cube [m].
-        seed: of the noise.
+        seed: seed of the noise.
         changes: entries that replace the experiment's, as ``--set`` takes them: a parameter's name, or ``"table.key"``.
 
     Raises:
-        InputError: a bad experiment, or a robot with other channels or markers than the one deployed.
+        InputError: a bad experiment, or a robot with other channels or markers than the deployed robot.
     """
     simulator, values = true_simulator(robot, experiment, changes)
     command = simulator.robot.command
@@ -107,12 +107,12 @@ class SimulatedTrunk:
     """A session of one lane as a `deployment.Plant`.
 
     Args:
-        robot: whose motors wind the cables.
-        simulator: of the same channels and markers, whose commands ramp over one period.
-        period: of the session [s].
-        values: of the simulator's parameters.
+        robot: robot whose motors wind the cables.
+        simulator: simulator of the same channels and markers, whose commands ramp over a period.
+        period: control period of the session [s].
+        values: values of the simulator's parameters.
         marker_noise: see `trunk` [m].
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     def __init__(

@@ -94,12 +94,12 @@ class Orientation(WhiteSeries):
         """See `Series.expected`.
 
         Raises:
-            InputError: a simulator that does not tell how its sections are turned.
+            InputError: a simulator without section orientations.
         """
         found = seen.observation.orientation
         if found is None:
             raise InputError(
-                "the simulator does not tell how its sections are turned",
+                "the simulator has no section orientations",
                 where="[model] orientation",
                 remedy="leave it out, or use a body that is a rod",
             )

@@ -171,7 +171,7 @@ class Hub:
         self.channel = channel if family == socket.AF_UNIX else f"{name[0]}:{name[1]}"
 
     def serve(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Pass frames on until ``stop`` says so (asked twice a second)."""
+        """Pass frames on until ``stop`` returns True; it is called twice a second."""
         try:
             while not stop():
                 for key, events in self._selector.select(0.5):

@@ -32,7 +32,7 @@ def _new_library(state: Any) -> CPUCodeLibrary:
 
 
 def _link_all(library: CPUCodeLibrary) -> None:
-    """Link what a library calls, directly or not, each once: what was deferred has linked nothing itself."""
+    """Link all direct and indirect callees of a library once: a deferred library has linked nothing itself."""
     called: dict[CPUCodeLibrary, None] = {}
     waiting = list(library._linking_libraries)
     while waiting:

@@ -292,7 +292,7 @@ class NativeRod:
         modulus = rows["young_modulus"]
         shear = modulus / (2.0 * (1.0 + rows["poisson_ratio"]))
         arrays = {
-            "moduli": np.stack([modulus, shear], axis=1),
+            "moduli": np.stack([modulus, shear, rows["axial_scale"] * modulus], axis=1),
             "density": rows["density"][:, None],
             "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
             "gravity": rows["gravity"],

@@ -1,8 +1,8 @@
 """Kernels of a body of corotational tetrahedra in SIMD lanes: frames, forces, and the matrix of a stage.
 
-The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``, with samples in lanes. Nodes are numbered
-in elimination order, held nodes after the free ones. Block storage beyond that of the factor is a dump for blocks of
-held nodes.
+The physics follows ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``, with samples in lanes. Nodes are numbered in
+elimination order, held nodes after the free nodes. Block storage beyond the factor's is a dump for blocks of held
+nodes.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Draws of normal approximations, weighted by the exact posterior: what a normal says of a curved ridge is mended here.
+"""Draws of normal approximations, weighted by the exact posterior, which corrects the approximation of curved ridges.
 
-The first candidates come from the approximations. A normal is thin where a ridge bends away from it, and weights do not
-show what no candidate has seen. So the next rounds come from Student-t distributions with the weighted covariance of
-all before them, added to that of the normal (adaptive multiple importance sampling, Cornuet et al. 2012). All together
-have the density ``q``. A candidate's weight for optimum k is ``p(u) / q(u)`` times the share
-of k in ``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight
-are then resampled, and the effective number ``(sum w)^2 / sum w^2`` says how many candidates are behind them.
+The first candidates come from the approximations. A normal has little density on a curved ridge, and weights cannot
+reveal regions without candidates. So the next rounds come from Student-t distributions with the weighted covariance of
+all earlier candidates, added to the normal's covariance (adaptive multiple importance sampling, Cornuet et al. 2012).
+All together have the density ``q``. A candidate's weight for optimum k is ``p(u) / q(u)`` times the share of k in
+``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight are
+then resampled, and the effective number ``(sum w)^2 / sum w^2`` measures the number of effective candidates.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) 
 
 
 def reweighting_cautions(found: Reweighted | None) -> list[Caution]:
-    """What the exact posterior says of the normal approximation; None stands for draws that were not compared."""
+    """Cautions from the comparison of the normal approximation with the exact posterior; None means no comparison."""
     remedy = "allow more rollouts, or use the bridge or SMC"
     if found is None:
         sentence = f"no rollouts were left to check the normal approximation that the draws are from: {remedy}"

@@ -70,18 +70,18 @@ class Tuning(NamedTuple):
 
 
 class StageInfo(NamedTuple):
-    """What one stage did.
+    """Facts about one stage.
 
     Attributes:
-        progress: where on the path it arrived.
-        log_evidence_increment: of the stage.
+        progress: position on the path at its end.
+        log_evidence_increment: its increment of the log evidence.
         row_log_evidence: log evidence, relative to the start of the stage, at each whole row it passed.
-        passed: those rows, as prefix lengths.
+        passed: these rows, as prefix lengths.
         ess: effective sample size before resampling, as a share of all particles.
-        moves: number of moves of every particle, 0 when weights were carried on instead.
-        acceptance: mean acceptance over those moves.
+        moves: number of moves of every particle, 0 if weights were kept instead.
+        acceptance: mean acceptance over the moves.
         scale: step size at the end.
-        correlation: slowest correlation left by the moves.
+        correlation: slowest remaining correlation after the moves.
     """
 
     progress: float
@@ -112,11 +112,11 @@ def advance(
         population: particles at ``population.progress``.
         target_ess: share of effective particles to keep.
         stop: end of the path.
-        leap: go to the end whatever becomes of the weights (for a budget that is used up).
+        leap: go to the end with any weights (for an exhausted budget).
 
     Returns:
-        the reweighted population, what is known of the stage so far, and whether the end was reached with the
-        effective sample size kept.
+        the reweighted population, the facts about the stage so far, and whether the end was reached with the effective
+        sample size kept.
     """
     start = population.progress
     first = int(start)
@@ -285,12 +285,12 @@ def refresh(
 def prolong(
     key: PRNGKeyArray, population: Population, evaluate: Evaluate, tuning: Tuning, moves: int, rounds: int
 ) -> Population:
-    """Equal-weight particles, and where each of some rounds of moves under the same target takes them.
+    """Equal-weight particles, with their positions after each round of moves under the same target.
 
-    All are draws of the target; a hundred particles alone make coarse quantiles, the more so as resampling left copies.
+    All are draws of the target; a hundred particles give coarse quantiles, even more so with copies from resampling.
 
-    The key must not be that of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``, and moves
-    by the same random numbers end near where they began.
+    The key must differ from the key of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``,
+    and moves with the same random numbers end near their start.
     """
     found = [population]
     for index in range(rounds):
@@ -310,7 +310,7 @@ def next_step(
     """Longest step along a path of targets that keeps the effective sample size.
 
     Args:
-        log_weights_at: log weights of the particles after a step of the given length; 0 gives the present ones.
+        log_weights_at: log weights of the particles after a step of the given length; 0 gives the present weights.
         longest: length of the step to the end of the path.
         target: effective sample size to keep, as a share of the particles that have weight at the end of the path.
 

@@ -1,4 +1,4 @@
-"""Lanes of a MuJoCo model that go on from where they were left, each with parameters of its own."""
+"""Lanes of a MuJoCo model that continue from their state, each with its own parameters."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 class MuJoCoLanes:
     """Bodies of a session: see `simulators.body_lanes.BodyLanes`. The material of a lane is its parameters by name.
 
-    Motion is that of whole rollouts, to the tolerance of MuJoCo's solver where it has constraints: each period begins
-    its first solve anew.
+    Motion equals that in whole rollouts, to the tolerance of MuJoCo's solver if there are constraints, because each
+    period restarts the solver.
 
     Args:
-        rollouts: of the model.
-        count: how many lanes.
+        rollouts: rollouts of the model.
+        count: number of lanes.
     """
 
     def __init__(self, rollouts: MuJoCoRollouts, count: int) -> None:
