@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rfdropo_bayes
 from rfdropo_bayes.bayes.inferred_parameter import Pooled
-from rfdropo_bayes.bayes.scopes import build_scopes
+from rfdropo_bayes.bayes.scopes import Scopes, build_scopes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups, group_of, in_group
+from rfdropo_bayes.posteriors import ParameterInfo
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPECS = (
@@ -201,3 +207,56 @@ def test_a_spread_between_groups_that_is_inferred_is_that_of_the_deviations():
     held = hierarchical(0.001)
     assert "offset_spread" not in held.names
     assert held["offset_x_deviation@c"].prior.scale == 0.001
+
+
+def every_kind():
+    """A shared parameter, one of each recording, one of one group alone, and one that is pooled."""
+    size = ParameterSpec("size", "-", 0.0, 9.0, 0.5, {"distribution": "HalfNormal", "scale": 1.0}, "")
+    recordings = ("a1", "b", "c")
+    pooled = {"offset_x": Pooled(0.002, gather_groups(recordings, DAYS), "offset")}
+    priors = {"young_modulus": {}, "poisson_ratio": {}, "offset_x": {}, "size": {}}
+    alone, only_in = {"poisson_ratio": ["a1", "b"]}, {"size": {"april": ("b",)}}
+    return build_scopes((*SPECS, size), priors, alone, recordings, pooled=pooled, only_in=only_in)
+
+
+def test_a_posterior_says_whose_each_parameter_is():
+    """Read back from its record, the parameters hold where they held: a group's in new recordings of the group."""
+    chosen = every_kind()
+    infos = [ParameterInfo.from_dict(json.loads(json.dumps(info.as_dict()))) for info in chosen.infos]
+    back = Scopes.read(infos, tuple(chosen.specs.values()), {})
+    assert back.names == chosen.names
+    values = {name: float(k) for k, name in enumerate(chosen.names, 1)}
+    new = back.extended(["a1[3:9]", "b2", "d"], ["a1", "b", "c"], {**DAYS, "april": "b*"})
+    assert new.like["size@april"] == ("size@april",)
+    assert new.like["poisson_ratio@a1[3:9]"] == ("poisson_ratio@a1",)
+    assert new.like["offset_x_deviation@d"] == ()
+    assert "poisson_ratio@d" not in new.scopes.names  # two of three fitted recordings had one
+    given = values | {"poisson_ratio@a1[3:9]": 0.3, "offset_x_deviation@d": 0.01}
+    piece, april, other = (new.scopes.values_in(name, given) for name in ("a1[3:9]", "b2", "d"))
+    assert (piece["poisson_ratio"], piece["size"], other["poisson_ratio"]) == (0.3, 0.5, 0.45)
+    assert (april["size"], other["size"]) == (values["size@april"], 0.5)
+
+
+def test_what_is_held_acts_where_it_did():
+    chosen = every_kind()
+    values = {name: float(column[0]) for name, column in chosen.sample(jax.random.key(0), 1).items()}
+    held = {name: values[name] for name in ("offset_x_deviation@january", "poisson_ratio@b", "young_modulus")}
+    rest = {name: value for name, value in values.items() if name not in held}
+    for recording in ("a1", "b", "c"):
+        assert chosen.holding(held).values_in(recording, rest) == chosen.values_in(recording, values)
+
+
+def test_a_parameter_that_the_model_lacks_is_refused():
+    with pytest.raises(InputError, match="holds 'size', which the experiment's model lacks"):
+        Scopes.read(every_kind().infos, SPECS, {})
+
+
+def test_no_label_is_taken_apart():
+    """The structure of parameters is in `Scope`; text that knows the sign is text for people."""
+    package = Path(rfdropo_bayes.__file__).parent
+    found = {
+        p.name
+        for p in package.rglob("*.py")
+        if re.search(r"""(split|partition|in)\W{1,2}["']@["']""", p.read_text("utf-8"))
+    }
+    assert found == set()

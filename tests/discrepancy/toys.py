@@ -235,7 +235,7 @@ def with_prior(asked: AuditProblem, name: str, prior: dict) -> AuditProblem:
     """The same data set and library under another prior of one parameter."""
     tables = {spec.name: prior if spec.name == name else {} for spec in Toy.parameters}
     space = build_scopes(Toy.parameters, tables, {}, asked.model.recordings.names)
-    return replace(asked, coordinates=replace(asked.coordinates, space=space), model=replace(asked.model, space=space))
+    return replace(asked, coordinates=replace(asked.coordinates, space=space), model=replace(asked.model, scopes=space))
 
 
 def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weighed, ...] = ()) -> AuditProblem:
