@@ -21,7 +21,7 @@ from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 SCATTERED = 0.5  # nats
 APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
 STUCK = 0.7  # correlation with their start that last moves may leave unsaid
-PRIOR_DRAWS = 2000  # that tell where a prior is, and whether it is one of logarithms
+PRIOR_DRAWS = 2000  # they show the range of a prior, and whether it is logarithmic
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
 

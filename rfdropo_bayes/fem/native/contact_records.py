@@ -171,5 +171,5 @@ def cube_rows(
         array = np.asarray(given, dtype=float)
         if array.shape not in ((width,), (1, width), (count, width)):
             raise InputError(f"{name} has shape {array.shape}, expected {(count, width)}", where="cube")
-        rows.append(np.ascontiguousarray(np.broadcast_to(array, (count, width)), dtype=dtype))
+        rows.append(np.array(np.broadcast_to(array, (count, width)), dtype=dtype, order="C"))
     return Cubes(*rows)

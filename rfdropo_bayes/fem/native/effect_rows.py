@@ -101,4 +101,4 @@ def load_rows(loads: SectionLoads | None) -> tuple[Float[np.ndarray, "batch valu
     batch, rows = force.shape[:2]
     factors = [np.exp(np.asarray(part, float))[..., None] for part in (loads.stiffness, loads.damping)]
     columns = [force.reshape(batch, rows, -1), *factors, np.asarray(loads.gravity, float)]
-    return np.concatenate(columns, axis=-1).reshape(batch, -1), np.asarray(loads.station, dtype=np.int64)
+    return np.concatenate(columns, axis=-1).reshape(batch, -1), np.array(loads.station, dtype=np.int64)

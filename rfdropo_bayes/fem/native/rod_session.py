@@ -23,6 +23,7 @@ from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_engine import NativeRod, Records, Run
 from rfdropo_bayes.fem.native.rod_records import RodSamples
+from rfdropo_bayes.fem.native.rod_tables import as_kernel_array
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads
@@ -158,7 +159,7 @@ class RodSession:
         if displacement.ndim != 3 or displacement.shape[::2] != (self.count, engine.tables.cables):
             expected = f"({self.count}, steps, {engine.tables.cables})"
             raise InputError(f"displacement has shape {displacement.shape}, expected {expected}", where="advance")
-        moves = np.ascontiguousarray(displacement, dtype=engine.dtype).reshape(self.count, -1)
+        moves = as_kernel_array(np.asarray(displacement, float).reshape(self.count, -1), engine.dtype.type)
         batch = self._run.batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
         if bool(batch.present[LOADED]) != (loads is not None):
             raise InputError(
@@ -257,7 +258,7 @@ class RodSession:
             own: dict[str, dict[str, np.ndarray]] = {place.record: {} for place in self._places}
             for place in self._places:
                 own[place.record][place.name] = self.memory[block, place.first : place.last]
-            # What is present is the same for all blocks, and no lane's own.
+            # Flags of present effects are the same for all blocks and lanes.
             own["samples"]["present"] = self._run.batch.present
             parts = {name: getattr(records, name)._replace(**fields) for name, fields in own.items()}
             self._local.records[block] = records._replace(**parts)
