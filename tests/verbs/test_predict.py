@@ -257,7 +257,7 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
         return moved.reshape(len(moved), horizon, 6), np.zeros(len(moved))
 
     problem = SimpleNamespace(
-        model=SimpleNamespace(space=space, recordings=recordings), n_recordings=1, rollouts=rollouts
+        model=SimpleNamespace(scopes=space, recordings=recordings), n_recordings=1, rollouts=rollouts
     )
     drawn = [p for p in space.parameters if p.scope.added_to]
     matched, unmatched = match_first_row(problem, values, ["new"], drawn, left, jax.random.key(2))
