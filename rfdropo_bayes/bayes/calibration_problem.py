@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
+from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -33,30 +34,30 @@ class CalibrationProblem:
     Args:
         model: priors, simulator and data.
         chunk: most parameter sets in one compiled call.
-        earlier: draws of the posterior of another model of the same robot, by parameter name, from which climbs may
-            start; parameters that it lacks start from their priors.
+        earlier: draws of the posterior of another model of the same robot, from which climbs may start; parameters that
+            it lacks start from their priors.
     """
 
-    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: Batch | None = None) -> None:
+    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: DrawsByOwner | None = None) -> None:
         self.model = model
-        self.earlier = {} if earlier is None else {name: np.asarray(draws) for name, draws in earlier.items()}
+        self.earlier: DrawsByOwner = earlier or {}
         self.measured = model.measured
         self.shares = dict.fromkeys(self.measured, 1.0)  # what each channel counts
         self.jacobian = "auto"
         self._told: Callable[[float], None] | None = None
         self.chunk = chunk
-        self.names = model.space.names
-        self.units = {p.name: p.spec.unit for p in model.space.parameters}
-        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.space.parameters}
-        self.prior_ends = {p.name: p.ends for p in model.space.parameters}
+        self.names = model.scopes.names
+        self.units = {p.name: p.spec.unit for p in model.scopes.parameters}
+        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.scopes.parameters}
+        self.prior_ends = {p.name: p.ends for p in model.scopes.parameters}
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}
         self.compared = [channel for channel in model.channels if isinstance(channel, FeatureChannel)]
         physical = {spec.name for spec in model.simulator.parameters}
-        self.scales, self.typical_scales = model.space.scales, model.space.typical_scales
+        self.scales, self.typical_scales = model.scopes.scales, model.scopes.typical_scales
         self.physical_names = tuple(
-            p.name for p in model.space.parameters if p.physical in physical or p.name in self.scales
+            p.name for p in model.scopes.parameters if p.physical in physical or p.name in self.scales
         )
 
     @cached_property
@@ -67,15 +68,19 @@ class CalibrationProblem:
         data = self.measured.values()
         for array in (*data, recordings.time, *jax.tree.leaves((recordings.line, recordings.commands))):
             digest.update(np.ascontiguousarray(array).tobytes())
-        priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
+        priors = [(p.name, sorted(p.table.items())) for p in self.model.scopes.parameters]
         rest = (
             priors,
-            sorted(self.model.fixed.items()),
+            sorted(self.model.scopes.fixed.items()),
             [(channel.name, _plain(channel)) for channel in self.model.channels],
             self.model.noise,
             sorted(self.model.simulator.description.items()),
             sorted(self.shares.items()),
-            *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
+            *(
+                (name, owner, np.asarray(draws).tobytes())
+                for name, own in sorted(self.earlier.items())
+                for owner, draws in sorted(own.items())
+            ),
         )
         digest.update(repr(rest).encode())
         return digest.hexdigest()
@@ -84,7 +89,7 @@ class CalibrationProblem:
         """The same problem with some parameters known, and no longer inferred; itself where none is."""
         if not values:
             return self
-        model = replace(self.model, space=self.model.space.holding(values), fixed={**self.model.fixed, **values})
+        model = replace(self.model, scopes=self.model.scopes.holding(values))
         other = CalibrationProblem(model, chunk=self.chunk, earlier=self.earlier)
         other.measured, other.shares = self.measured, self.shares
         other.jacobian, other._told = self.jacobian, self._told
@@ -98,43 +103,43 @@ class CalibrationProblem:
 
     def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
         """Log density of the prior of the standard deviations, in the order of ``scales``."""
-        priors = [self.model.space[name].prior for name in self.scales]
+        priors = [self.model.scopes[name].prior for name in self.scales]
         return np.sum([np.asarray(p.log_prob(column)) for p, column in zip(priors, values.T, strict=True)], axis=0)
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""
-        return self.model.space.sample(key, n)
+        return self.model.scopes.sample(key, n)
 
     def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Where climbs may start: the prior, with what an earlier posterior knows in its place."""
-        return self.model.space.sample_around(self.earlier, key, n)
+        return self.model.scopes.sample_around(self.earlier, key, n)
 
     def to_unconstrained(self, values: Batch) -> Float[Any, "n d"]:
         """Values as points of the unconstrained space, columns in the order of ``names``."""
         columns = {name: values[name] for name in self.names}
-        space = self.model.space
-        return padded(self._unconstrained, columns) if is_batch(columns, 1) else space.to_unconstrained(columns)
+        scopes = self.model.scopes
+        return padded(self._unconstrained, columns) if is_batch(columns, 1) else scopes.to_unconstrained(columns)
 
     def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`."""
-        return padded(self._constrained, u) if is_batch(u, 2) else self.model.space.from_unconstrained(u)
+        return padded(self._constrained, u) if is_batch(u, 2) else self.model.scopes.from_unconstrained(u)
 
     def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log prior density in the unconstrained space."""
-        space = self.model.space
-        return padded(self._log_prior, u) if is_batch(u, 2) else space.log_prior_unconstrained(u)
+        scopes = self.model.scopes
+        return padded(self._log_prior, u) if is_batch(u, 2) else scopes.log_prior_unconstrained(u)
 
     @cached_property
     def _unconstrained(self) -> Callable:
-        return jax.jit(self.model.space.to_unconstrained)
+        return jax.jit(self.model.scopes.to_unconstrained)
 
     @cached_property
     def _constrained(self) -> Callable:
-        return jax.jit(self.model.space.from_unconstrained)
+        return jax.jit(self.model.scopes.from_unconstrained)
 
     @cached_property
     def _log_prior(self) -> Callable:
-        return jax.jit(self.model.space.log_prior_unconstrained)
+        return jax.jit(self.model.scopes.log_prior_unconstrained)
 
     @cached_property
     def prior_derivatives(self) -> tuple[Callable, Callable]:
@@ -206,7 +211,7 @@ class CalibrationProblem:
     def noise_deviation(self, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
         values."""
-        known = {**self.model.fixed, **values}
+        known = {**self.model.scopes.fixed, **values}
         return np.tile(np.concatenate([c.feature_deviation(known) for c in self.compared]), self.n_recordings)
 
     @cached_property
@@ -323,7 +328,7 @@ class CalibrationProblem:
 
         def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             keys = jax.random.split(key, self.n_recordings)
-            known = {**self.model.fixed, **values}
+            known = {**self.model.scopes.fixed, **values}
             return jax.vmap(lambda k, t: draw(k, t, known))(keys, jnp.asarray(self.model.recordings.time))
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import DrawsByOwner
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
@@ -153,11 +154,11 @@ class WarmStart(Problem, Protocol):
     """A problem that knows places to start from beside its prior.
 
     Attributes:
-        earlier: draws of an earlier posterior, by parameter name; empty without one.
+        earlier: draws of an earlier posterior, by parameter and owner; empty without one.
     """
 
     @property
-    def earlier(self) -> Mapping[str, Float[Any, " n"]]: ...
+    def earlier(self) -> DrawsByOwner: ...
 
     def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Where climbs may start."""

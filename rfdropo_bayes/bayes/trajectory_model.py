@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.bayes.channels import Channel, Markers, ObjectPose, Seen
 from rfdropo_bayes.bayes.channels.object_pose import Placing, offset_of
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
+from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.protocol import Observation, Simulator
 
 Values = Mapping[str, Float[Array, "..."]]
@@ -30,16 +31,13 @@ class TrajectoryModel:
 
     Attributes:
         simulator: anything that satisfies `Simulator`, mechanisms included.
-        space: inferred parameters, those of the channels among them.
-        fixed: values of parameters that are not inferred and differ from their nominal value; of all recordings, or of
-            one (``name@recording``).
+        scopes: what is inferred and what is known, parameters of the channels among them.
         recordings: what was commanded, and when it was observed.
         channels: what was measured, `Markers` first.
     """
 
     simulator: Simulator
-    space: ParameterSpace
-    fixed: Mapping[str, float]
+    scopes: Scopes
     recordings: RecordingSet
     channels: tuple[Channel, ...]
 
@@ -72,30 +70,13 @@ class TrajectoryModel:
     def _physical(self) -> frozenset[str]:
         return frozenset(spec.name for spec in self.simulator.parameters)
 
-    @cached_property
-    def _absent(self) -> dict[str, float]:
-        """Nominal values of parameters that belong to some recordings only: the others have these."""
-        own = {parameter.spec.name for parameter in self.space.parameters if parameter.recording}
-        own |= {name.partition(SEPARATOR)[0] for name in self.fixed if SEPARATOR in name}
-        return {spec.name: spec.nominal for spec in self.simulator.parameters if spec.name in own}
-
-    @cached_property
-    def _ends_of_sums(self) -> dict[str, tuple[float, float]]:
-        """Hard bounds of the parameters that are a shared value and a group's deviation from it."""
-        summed = {parameter.added_to for parameter in self.space.parameters if parameter.added_to}
-        return {spec.name: (spec.low, spec.high) for spec in self.simulator.parameters if spec.name in summed}
-
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
-        """What the simulator is given for one recording: fixed and inferred physical parameters.
+        """The parameters that the simulator is given for one recording.
 
-        The sum of a shared value and a group's deviation ends at the parameter's hard bounds, as in audits. A body
-        whose poses are measured starts at the first of them.
+        A body whose poses are measured starts at the first of them.
         """
-        parts = ((name.partition(SEPARATOR), value) for name, value in self.fixed.items())
-        fixed = {name: value for (name, _, owner), value in parts if owner in ("", recording)}
-        chosen = {**self._absent, **fixed, **self.space.for_recording(values, recording)}
+        chosen = self.scopes.values_in(recording, values)
         physical = {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
-        physical |= {name: jnp.clip(physical[name], *ends) for name, ends in self._ends_of_sums.items()}
         if self._poses is None:
             return physical
         assert isinstance(self.simulator, Placing)
@@ -120,7 +101,7 @@ class TrajectoryModel:
     def seen(self, observation: Observation, values: Values) -> Seen:
         """An observation as channels want it, with the values that it was simulated under."""
         offset = jnp.stack([offset_of(self.rollout_values(values, name)) for name in self.recordings.names])
-        return Seen(observation, {**self.fixed, **values}, offset)
+        return Seen(observation, {**self.scopes.fixed, **values}, offset)
 
     def row_log_likelihood(
         self,
@@ -158,14 +139,15 @@ class TrajectoryModel:
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
         values: dict[str, Array] = {}
-        for p in self.space.parameters:  # a spread comes before what it is the spread of
-            prior = dist.Normal(0.0, values[p.scaled_by]) if p.scaled_by else p.prior
+        for p in self.scopes.parameters:
+            scale = p.scope.scaled_by
+            prior = dist.Normal(0.0, values[scale]) if scale else p.prior
             values[p.name] = numpyro.sample(p.name, prior)
         seen = self.seen(self.simulate(values), values)
         numpyro.deterministic("status", seen.observation.status)
         for index, name in enumerate(self.recordings.names):
             rows = int(self.recordings.rows[index])
             measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
-            numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
+            numpyro.sample(label("position", name), self.markers.distribution(seen, index), obs=measured)
         for channel in self.channels[1:] if observe else ():
             numpyro.factor(channel.name, channel.row_log_density(seen, channel.measured))

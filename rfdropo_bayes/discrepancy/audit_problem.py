@@ -62,6 +62,11 @@ class AuditProblem:
         """A candidate by its name; None for the mesh and time step, which are none of the library's."""
         return next((candidate for candidate in self.candidates if candidate.name == name), None)
 
+    def group_of(self, name: str) -> str:
+        """The group of recordings that a candidate is in; empty for all."""
+        candidate = self.candidate(name)
+        return "" if candidate is None else candidate.group
+
     def kinds(self, names: Sequence[str]) -> list[Hashable]:
         """What tells recordings apart beside their commands: the parameters that they have, and their group, in which a
         mechanism or a law may act alone. Recordings of one kind may be repeats of each other."""

@@ -9,9 +9,9 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.score import Signature, project_out, signature, span
+from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
@@ -25,8 +25,7 @@ UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does no
 
 def spoken(name: str) -> str:
     """A candidate's name in words: ``payload@april`` is "payload in april"."""
-    title, _, group = name.partition(SEPARATOR)
-    return title.replace("_", " ") + (f" in {group.replace('_', ' ')}" if group else "")
+    return name.replace("_", " ").replace("@", " in ")
 
 
 @dataclass(frozen=True)
@@ -75,23 +74,23 @@ class Candidate:
     """A mechanism that may be named.
 
     Attributes:
-        name: registry name.
+        title: registry name.
         indices: coordinates of its parameters.
         mechanism: itself.
         source: what an experiment file calls it.
-        group: of recordings that it is in; empty for all. Its name then ends in ``@group``.
+        group: of recordings that it is in; empty for all.
     """
 
-    name: str
+    title: str
     indices: tuple[int, ...]
     mechanism: Mechanism
     source: str
     group: str = ""
 
     @property
-    def title(self) -> str:
-        """Its name without the group's."""
-        return self.name.partition(SEPARATOR)[0]
+    def name(self) -> str:
+        """Title and group in one word, by which it is known."""
+        return label(self.title, self.group)
 
 
 def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:

@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.bayes.batches import padded
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.priors import log_density
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 
 MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
 PRIOR_DRAWS = 4000
@@ -43,7 +44,7 @@ class Coordinates:
             is.
     """
 
-    space: ParameterSpace
+    space: Scopes
     base: int
     physical: tuple[str, ...]
     nominal: Mapping[str, float]
@@ -56,12 +57,12 @@ class Coordinates:
         """Names, in the order of the vector."""
         return self.space.names
 
-    def with_further(self, added: ParameterSpace) -> Coordinates:
+    def with_further(self, added: Scopes) -> Coordinates:
         """The same with parameters after all others, which are measured from their null values.
 
         What was computed of the others is kept: to sample and to compile it anew takes as long as a refit's rollouts.
         """
-        found = replace(self, space=ParameterSpace((*self.space.parameters, *added.parameters)))
+        found = replace(self, space=self.space.with_further(added.parameters))
         assert found.affine[len(self.names) :].all()
         fresh = added.sample(jax.random.key(len(self.names)), PRIOR_DRAWS)
         kept = {"_draws": self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}}
@@ -79,7 +80,7 @@ class Coordinates:
         """True where a coordinate is measured from its null value."""
         return np.array(
             [
-                i >= self.base and (p.table or {}).get("distribution") in MEASURED_FROM_NULL
+                i >= self.base and p.table.get("distribution") in MEASURED_FROM_NULL
                 for i, p in enumerate(self.space.parameters)
             ]
         )
@@ -179,7 +180,7 @@ class Coordinates:
         usual = self._with_moved(self._null + self._scale * x, x, 0)  # in a wider prior as far from null as usual there
         slopes = self._with_moved(np.tile(self._scale, (len(x), 1)), x, 1)
         own = zip(self.space.parameters, usual.T, strict=True)
-        density = [log_density(p.spec, p.table or p.spec.prior, value) for p, value in own]
+        density = [log_density(p.spec, p.table, value) for p, value in own]
         return np.stack(density, axis=1) + np.log(np.abs(slopes))
 
     @cached_property
@@ -246,7 +247,7 @@ class Coordinates:
         return self._scattered(zero, self.slopes(x) * directions, slots)
 
     def _scattered(self, theta: np.ndarray, values: np.ndarray, slots: np.ndarray) -> np.ndarray:
-        added = np.array([bool(p.added_to) for p in self.space.parameters])
+        added = np.array([bool(p.scope.added_to) for p in self.space.parameters])
         for recording, places in enumerate(slots):
             own = (places >= 0) & ~added
             theta[:, recording, places[own]] = values[:, own]
@@ -257,4 +258,4 @@ class Coordinates:
 
 def _spread(parameter: InferredParameter, draws: np.ndarray) -> float:
     """Scale of the prior: its own where it names one, so that a half-normal at null is a standard normal's half."""
-    return float((parameter.table or {}).get("scale", 0.0)) or float(np.std(draws)) or 1.0
+    return float(parameter.table.get("scale", 0.0)) or float(np.std(draws)) or 1.0

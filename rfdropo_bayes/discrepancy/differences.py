@@ -15,12 +15,13 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from rfdropo_bayes.bayes.pooling import deviation_spec
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter, deviation
 from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
 from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, families, stem
+from rfdropo_bayes.posteriors import Scope
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 WHERE = "--between"
@@ -74,7 +75,7 @@ class _Space:
 
 
 def with_differences(
-    space: ParameterSpace,
+    space: Scopes,
     base: int,
     simulated: Sequence[ParameterSpec],
     library: Sequence[Candidate],
@@ -82,7 +83,7 @@ def with_differences(
     *,
     spreads: Mapping[str, float],
     held: Sequence[str] = (),
-) -> tuple[ParameterSpace, list[Candidate]]:
+) -> tuple[Scopes, list[Candidate]]:
     """Parameters and candidates, those that may differ between groups among them.
 
     Args:
@@ -96,8 +97,8 @@ def with_differences(
     """
     found = _Space(list(space.parameters))
     candidates = list(library)
-    shared = {p.spec.name: p for p in space.parameters[:base] if not p.recording}
-    free = {p.physical for p in space.parameters[:base] if p.recording}  # differ between recordings or groups already
+    shared = {p.spec.name: p for p in space.parameters[:base] if not p.scope.owner}
+    free = {p.physical for p in space.parameters[:base] if p.scope.owner}  # differ between recordings or groups already
     places: dict[str, dict[str, int]] = {}  # by group, by parameter
     known = {*held, *free}
     specs = [spec for spec in simulated if spec.name not in known and (spec.name in shared or spec.prior)]
@@ -113,7 +114,7 @@ def with_differences(
         candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
     for scope in groups.complements:  # an effect of either sign is added to what all share, and so may be absent in one
         candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
-    return ParameterSpace(tuple(found.parameters)), candidates
+    return replace(space, parameters=tuple(found.parameters)), candidates
 
 
 def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) -> float:
@@ -126,9 +127,8 @@ def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) 
 def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> InferredParameter:
     """What one group's value is off that of the others, Normal(0, ``spread``)."""
     width = spec.high - spec.low
-    own = deviation_spec(spec, spread)._replace(low=-width, high=width)
-    prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
-    return InferredParameter(own, prior, group, dict(own.prior), groups.recordings(group), spec.name)
+    scope = Scope(group, group=True, added_to=spec.name)
+    return deviation(spec, spread, scope, groups.recordings(group), width, where=WHERE)
 
 
 def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
@@ -138,13 +138,13 @@ def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, 
     cause = f"{described}: not the same in {group} as in {elsewhere}"
     remedy = f"measure it in {group} and in {elsewhere}, and undo what changed"
     change = OwnParameter(name, tuple(specs), cause, remedy)
-    return Candidate(f"{name}{SEPARATOR}{group}", tuple(places), change, name, group)
+    return Candidate(name, tuple(places), change, name, group)
 
 
 def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Space) -> Candidate:
     """A mechanism of the library in one group only. Shapes, which mean nothing where it is absent, are shared."""
     parameters = [found.parameters[i] for i in candidate.indices]
-    sized = [(p.table or p.spec.prior).get("distribution") in MEASURED_FROM_NULL for p in parameters]
+    sized = [p.table.get("distribution") in MEASURED_FROM_NULL for p in parameters]
     indices = []
     for index, parameter, has_size in zip(candidate.indices, parameters, sized, strict=True):
         if has_size:
@@ -154,7 +154,7 @@ def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Spac
         else:
             spread = float(np.std(np.asarray(parameter.prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
             indices.append(found.add(_difference(parameter.spec, spread, group, groups)))
-    return replace(candidate, name=f"{candidate.name}{SEPARATOR}{group}", indices=tuple(indices), group=group)
+    return replace(candidate, indices=tuple(indices), group=group)
 
 
 def _one_sided(candidate: Candidate, found: _Space) -> bool:
@@ -165,11 +165,11 @@ def _one_sided(candidate: Candidate, found: _Space) -> bool:
 
 def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
     """The size of a mechanism in one group, measured from its null value and added to what all share."""
-    spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
+    spec, table = parameter.spec, dict(parameter.table)
     for key in ("loc", "low", "high"):
         if key in table:
             table[key] -= spec.nominal
     low, high, grid = spec.low - spec.nominal, spec.high - spec.nominal, tuple(g - spec.nominal for g in spec.grid)
     own = spec._replace(low=low, high=high, nominal=0.0, prior=table, grid=grid)
-    prior = prior_from_table(own, table, where=f"{WHERE} {spec.name}")
-    return InferredParameter(own, prior, group, table, groups.recordings(group), spec.name)
+    scope = Scope(group, group=True, added_to=spec.name)
+    return InferredParameter.of(own, table, scope, groups.recordings(group), where=WHERE)

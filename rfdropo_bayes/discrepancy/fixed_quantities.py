@@ -7,10 +7,10 @@ cables, may be what its model lacks as well.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -30,8 +30,8 @@ class OwnParameter:
 
 
 def with_fixed_quantities(
-    space: ParameterSpace, simulated: Sequence[ParameterSpec], known: Sequence[str]
-) -> tuple[ParameterSpace, list[Candidate]]:
+    space: Scopes, simulated: Sequence[ParameterSpec], known: Sequence[str]
+) -> tuple[Scopes, list[Candidate]]:
     """Parameters and candidates beyond those of the library.
 
     One quantity at several places is asked for, and no other: a single value that is not inferred (a damping) is one
@@ -49,12 +49,11 @@ def with_fixed_quantities(
     for family in families(specs):
         first = len(parameters)
         for spec in family:
-            prior = prior_from_table(spec, dict(spec.prior), where=spec.name)
-            parameters.append(InferredParameter(spec, prior, "", dict(spec.prior)))
+            parameters.append(InferredParameter.of(spec, {}, where="[audit]"))
         cause = f"{family[0].description}: not the nominal one"
         own = OwnParameter(stem(family), tuple(family), cause, _remedy(family))
         candidates.append(Candidate(own.name, tuple(range(first, len(parameters))), own, own.name))
-    return ParameterSpace(tuple(parameters)), candidates
+    return replace(space, parameters=tuple(parameters)), candidates
 
 
 def _remedy(family: Sequence[ParameterSpec]) -> str:

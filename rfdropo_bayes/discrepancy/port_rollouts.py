@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Fields, Forward, Lanes, Points
 from rfdropo_bayes.discrepancy.journal import digest
@@ -318,7 +318,7 @@ def with_laws_of(own: Forward, forward: Forward) -> Forward:
 def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
     """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
     specs = [spec for term in terms for spec in term.specs]
-    added = build_space(specs, {spec.name: {} for spec in specs}, {}, ())
+    added = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ())
     return coordinates.with_further(added)
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from rfdropo_bayes.bayes.calibration_problem import Batch, CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import (
     Channel,
     Markers,
@@ -22,6 +22,7 @@ from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
 from rfdropo_bayes.bayes.channels.orientation import FRAME_TURNS, ORIENTATION_NOISE
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.noise import (
     NOISE_CORRELATION_TIME,
     NOISE_MODELS,
@@ -30,11 +31,10 @@ from rfdropo_bayes.bayes.noise import (
     noise_specs,
 )
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
-from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_repeats
-from rfdropo_bayes.bayes.space import ParameterSpace, build_space
+from rfdropo_bayes.bayes.scopes import Scopes, build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import DataSpec, Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
@@ -46,6 +46,7 @@ from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.compute_backend import backend
 from rfdropo_bayes.model.experiment import matching
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
+from rfdropo_bayes.posteriors import DrawsByOwner, ParameterInfo
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
@@ -310,19 +311,19 @@ def build_model(spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     recordings = gather_recordings(simulator, trajectories)
-    space = model_space(spec, simulator, model_specs(spec, simulator), recordings.names)
-    channels = gather_channels(spec, simulator, trajectories, recordings, space.names)
-    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels)
+    scopes = model_scopes(spec, simulator, model_specs(spec, simulator), recordings.names)
+    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos)
+    return TrajectoryModel(simulator, scopes, recordings, channels)
 
 
-def model_space(
+def model_scopes(
     spec: ModelSpec,
     simulator: AnySimulator,
     specs: Sequence[ParameterSpec],
     fitted: Sequence[str],
     others: Sequence[str] = (),
     later: Sequence[Mechanism] = (),
-) -> ParameterSpace:
+) -> Scopes:
     """What is inferred: parameters of the model, those of ``later`` mechanisms after all others.
 
     The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
@@ -353,11 +354,11 @@ def model_space(
     defaults = [name for name in (*added, *shared, *groups, *measured) if name not in fixed and name not in given]
     priors: dict[str, Any] = {name: given.get(name, {}) for name in (*given, *defaults) if name not in last}
     priors |= {name: given.get(name, {}) for name in last if name not in fixed and name not in priors}
-    scopes = {
+    alone = {
         name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
     }
     pooled = pooling(spec, simulator.parameters, fitted, others)
-    return build_space(specs, priors, scopes, fitted, pooled=pooled, scoped=groups)
+    return build_scopes(specs, priors, alone, fitted, pooled=pooled, only_in=groups, fixed=fixed)
 
 
 def gather_channels(
@@ -365,12 +366,12 @@ def gather_channels(
     simulator: AnySimulator,
     trajectories: Sequence[Trajectory],
     recordings: RecordingSet,
-    inferred: Sequence[str],
+    inferred: Sequence[ParameterInfo],
     fitted: int | None = None,
 ) -> tuple[Channel, ...]:
     """What was measured and is to be used, markers first and weighed parts last.
 
-    ``inferred`` are the names of parameters, of which some may be weighed; ``fitted`` is the number of recordings, the
+    Of the ``inferred`` parameters some may be weighed; ``fitted`` is the number of recordings, the
     first ones, that need what [model] asks for; all by default.
     """
     chosen, length = spec.channels, recordings.time.shape[1]
@@ -409,7 +410,7 @@ def stated_noise(spec: ModelSpec, recordings: RecordingSet, first: Trajectory) -
     return Markers.gather(recordings, STATED).stated(values, step).at(recordings.steps)
 
 
-def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:
+def build_problem(model: TrajectoryModel, earlier: DrawsByOwner | None = None) -> CalibrationProblem:
     """The model as the inference methods see it, in chunks that suit its engine; ``earlier``: see the problem."""
     lanes = model.simulator.lanes
     return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier)

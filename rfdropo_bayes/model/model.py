@@ -31,7 +31,7 @@ from rfdropo_bayes.model.assembly import (
 from rfdropo_bayes.model.experiment import Experiment, ModelTable, load_experiment
 from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe
 from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
-from rfdropo_bayes.prediction.predictive import Batch
+from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.signatures import with_keywords_of
@@ -204,7 +204,7 @@ class Model:
         refuse_lost_threads()
         return build_model(self.spec, self.simulator, runs)
 
-    def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:
+    def problem(self, runs: Sequence[Trajectory], earlier: DrawsByOwner | None = None) -> CalibrationProblem:
         """The posterior given these recordings, as the inference methods see it."""
         return build_problem(self.numpyro(runs), earlier)
 

@@ -21,9 +21,9 @@ from scipy.special import softmax
 from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.space import InferredParameter
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.inference import next_step
-from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE, spread_of_draws
+from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
 
 Batch = dict[str, Float[np.ndarray, " n"]]
@@ -106,8 +106,8 @@ def physical_of_normal(
     parameter: InferredParameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """Values of a parameter at standard normal coordinates of its prior."""
-    if parameter.added_to:
-        return normal * spread_of_draws(parameter, given, len(normal))
+    if parameter.scope.added_to:
+        return normal * parameter.info.spread_of(given, len(normal))
     return np.asarray(parameter.prior.icdf(norm.cdf(normal)))
 
 

@@ -6,7 +6,7 @@ among draws for recordings whose group was fitted: nothing of theirs is free, bu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -18,8 +18,8 @@ from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import next_step
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -65,21 +65,21 @@ def match_first_row(
         InputError: a first row that is masked throughout.
     """
     recordings = problem.model.recordings
-    shifted = [p for p in problem.model.space.parameters if p.recording in names and p.spec.name in OFFSETS]
+    shifted = [p for p in problem.model.scopes.parameters if p.scope.owner in names and p.spec.name in OFFSETS]
     if shifted:
-        values = _with_offsets(problem, values, names, left)
+        values = _with_offsets(problem, values, shifted, left)
     if left is None or not deviations:
         return values, 0
     lost = 0
-    for number, group in enumerate(dict.fromkeys(p.recording for p in deviations)):
-        own = [p for p in deviations if p.recording == group]
+    for number, group in enumerate(dict.fromkeys(p.scope.owner for p in deviations)):
+        own = [p for p in deviations if p.scope.owner == group]
         seen = [r for r in own[0].members if recordings.line.valid[recordings.names.index(r), 0].any()]
         if seen:
-            free = any(p.recording == seen[0] for p in shifted)
+            free = any(p.scope.owner == seen[0] for p in shifted)
             own_key = jax.random.fold_in(key, number)
             values, unmatched = _with_deviations(problem, values, seen[0], own, left, own_key, shifted=free)
             lost += unmatched
-    return (_with_offsets(problem, values, names, left) if shifted else values), lost
+    return (_with_offsets(problem, values, shifted, left) if shifted else values), lost
 
 
 def weighed_by_first_row(
@@ -135,24 +135,26 @@ def far_first_rows(predictions: Sequence[RecordingPrediction], left: ModelError 
     return found
 
 
-def _with_offsets(problem: CalibrationProblem, values: Batch, names: Sequence[str], left: ModelError | None) -> Batch:
+def _with_offsets(
+    problem: CalibrationProblem, values: Batch, offsets: Sequence[InferredParameter], left: ModelError | None
+) -> Batch:
     recordings = problem.model.recordings
     position = _first_rows(problem, values)
     precision = 1.0 / _errors(recordings.markers, left) ** 2
     shifted = dict(values)
     for index, name in enumerate(recordings.names):
         valid = recordings.line.valid[index, 0]
-        if name not in names or not recordings.line.valid[index].any():
+        own = [p for p in offsets if p.scope.owner == name]
+        if not own or not recordings.line.valid[index].any():
             continue  # commands alone: where the frame lies is as uncertain as it was among the fitted recordings
         if not valid.any():
             raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
         error = recordings.position[index, 0, valid] - position[:, index, valid]
-        for axis, offset in enumerate(OFFSETS):
-            key = f"{offset}{SEPARATOR}{name}"
-            if key in shifted:
-                shift = np.average(error[:, :, axis], axis=1, weights=precision[valid])
-                # A draw that fails here is counted when all is rolled out.
-                shifted[key] = shifted[key] + np.nan_to_num(shift)
+        for offset in own:
+            axis = OFFSETS.index(offset.spec.name)
+            shift = np.average(error[:, :, axis], axis=1, weights=precision[valid])
+            # A draw that fails here is counted when all is rolled out.
+            shifted[offset.name] = shifted[offset.name] + np.nan_to_num(shift)
     return shifted
 
 
@@ -171,7 +173,7 @@ def _with_deviations(
     recordings = problem.model.recordings
     index = recordings.names.index(recording)
     valid = recordings.line.valid[index, 0]
-    spread = np.stack([spread_of_draws(p, values, len(values[p.name])) for p in own], axis=1)
+    spread = np.stack([p.info.spread_of(values, len(values[p.name])) for p in own], axis=1)
     drawn = np.stack([values[p.name] for p in own], axis=1) / spread
     sd = _errors(recordings.markers, left)[valid, None] / np.sqrt(3.0)
     noise = np.asarray(jax.random.normal(key, (len(drawn), int(valid.sum()), 3)))
@@ -188,15 +190,6 @@ def _with_deviations(
     found = fit_own(residuals, drawn)
     matched = zip([p.name for p in own], (found.point * spread).T, strict=True)
     return {**values, **dict(matched)}, int((~found.converged).sum())
-
-
-def spread_of_draws(
-    deviation: InferredParameter, values: Mapping[str, np.ndarray], count: int
-) -> Float[np.ndarray, " n"]:
-    """Standard deviation between groups of what a deviation is added to, for each of ``count`` draws."""
-    if deviation.scaled_by:
-        return np.asarray(values[deviation.scaled_by])
-    return np.full(count, float((deviation.table or {})["scale"]))
 
 
 def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray, "n recording marker 3"]:

@@ -23,16 +23,16 @@ from rfdropo_bayes.bayes.channels.object_pose import (
     OFFSETS,
     draw_object_error,
 )
-from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Extension, Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
-from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.day_error import DayError
 from rfdropo_bayes.prediction.day_spread import draw_deviation
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
@@ -40,7 +40,7 @@ from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 # Among the attributes of a posterior.
-FITTED, HELD = "fitted_recordings", "held_parameters"
+FITTED = "fitted_recordings"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
 SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
@@ -86,17 +86,14 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
     return cautions
 
 
-def without_cautions(space: ParameterSpace, groups: Sequence[str], known: Container[str]) -> list[Caution]:
+def without_cautions(scopes: Scopes, groups: Sequence[str], known: Container[str]) -> list[Caution]:
     """Cautions of groups that no fit has seen, where some of the fitted groups alone have a parameter.
 
     Args:
-        space: of the fit.
+        scopes: of the fit.
         groups: that are predicted; known: those of the fitted recordings.
     """
-    owners: dict[str, list[str]] = {}
-    for parameter in space.parameters:
-        if parameter.scoped:
-            owners.setdefault(parameter.spec.name, []).append(parameter.recording)
+    owners = scopes.groups_alone
     names = "; ".join(f"{name} in {' and '.join(own)}" for name, own in owners.items())
     sentence = (
         "{0} is predicted without what some of the fitted groups alone have ({1}); if {0} may have it, name {0} in "
@@ -154,17 +151,18 @@ def predict_new(
     """
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
-    space, extended = _for_new_recordings(model.space, values, names, fitted, own_key, groups or {})
+    extension = model.scopes.extended(names, fitted, groups or {})
+    scopes, extended = extension.scopes, draw_extended(extension, values, names, own_key)
     recordings = gather_recordings(model.simulator, trajectories)
     markers = model.markers.like(recordings)
     if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
         step = sample_time(*(t.time for t in trajectories))
         noise = noise_of_markers(left.every(step), left.markers, recordings)
         markers = replace(markers, known=noise.at(recordings.steps))
-    fresh = replace(model, space=space, recordings=recordings, channels=(markers,))
+    fresh = replace(model, scopes=scopes, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)
-    own = _known_recordings(model.space, fitted)
-    drawn = [p for p in space.parameters if p.added_to and p.name not in values]
+    own = model.scopes.recordings_known(fitted)
+    drawn = [p for p in scopes.deviating if p.name not in values]
     new = [n for n in names if whole(n) not in own]
     extended, unmatched = match_first_row(problem, extended, new, drawn, left, row_key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
@@ -179,8 +177,8 @@ def predict_new(
         for p, k in zip(predictions, keys, strict=True)
     ]
     patterns = groups or {}
-    known = {*gather_groups(fitted, patterns), *(p.recording for p in model.space.parameters if p.added_to or p.scoped)}
-    without = without_cautions(model.space, list(gather_groups(names, patterns)), known)
+    known = {*gather_groups(fitted, patterns), *(p.scope.owner for p in model.scopes.parameters if p.scope.group)}
+    without = without_cautions(model.scopes, list(gather_groups(names, patterns)), known)
     return NewPredictions(predictions, unmatched, far_first_rows(predictions, left), without)
 
 
@@ -216,62 +214,27 @@ def with_repeats_marked(
     return marked
 
 
-def _for_new_recordings(
-    space: ParameterSpace,
-    values: Batch,
-    names: Sequence[str],
-    fitted: Sequence[str],
-    key: PRNGKeyArray,
-    groups: Patterns,
-) -> tuple[ParameterSpace, Batch]:
-    """The space with its per-recording parameters renamed to the new recordings, and values for them."""
-    own = _known_recordings(space, fitted)
-    shared = [p for p in space.parameters if not p.recording]
-    families: dict[str, list[InferredParameter]] = {}
-    for parameter in space.parameters:
-        if parameter.of_recordings_alone:
-            families.setdefault(parameter.spec.name, []).append(parameter)
-    extended = {p.name: values[p.name] for p in shared}
-    count = len(next(iter(values.values())))
-    parameters = list(shared)
-    for index, recording in enumerate(names):
-        # One fitted recording is chosen per draw for all families at once: its values belong together.
-        chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
-        for name, family in families.items():
-            members = [p for p in family if whole(p.recording) == whole(recording)]
-            of_fit = [p for p in family if p.recording in fitted]
-            if not members and len(of_fit) == len(fitted) and whole(recording) not in own:
-                members = of_fit
-            if not members:
-                continue
-            pool = np.stack([values[member.name] for member in members])
-            extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
-            parameters.append(replace(members[0], recording=recording))
-    gathered = gather_groups(names, groups)
-    for parameter in space.parameters:
-        if parameter.scoped and parameter.recording in gathered:
-            extended[parameter.name] = values[parameter.name]
-            parameters.append(replace(parameter, members=gathered[parameter.recording]))
-    deviating = [p for p in space.parameters if p.added_to]
-    for parameter in _deviations(deviating, gathered):
-        drawn = values.get(parameter.name)
-        if drawn is None:
-            own_key = jax.random.fold_in(key, len(names) + len(parameters))
-            drawn = draw_deviation(parameter, values, own_key, count)
-        extended[parameter.name] = drawn
-        parameters.append(parameter)
-    return ParameterSpace(tuple(parameters)), extended
+def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key: PRNGKeyArray) -> Batch:
+    """Values of the parameters of new recordings, from draws of the fitted ones.
 
-
-def _known_recordings(space: ParameterSpace, fitted: Sequence[str]) -> set[str]:
-    """Recordings that were fitted, or that an adapted posterior has values of from the fit before."""
-    return {whole(name) for name in (*fitted, *(p.recording for p in space.parameters if p.of_recordings_alone))}
-
-
-def _deviations(fitted: Sequence[InferredParameter], groups: Mapping[str, tuple[str, ...]]) -> list[InferredParameter]:
-    """The deviations of the groups that new recordings belong to, whether any of a group was fitted or not."""
-    kinds = {p.spec.name: p for p in fitted}
-    return [replace(p, recording=group, members=members) for group, members in groups.items() for p in kinds.values()]
+    One fitted recording is chosen per draw for all parameters of a new one: its values belong together.
+    """
+    count, found = len(next(iter(values.values()))), {}
+    chosen = {
+        name: np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
+        for index, name in enumerate(names)
+    }
+    for number, parameter in enumerate(extension.scopes.parameters):
+        like = extension.like[parameter.name]
+        if not like:
+            own_key = jax.random.fold_in(key, len(names) + number)
+            found[parameter.name] = draw_deviation(parameter.info, values, own_key, count)
+        elif len(like) == 1:
+            found[parameter.name] = values[like[0]]
+        else:
+            pool = np.stack([values[name] for name in like])
+            found[parameter.name] = pool[chosen[parameter.scope.owner] % len(like), np.arange(count)]
+    return found
 
 
 def _predictions(
@@ -346,18 +309,17 @@ def with_measured_starts(
     if not isinstance(simulator, RobotSimulator) or not simulator.pushes:
         return model, values
     specs = {spec.name: spec for spec in simulator.parameters}
-    kept = [p for p in model.space.parameters if p.spec.name not in PLACE]
-    placed = {p.name: values[p.name] for p in kept}
-    parameters = list(kept)
-    for trajectory in trajectories:
-        known = model.space.for_recording(values, trajectory.name)
-        known |= _place(simulator, model, trajectory, values)
-        for name in PLACE:
-            if name in known:
-                prior = prior_from_table(specs[name], dict(specs[name].prior), where=name)
-                parameters.append(InferredParameter(specs[name], prior, trajectory.name))
-                placed[f"{name}{SEPARATOR}{trajectory.name}"] = np.asarray(known[name])
-    return replace(model, space=ParameterSpace(tuple(parameters))), placed
+    inferred = {p.spec.name for p in model.scopes.parameters}
+    parameters = [p for p in model.scopes.parameters if p.spec.name not in PLACE]
+    placed = {p.name: values[p.name] for p in parameters}
+    for run in trajectories:
+        measured = _place(simulator, model, run, values)
+        known = {**model.scopes.values_in(run.name, values), **measured}
+        for name in (name for name in PLACE if name in measured or (name in inferred and name in known)):
+            own = InferredParameter.of(specs[name], {}, Scope(run.name), (run.name,), where="prediction")
+            parameters.append(own)
+            placed[own.name] = np.asarray(known[name])
+    return replace(model, scopes=replace(model.scopes, parameters=tuple(parameters))), placed
 
 
 def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajectory, values: Batch) -> Batch:
@@ -366,7 +328,7 @@ def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajec
     if pose is None or not np.isfinite(pose[0]).all():
         return {}
     count = len(next(iter(values.values())))
-    known = {**model.fixed, **model.space.for_recording(values, trajectory.name)}
+    known = model.scopes.values_in(trajectory.name, values)
     placed = simulator.with_object_at(known, pose[0])
     return {name: np.broadcast_to(np.asarray(placed[name]), (count,)) for name in PLACE}
 
@@ -387,7 +349,7 @@ def measured_objects(
     shifted = np.array(pose)
     count = len(shifted)
     for index, name in enumerate(model.recordings.names):
-        known = {**model.fixed, **model.space.for_recording(values, name)}
+        known = model.scopes.values_in(name, values)
         shifted[:, index, :, :3] += offsets(known, count)[:, None]
         sizes = {s.name: np.broadcast_to(known[s.name], (count,)) for s in SIZES if s.name in known}
         if sizes:

@@ -35,6 +35,7 @@ class ParameterRow:
 
     Attributes:
         name, unit, description: facts of the parameter.
+        parameter, owner: name without the owner, and the recording or group that has it; see `Scope`.
         mean, sd, q05, median, q95: statistics of the draws.
         at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
         bound: "low", "high" or None.
@@ -63,6 +64,8 @@ class ParameterRow:
     mcse_mean: float
     r_hat: float
     derived: bool
+    parameter: str
+    owner: str
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the name, for summary.json."""
@@ -99,6 +102,8 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
                 diagnostics[info.name]["mcse_mean"],
                 diagnostics[info.name]["r_hat"],
                 info.name not in free,
+                info.parameter,
+                info.scope.owner,
             )
         )
     return rows
@@ -133,6 +138,8 @@ class ParameterSummary(_Open):
     q95: float
     unit: str
     at_bound: bool
+    parameter: str
+    owner: str
 
 
 class Evidence(_Open):

@@ -41,10 +41,9 @@ from rfdropo_bayes.model.assembly import (
     AnySimulator,
     build_simulator,
     expand_groups,
-    fixed_values,
     gather_channels,
     measurement_specs,
-    model_space,
+    model_scopes,
     stated_noise,
 )
 from rfdropo_bayes.model.experiment import AuditTable, NoiseTable
@@ -242,7 +241,7 @@ def build_problem(
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
         candidates = [c for c in candidates if c.name not in table.exclude]
     nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
-    coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
+    coordinates = Coordinates(model.scopes, base, tuple(nominal), nominal, model.scopes.fixed, limits)
     workshop = {} if workshop is None else workshop
     lanes = partial(_lanes, names=names, model=model, coordinates=coordinates, workshop=workshop)
 
@@ -290,7 +289,7 @@ def _named(
     table: AuditTable, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
 ) -> list[Candidate]:
     """Mechanisms as candidates, less those that [audit] excludes."""
-    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
+    index = {p.spec.name: i for i, p in enumerate(model.scopes.parameters)}
     return [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
         for name, m in zip(names, added, strict=True)
@@ -307,12 +306,12 @@ def _with_own(
     spreads: Mapping[str, float],
 ) -> tuple[TrajectoryModel, list[Candidate]]:
     """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
-    space, own = with_fixed_quantities(model.space, plain, tuple(model.fixed))
+    space, own = with_fixed_quantities(model.scopes, plain, tuple(model.scopes.fixed))
     if groups is not None:
         space, candidates = with_differences(
-            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
+            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.scopes.fixed)
         )
-    return replace(model, space=space), [*candidates, *own]
+    return replace(model, scopes=space), [*candidates, *own]
 
 
 def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
@@ -429,12 +428,12 @@ def _model(
     recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
     specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
-    space = model_space(spec, simulator, specs, *groups, later=added)
-    space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
+    scopes = model_scopes(spec, simulator, specs, *groups, later=added)
+    scopes = scopes.holding(scopes.typical_scales)  # evidences are compared at one spread between groups
     of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
-    base = sum(p.spec.name not in of_candidates for p in space.parameters)
-    channels = gather_channels(spec, simulator, trajectories, recordings, space.names, fitted)
-    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels), base
+    base = sum(p.spec.name not in of_candidates for p in scopes.parameters)
+    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
+    return TrajectoryModel(simulator, scopes, recordings, channels), base
 
 
 def _fields(model: TrajectoryModel) -> list[str]:
@@ -445,16 +444,16 @@ def _fields(model: TrajectoryModel) -> list[str]:
 
 def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
     """The noise that the experiment states, for recordings without repeats: that of the positions under [noise],
-    that of other channels under [model.fixed]; None where that of any channel is not stated."""
+    that of other channels under [model.scopes.fixed]; None where that of any channel is not stated."""
     if spec.stated is None or spec.stated.standard_deviation == 0.0:
         return None
     parts = [stated_noise(spec, model.recordings, first)]
     for channel in model.channels[1:]:
         if isinstance(channel, Series):
-            known = [model.fixed.get(each.name) for each in channel.noise_specs]
+            known = [model.scopes.fixed.get(each.name) for each in channel.noise_specs]
             if any(value is None for value in known):
                 return None
-            parts.append(channel.stated(model.fixed, float(first.dataset.attrs["sample_time"])))
+            parts.append(channel.stated(model.scopes.fixed, float(first.dataset.attrs["sample_time"])))
     return Stacked(tuple(parts))
 
 
@@ -519,9 +518,9 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
         parameter = coordinates.space.parameters[index]
         if parameter.spec.name != parameter.physical:  # how far one group's value is off, of which no file has a prior
             continue
-        table = dict(parameter.table or parameter.spec.prior)
+        table = dict(parameter.table)
         for key in ("loc", "low", "high"):  # a size in one group is measured from null
-            if key in table and parameter.added_to:
+            if key in table and parameter.scope.added_to:
                 table[key] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")

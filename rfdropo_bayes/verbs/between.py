@@ -120,13 +120,14 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
     coordinates, groups = answer.problem.coordinates, answer.problem.groups
     assert groups is not None
     factor = widening(answer.extended, coordinates)
-    scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
+    named = [answer.problem.candidate(step.name) for step in answer.adopted]
+    scopes = {each.name for each in named if each is not None and each.title == candidate.title}
     alone = len(scopes) == 1 and not isinstance(candidate.mechanism, OwnParameter)
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
-        if not parameter.added_to:
+        name = parameter.scope.added_to
+        if not name:
             continue
-        name = parameter.added_to
         if groups.compared:
             model["groups"] = _naming(groups.members, model.get("groups", {}))
         if alone:
@@ -134,8 +135,7 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
             model["groups"] = _naming(own, model.get("groups", {}))
             model.setdefault("only_in", {})[name] = list(own)
             continue
-        table = parameter.table or {}
-        spread = float(table["scale"]) * float(factor[index]) / np.sqrt(2.0)
+        spread = float(parameter.table["scale"]) * float(factor[index]) / np.sqrt(2.0)
         model.setdefault("per_group", {})[name] = float(f"{spread:.3g}")
         if name not in coordinates.names:
             model.setdefault("priors", {}).setdefault(name, {})

@@ -369,8 +369,8 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
     model = _try(found, lambda: build_model(spec, simulator, fitted))
     if model is not None:
-        for index, parameter in enumerate(model.space.parameters):
-            table = parameter.table or {}
+        for index, parameter in enumerate(model.scopes.parameters):
+            table = parameter.table
             words = ", ".join(f"{k} {v:g}" for k, v in table.items() if k != "distribution")
             text = f"{parameter.name} [{parameter.spec.unit}] ~ {table.get('distribution')}({words})"
             found.lines.append(("inferred" if index == 0 else "", text))
@@ -390,9 +390,9 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
 
 def _ranges(model: TrajectoryModel) -> dict[str, tuple[float, float]]:
     """Where the prior has nine tenths of every parameter, and values that are fixed."""
-    drawn = model.space.sample(jax.random.key(0), PRIOR_DRAWS)
-    known = {name: (value, value) for name, value in model.fixed.items()}
-    return known | {p.spec.name: central_interval(np.asarray(drawn[p.name])) for p in model.space.parameters}
+    drawn = model.scopes.sample(jax.random.key(0), PRIOR_DRAWS)
+    known = {name: (value, value) for name, value in model.scopes.fixed.items()}
+    return known | {p.spec.name: central_interval(np.asarray(drawn[p.name])) for p in model.scopes.parameters}
 
 
 def _see_candidates(spec: ModelSpec, table: AuditTable) -> None:

@@ -25,14 +25,14 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.prediction.day import physical_of_normal
 from rfdropo_bayes.prediction.own_fit import STEP
-from rfdropo_bayes.prediction.predictive import FITTED, Batch
+from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.designed import COMMANDS, Design
 from rfdropo_bayes.tables import nearest
-from rfdropo_bayes.verbs.adapt import day_space, model_error_of
+from rfdropo_bayes.verbs.adapt import day_scopes, model_error_of
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.design import command_table, proposals, units_said
-from rfdropo_bayes.verbs.predict import fitted_parts, model_of
+from rfdropo_bayes.verbs.predict import model_of
 
 LONGEST = 10.0  # [s] of a proposal, unless more is asked for
 DAY = "another day"
@@ -165,15 +165,14 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     """Recordings of one day, the names of its parameters, and values a step up and a step down along each of these from
     the middle of its prior, at the body's mean."""
     model, left = model_of(fit), model_error_of(fit.record)
-    fixed, space = fitted_parts(fit)
     recordings = gather_recordings(model.simulator, runs)
     noise = noise_of_markers(left.every(sample_time(runs[0].time)), left.markers, recordings)
     noise = noise.at(recordings.steps)
-    space = day_space(space, model, recordings.names, DAY, fit.record.attrs[FITTED])
+    scopes = day_scopes(fit, model, recordings.names, DAY)
     drawn = fit.record.posterior
-    body = {name: value for name, value in space.typical_scales.items() if name not in drawn}
-    body |= {p.name: float(np.mean(drawn[p.name])) for p in space.parameters if p.name in drawn}
-    own = [p for p in space.parameters if p.name not in body]
+    body = {name: value for name, value in scopes.typical_scales.items() if name not in drawn}
+    body |= {p.name: float(np.mean(drawn[p.name])) for p in scopes.parameters if p.name in drawn}
+    own = [p for p in scopes.parameters if p.name not in body]
     if not own:
         raise InputError(
             "nothing of the model differs between days",
@@ -183,7 +182,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
     values = {name: np.full(len(points), value) for name, value in body.items()}
     values |= {p.name: physical_of_normal(p, x, values) for p, x in zip(own, points.T, strict=True)}
-    program = TrajectoryModel(model.simulator, space, fixed, recordings, (Markers.gather(recordings, STATED, noise),))
+    program = TrajectoryModel(model.simulator, scopes, recordings, (Markers.gather(recordings, STATED, noise),))
     return CalibrationProblem(program, chunk=max(1, model.simulator.lanes // len(runs))), [p.name for p in own], values
 
 

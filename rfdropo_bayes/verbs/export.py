@@ -16,7 +16,6 @@ from rfdropo_bayes.model.assembly import physical_values
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.simulators.black_box import BlackBox
@@ -124,7 +123,7 @@ def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = Fal
     known = {spec.name: spec for spec in model.robot.specs} if isinstance(model.robot, BlackBox) else {}
     draws = {info.name: record.flat(info.name) for info in record.free if info.name in known}
     values = {name: float(own.mean()) for name, own in draws.items()}
-    held = physical_values(model.spec, model.simulator) | record.attrs.get(HELD, {})
+    held = physical_values(model.spec, model.simulator) | {info.name: value for info, value in record.held}
     values |= {name: value for name, value in held.items() if name in known}
     lines = ["Calibrated by rfdropo_bayes: posterior means; in brackets the 90 % range to randomise over."]
     for name, value in values.items():

@@ -16,10 +16,10 @@ from rfdropo_bayes.inference.methods import run
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.posteriors import DrawsByOwner, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_error, prior_day_error
 from rfdropo_bayes.prediction.model_error import ModelError
-from rfdropo_bayes.prediction.predictive import Batch, predict_new, thin
+from rfdropo_bayes.prediction.predictive import predict_new, thin
 
 CLIMB = LaplaceConfig(starts=1, screen=8, blocks=1, max_steps=10, draws=200)  # from the optimum of all days
 DRAWS = 100
@@ -38,7 +38,7 @@ class Days(NamedTuple):
 
     model: Model
     runs: Sequence[Trajectory]
-    start: Batch
+    start: DrawsByOwner
     predictions: Sequence[RecordingPrediction]
     left: ModelError
 

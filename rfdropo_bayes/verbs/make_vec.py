@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
@@ -37,9 +36,8 @@ from rfdropo_bayes.policies.randomisation import (
 from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
-from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord
+from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.prediction.day_spread import day_deviations
-from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot
@@ -171,7 +169,7 @@ def randomisation_of(
         check_fitted_integrator(fitted, simulator.integrator, where="fit")
         rows = drawn_rows(fit.record, simulator.parameters, robot=simulator.robot)
         _check_parameters(fit.record, simulator, where="fit")
-        parts.append(_beside_held(_on_its_day(rows, fit.record, simulator), fit.record.attrs, simulator))
+        parts.append(_beside_held(_on_its_day(rows, fit.record, simulator), fit.record, simulator))
     elif fit is not None:
         parts.append(_of_run(Path(fit), simulator))
     elif table.randomisation != "none":
@@ -234,7 +232,7 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     attributes = {} if record is None else record.attrs
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
-    return _beside_held(found, attributes, simulator)
+    return _beside_held(found, record, simulator)
 
 
 def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where: str) -> None:
@@ -245,7 +243,7 @@ def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where
         InputError: a parameter that the simulator lacks.
     """
     known = {spec.name for spec in simulator.parameters} | measured_parameters() | set(OBJECT)
-    of_all = [info.name for info in record.free if SEPARATOR not in info.name and not info.name.endswith(SPREAD)]
+    of_all = [info.name for info in record.free if not info.scope.owner and not info.scope.spread]
     lacking = [name for name in of_all if name not in known]
     if lacking:
         raise InputError(
@@ -272,8 +270,8 @@ def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -
     return Days(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
 
 
-def _beside_held(found: Randomisation, attributes: Mapping[str, Any], simulator: AnySimulator) -> Randomisation:
+def _beside_held(found: Randomisation, record: PosteriorRecord | None, simulator: AnySimulator) -> Randomisation:
     """What a run found, beside the values of the simulator's parameters that it held: what it found holds with them."""
     known = {spec.name for spec in simulator.parameters}
-    held = {name: value for name, value in attributes.get(HELD, {}).items() if name in known}
+    held = {} if record is None else {info.name: value for info, value in record.held if info.name in known}
     return Layers((Point(held), found), found.kind) if held else found

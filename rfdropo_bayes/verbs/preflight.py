@@ -156,6 +156,7 @@ class _Coordinates(NamedTuple):
     logarithmic: np.ndarray
     mean: Float[np.ndarray, " parameter"]
     sd: Float[np.ndarray, " parameter"]
+    masses: np.ndarray
 
     def values(self, x: Float[np.ndarray, "n parameter"]) -> dict[str, np.ndarray]:
         scaled = self.mean + self.sd * x
@@ -243,11 +244,14 @@ def _coordinates(problem: CalibrationProblem, drawn: Mapping[str, np.ndarray]) -
     names = tuple(name for name in problem.physical_names if np.ptp(drawn[name]) > 0.0)
     logarithmic = np.array([_has_scale(problem, name, drawn[name]) for name in names], dtype=bool)
     columns = [np.log(drawn[n]) if log else drawn[n] for n, log in zip(names, logarithmic, strict=True)]
-    return _Coordinates(names, logarithmic, np.array([c.mean() for c in columns]), np.array([c.std() for c in columns]))
+    own = [problem.model.scopes[name] for name in names]
+    masses = np.array([p.spec.unit == "kg" and not (p.scope.spread or p.scope.added_to) for p in own], dtype=bool)
+    mean, sd = (np.array([getattr(column, of)() for column in columns]) for of in ("mean", "std"))
+    return _Coordinates(names, logarithmic, mean, sd, masses)
 
 
 def _has_scale(problem: CalibrationProblem, name: str, draws: np.ndarray) -> bool:
-    family = (problem.model.space[name].table or {}).get("distribution")
+    family = problem.model.scopes[name].table.get("distribution")
     return bool(
         np.all(draws > 0.0) and (family in ("LogNormal", "LogUniform") or draws.std() < WELL_AWAY * draws.mean())
     )
@@ -266,7 +270,7 @@ def _noise(
         return _Noise(sd, 0.0, 1.0, f"noise of {1e3 * sd:.3g} mm, the spread of the repeats")
 
     def typical(name: str, otherwise: float) -> float:
-        return float(np.median(drawn[name])) if name in drawn else problem.model.fixed.get(name, otherwise)
+        return float(np.median(drawn[name])) if name in drawn else problem.model.scopes.fixed.get(name, otherwise)
 
     white = typical(OBSERVATION_NOISE.name, 1e-3)
     lasting = typical(LASTING_NOISE.name, 0.0) if model.spec.noise == "auto" else 0.0
@@ -422,12 +426,11 @@ def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> di
     found: dict[str, np.ndarray] = {}
     if tension.shape[-1] and not model.spec.channels.tension:
         found[f"tensions of the cables (to {100 * TENSION_ERROR:g} %)"] = _information(tension)
-    units = {spec.name: spec.unit for spec in model.simulator.parameters}
     for k, name in enumerate(coordinates.names):
         weight = np.zeros((1, *(len(coordinates.names),) * 2))
         size = 1.0 if coordinates.logarithmic[k] else max(abs(coordinates.mean[k]), coordinates.sd[k])
         weight[0, k, k] = (coordinates.sd[k] / (KNOWN * size)) ** 2
-        word = "weighed" if units.get(name.partition("@")[0]) == "kg" else BY_ITSELF
+        word = "weighed" if coordinates.masses[k] else BY_ITSELF
         found[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
     return found
 
