@@ -80,8 +80,9 @@ def test_under_sdirk2_it_does_the_same():
 
 
 def test_tensions_of_a_squeezed_trunk_come_to_rest_under_sdirk2():
-    """Opposed cables bring guides as near as a seventh of a neck to each other. Held for two seconds, tensions of over 100 N change
-    from step to step by less than 0.1 N; steps that know nothing of what taut cables hold lose the trunk."""
+    """Opposed cables bring guides as near as a seventh of a neck to each other. Held for two seconds, tensions of over
+    100 N change from step to step by less than 0.1 N; steps that know nothing of what taut cables hold lose the trunk.
+    """
     robot, discretisation = Robot.load("trunk_sofa"), Discretisation(0.01)
     assembly = assemble(robot, discretisation)
     engine = Engine(assembly, 0.01, Backend(threads=1), integrator="sdirk2")
