@@ -26,10 +26,10 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.audit_record import STIFFNESS, relative_sizes
+from rfdropo_bayes.discrepancy.base_fit import first_target
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.fit import Fit, climb, widened
 from rfdropo_bayes.discrepancy.journal import Journal
-from rfdropo_bayes.discrepancy.pipeline import first_target
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable

@@ -29,8 +29,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.law_search import law_search
-from rfdropo_bayes.discrepancy.pipeline import base_model
 from rfdropo_bayes.discrepancy.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.model.experiment import AuditTable

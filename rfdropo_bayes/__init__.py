@@ -1,4 +1,4 @@
-"""Probabilistic sim-to-real for soft robots: calibrate a simulator, say what it lacks, and measure the gain.
+"""Probabilistic sim-to-real for soft robots: calibrate a simulator, name the effects it lacks, and measure the gain.
 
     import rfdropo_bayes as rb
 
@@ -106,7 +106,7 @@ _HOMES = {
     "simulate": "verbs.simulate",
     "train": "verbs.train",
 }
-"""Where each name is defined: ``module`` under the same name, or ``module:name``."""
+"""Definition of each name: ``module`` under the same name, or ``module:name``."""
 
 _COMPUTING = ("inference.", "model.", "simulators.", "verbs.")
 """Rooms that make arrays of JAX when they are imported."""
@@ -163,7 +163,7 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # with this function every name would be Any to a type checker
 
     def __getattr__(name: str) -> Any:
-        """Load what a name stands for, once it is asked for."""
+        """Load the object of a name at its first use."""
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module, _, attribute = _HOMES[name].partition(":")

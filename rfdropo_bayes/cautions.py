@@ -1,4 +1,4 @@
-"""What speaks against a result: a code that programs decide on, and a sentence for people."""
+"""Reasons to doubt a result: a code for programs, and a sentence for people."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from typing import Any
 
 
 class Code(StrEnum):
-    """What a caution is about. Programs read codes; sentences may be reworded at any time."""
+    """Topic of a caution. Programs read codes; sentences may be reworded at any time."""
 
     AT_BOUND = "at_bound"
     """A parameter's posterior is cut off by a bound, or by an end of its prior."""
     IMPLAUSIBLE = "implausible"
-    """The mass or stiffness that was fitted or fixed is that of no soft robot."""
+    """The mass or stiffness that was fitted or fixed is implausible for a soft robot."""
     AGAINST_PRIOR = "against_prior"
-    """The data put parameters where their prior hardly is."""
+    """The data put parameters in a region of little prior mass."""
     BUDGET_SPENT = "budget_spent"
     """The rollouts ran out before all data were in."""
     PARTICLES_STUCK = "particles_stuck"
-    """The last moves left the particles near where they were."""
+    """The last moves hardly moved the particles."""
     EVIDENCE_SCATTERED = "evidence_scattered"
     """Replicates differ in their log evidence."""
     REPLICATES_DISAGREE = "replicates_disagree"
-    """Replicates differ in where parameters lie."""
+    """Replicates differ in the location of parameters."""
     MODES_UNSEEN = "modes_unseen"
-    """One replicate, or one climb, cannot show that a mode of the posterior was lost."""
+    """A single replicate or optimisation cannot show that a mode of the posterior was lost."""
     PASSES_DISAGREE = "passes_disagree"
     """Two passes over the data differ in their log evidence."""
     ROLLOUTS_EXCLUDED = "rollouts_excluded"
     """Many rollouts got no weight."""
     CLIMB_UNFINISHED = "climb_unfinished"
-    """The best climb stopped before its optimum."""
+    """The best optimisation stopped before its optimum."""
     SEVERAL_OPTIMA = "several_optima"
     """One normal distribution does not describe the posterior."""
     NORMAL_DIFFERS = "normal_differs"
@@ -52,7 +52,9 @@ class Code(StrEnum):
     FIRST_ROW_UNMATCHED = "first_row_unmatched"
     """Draws of a new group's parameters did not converge in matching a first row."""
     DAY_UNMATCHED = "day_unmatched"
-    """A day is fitted worse than the fitted ones, few of the body's draws explain it, or fits did not converge."""
+    """A session is fitted worse than the fitted sessions, few of the body's draws explain it, or fits did not
+    converge.
+    """
     GROUP_WITHOUT = "group_without"
     """Parameters that some groups alone have: a group that no fit has seen is taken to be without them."""
     UNSAFE_POSTERIOR = "unsafe_posterior"
@@ -70,15 +72,15 @@ class Code(StrEnum):
     RESIDUALS_LAST = "residuals_last"
     """Residuals last from row to row, and rows count accordingly less."""
     RESIDUALS_HEAVY = "residuals_heavy"
-    """More residuals are far off than the noise model allows."""
+    """There are more outliers than the noise model allows."""
 
 
 @dataclass(frozen=True)
 class Caution:
-    """One thing that speaks against a result.
+    """One reason to doubt a result.
 
     Attributes:
-        code: what it is about.
+        code: its topic.
         sentence: the same for people, with numbers and a remedy.
         grave: the method did not arrive at its answer; the draws must not be used as they are.
     """
@@ -93,7 +95,7 @@ class Caution:
 
 
 def grave(cautions: Iterable[Caution]) -> list[Caution]:
-    """Those that forbid to use the draws as they are."""
+    """The cautions that forbid use of the draws."""
     return [caution for caution in cautions if caution.grave]
 
 

@@ -1,4 +1,4 @@
-"""The error a user's input can raise: it says what is wrong, where, and what to do."""
+"""The error for unusable input: fault, location and remedy."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ class InputError(ValueError):
     """Input that cannot be used.
 
     Args:
-        what: what is wrong, in one clause.
-        where: the file, row, column, table or key it was found in.
-        remedy: what the user can do about it.
+        what: the fault, in one clause.
+        where: file, row, column, table or key of the fault.
+        remedy: advice to the user.
 
-    ``str(error)`` is a single line, so that the command line can print it as it is.
+    ``str(error)`` is a single line.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
@@ -23,15 +23,15 @@ class InputError(ValueError):
 
 
 class NoLikelihoodError(InputError):
-    """No parameter set that was tried has a positive likelihood: the prior excludes the data, or more must be tried."""
+    """No tried parameter set has a positive likelihood: the prior excludes the data, or more draws are needed."""
 
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C in the middle of a run.
 
     Args:
-        folder: where the run writes.
-        going_on: what to add to its command to go on with it, may be nothing; None where it has to start again.
+        folder: folder of the run.
+        going_on: options that continue the run, possibly empty; None if it has to start again.
     """
 
     def __init__(self, folder: str, going_on: str | None) -> None:

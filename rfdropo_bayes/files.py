@@ -1,4 +1,4 @@
-"""Files: found where recordings lie, and written whole or not at all."""
+"""Files: found beside recordings, and written completely or not at all."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Any, *, finite: bool = False) -> None:
-    """Write plain values as a JSON file, whole or not at all; where ``finite``, NaN in them is an error.
+    """Write plain values as a JSON file, completely or not at all; with ``finite``, NaN is an error.
 
     Raises:
         InputError: it cannot be written.
@@ -120,7 +120,7 @@ def append_line(path: Path, line: str) -> None:
 
 
 def _end_last_line(file: BinaryIO) -> None:
-    """Take away the last line of a file of JSON lines where it was cut; end it where its newline alone is missing."""
+    """Take away the last line of a file of JSON lines if it was cut; add a missing newline."""
     size = file.seek(0, os.SEEK_END)
     if size == 0:  # or a device, which ends nowhere
         return
@@ -139,7 +139,7 @@ def _end_last_line(file: BinaryIO) -> None:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The JSON object of each line of a file, up to the first one that a kill has cut; nothing without a file."""
+    """The JSON object of each line of a file, up to the first incomplete line; empty without a file."""
     found = []
     for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
@@ -164,7 +164,7 @@ def output_folder(path: Path) -> Path:
 
 
 def unwritten(error: OSError, path: Path) -> InputError:
-    """The error of the operating system as one that says what to do."""
+    """The error of the operating system with a remedy."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return InputError(
         f"cannot be written ({error.strerror or error})",

@@ -20,12 +20,12 @@ def whole(recording: str) -> str:
 
 
 def group_of(recording: str, patterns: Patterns) -> str:
-    """Name of the group a recording belongs to; one that belongs to none is a group of its own.
+    """Name of the group a recording belongs to; a recording without a group forms its own.
 
-    A group that names the recording comes before those that it is in by a wildcard.
+    A group that names the recording takes precedence over wildcards.
 
     Args:
-        recording: its name, or that of a piece of it.
+        recording: name of the recording or of a piece of it.
         patterns: names of recordings, or wildcards, by group.
 
     Raises:

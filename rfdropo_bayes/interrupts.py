@@ -1,7 +1,7 @@
-"""Ctrl-C: a run stops where it can go on, without a traceback.
+"""Ctrl-C: a run stops at a point from which it can continue, without a traceback.
 
-An exception raised at any place is not enough: modules that are being imported swallow it or crash, and JAX makes
-another of one that is raised while compiled code calls back.
+An exception raised at any place is not enough: modules that are being imported swallow it or crash, and JAX replaces an
+exception that is raised in a callback of compiled code.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def watch_interrupts() -> None:
 
 @contextmanager
 def running(*, checks: bool) -> Iterator[None]:
-    """A part in which Ctrl-C raises KeyboardInterrupt; with ``checks``, the first one does so in `check_interrupt`."""
+    """A part in which Ctrl-C raises KeyboardInterrupt; with ``checks``, the first press raises in `check_interrupt`."""
     global _answer
     before, _answer = _answer, "note" if checks else "raise"
     try:
@@ -52,7 +52,8 @@ def check_interrupt() -> None:
 
 def stop_if_asked_twice() -> None:
     """Raise KeyboardInterrupt if Ctrl-C was pressed more than once: for long steps, since compiled code that calls back
-    may have lost what the second one raised."""
+    may have lost the exception of the second press.
+    """
     if _pressed > 1:
         raise KeyboardInterrupt
 

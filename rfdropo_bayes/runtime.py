@@ -1,5 +1,6 @@
-"""Process-wide settings: double precision, operations in turn, one BLAS thread for the small solves, and what JAX
-compiled kept for the next process."""
+"""Process-wide settings: double precision, operations in turn, one BLAS thread for the small solves, and a persistent
+cache for JAX compilations.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from rfdropo_bayes.errors import InputError
 
-# The rollout of a value and those of a central difference call out of a program at once; one thread is left to copy.
+# The rollouts of a value and of a central difference are simultaneous callbacks; one thread is left to copy.
 CALLBACK_THREADS = 4
 
 
@@ -85,10 +86,10 @@ def configure_jax() -> None:
 
 
 def keep_compilations() -> None:
-    """Let JAX keep what it compiles in the user's cache folder, unless the user chose otherwise.
+    """Let JAX keep compiled programs in the user's cache folder, unless the user chose otherwise.
 
-    A calibration of the demo spends a quarter of its processor time on compiling what the last one compiled. Programs
-    that call the compiled engines are not kept: JAX leaves callbacks out. The variables are read when JAX is loaded.
+    A calibration of the demo spends a quarter of its processor time on repeated compilation. Programs that call the
+    compiled engines are not kept: JAX leaves callbacks out. The variables are read when JAX is loaded.
     """
     from llvmlite import binding
 

@@ -27,7 +27,7 @@ def read_toml(text: str) -> dict[str, Any]:
     """Tables of a TOML text.
 
     Raises:
-        tomllib.TOMLDecodeError: it is not TOML; the message says what to do about a path of Windows.
+        tomllib.TOMLDecodeError: it is not TOML; the message has a remedy for Windows paths.
     """
     try:
         return tomllib.loads(text)
@@ -55,8 +55,7 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
     """Validate a table.
 
     Raises:
-        InputError: the first thing that is wrong: its key, what was expected, and the nearest valid key if the key is
-            unknown.
+        InputError: for the first fault: its key, the expected value, and the nearest valid key if the key is unknown.
     """
     try:
         return schema.model_validate(plain(dict(table)))
@@ -75,7 +74,7 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
         message = first["msg"].removeprefix("Value error, ")
         # A whole table or list would fill the screen; its name says enough.
         given = f" = {first['input']!r}" if isinstance(first["input"], str | int | float | bool) else ""
-        # What a whole file says wrong has no key, and its message says what to mend.
+        # An error of the whole file has no key, and its message has the remedy.
         what, remedy = (f"{'.'.join(path)}{given}: {message}", "mend the value") if path else (message, "")
         raise InputError(what, where=where, remedy=remedy) from None
 
@@ -121,7 +120,7 @@ def set_entry(tables: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 
 def _follow(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], list[type[BaseModel]]]:
-    """What a user would call a place that pydantic names, and the tables that may stand there.
+    """User's name of a location from pydantic, and the tables allowed there.
 
     Pydantic puts the tag of a union, such as a shape's name, between the keys; the file has none there.
     """
@@ -140,7 +139,7 @@ def _follow(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[lis
 
 
 def _tag(table: type[BaseModel]) -> Any:
-    """The one value that the first field of a table may have, if it is such a field."""
+    """The only allowed value of a table's first field, if it has only one."""
     first = next(iter(table.model_fields.values()), None)
     choices = get_args(first.annotation) if first is not None and get_origin(first.annotation) is Literal else ()
     return choices[0] if len(choices) == 1 else None

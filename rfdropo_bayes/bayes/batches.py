@@ -38,10 +38,10 @@ def in_chunks(
     """A function of arrays with a common first axis, evaluated chunk by chunk.
 
     Args:
-        function: of a tree of arrays, to a tree of arrays.
+        function: maps a tree of arrays to a tree of arrays.
         given: the tree.
-        sizes: of chunks, ascending. All chunks but the last one are of the largest; the last one is padded to the
-            smallest that holds it. The padding repeats the last entry.
+        sizes: chunk sizes, ascending. All chunks but the last have the largest size; the last is padded to the smallest
+            sufficient size. The padding repeats the last entry.
         before: called before every chunk; it may raise.
         after: called with the number of entries after every chunk.
     """
@@ -65,5 +65,5 @@ def chunk_sizes(largest: int) -> tuple[int, ...]:
 
 
 def is_batch(given: Any, axes: int) -> bool:
-    """Whether these are arrays of numbers with so many axes, and nothing that JAX traces."""
+    """Whether these are concrete arrays with ``axes`` axes, not JAX tracers."""
     return all(not isinstance(a, jax.core.Tracer) and np.ndim(a) == axes for a in jax.tree.leaves(given))

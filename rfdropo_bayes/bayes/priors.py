@@ -28,7 +28,7 @@ KINDS: dict[type, tuple[str, tuple[str, ...]]] = {
     dist.Uniform: ("Uniform", ("low", "high")),
     dist.LogUniform: ("LogUniform", ("low", "high")),
 }
-"""Distributions whose arguments are those of a table."""
+"""Distributions by the arguments of a table."""
 TRUNCATED = (LeftTruncatedDistribution, RightTruncatedDistribution, TwoSidedTruncatedDistribution)
 TRANSFORMED = (dist.TransformedDistribution, dist.LogNormal)
 WRAPPERS = (dist.Independent, dist.ExpandedDistribution)
@@ -45,8 +45,8 @@ def _half_normal(spec: ParameterSpec, scale: float) -> dist.Distribution:
 class TruncatedLogNormal(dist.TransformedDistribution):
     """Log-normal distribution confined to an interval.
 
-    Its support is said here: a transformed distribution takes the whole codomain of its transform, here all positive
-    numbers, for its support, and forgets where its base ends.
+    Its support is set explicitly: a transformed distribution would use all positive numbers, the codomain of its
+    transform, and ignore the ends of its base.
     """
 
     def __init__(self, median: float, sigma: float, low: float, high: float) -> None:
@@ -94,7 +94,7 @@ OPTIONAL = {"TruncatedNormal": ("low", "high")}
 def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: str) -> dist.Distribution:
     """Build the prior of one parameter.
 
-    Normal, HalfNormal and LogNormal priors are truncated to the hard bounds, a TruncatedNormal to its own ends, too;
+    Normal, HalfNormal and LogNormal priors are truncated to the hard bounds, a TruncatedNormal also to its own ends;
     Uniform and LogUniform ranges must lie inside them.
 
     Args:
@@ -207,7 +207,7 @@ def table_of(prior: Any, *, where: str) -> dict[str, Any]:
 
 
 def _table(prior: dist.Distribution, where: str) -> dict[str, Any] | None:
-    """The table of a distribution of one element; None where there is none."""
+    """The table of a distribution of one element; None if there is none."""
     if type(prior) in KINDS:
         family, names = KINDS[type(prior)]
         return {"distribution": family, **{name: _plain(getattr(prior, name), name, where) for name in names}}
@@ -228,7 +228,7 @@ def _table(prior: dist.Distribution, where: str) -> dict[str, Any] | None:
 
 
 def _through(table: dict[str, Any], transform: transforms.Transform, where: str) -> dict[str, Any] | None:
-    """The table of what a transform makes of a distribution; None where there is none."""
+    """The table of a transformed distribution; None if there is none."""
     family = table["distribution"]
     if isinstance(transform, transforms.ExpTransform):
         if family == "Normal":
@@ -239,7 +239,7 @@ def _through(table: dict[str, Any], transform: transforms.Transform, where: str)
     if not isinstance(transform, transforms.AffineTransform):
         return None
     shift, factor = _plain(transform.loc, "loc", where), _plain(transform.scale, "scale", where)
-    if family.startswith("Log"):  # what is shifted is log-normal no more
+    if family.startswith("Log"):  # a shifted variable is not log-normal
         sized: dict[str, float] = {name: factor * table[name] for name in ("median", "low", "high") if name in table}
         return {**table, **sized} if shift == 0.0 and factor > 0.0 else None
     if family == "HalfNormal":

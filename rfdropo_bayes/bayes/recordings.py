@@ -24,10 +24,10 @@ class RecordingSet:
     Attributes:
         names: one per recording.
         markers: the markers that all recordings have.
-        marker_index: where these are among the simulator's.
+        marker_index: indices of these markers in the simulator.
         time: observation times, from zero [s].
         rows: number of rows of each recording.
-        position: measured marker positions [m]; zero where masked.
+        position: measured marker positions [m]; zero if masked.
         commands: commands on the simulator's clock.
     """
 
@@ -61,11 +61,11 @@ class RecordingSet:
 
 
 def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) -> RecordingSet:
-    """Bring trajectories onto the simulator's clock and markers: those of the robot's that every recording has.
+    """Bring trajectories onto the simulator's clock and markers: the robot's markers that every recording has.
 
     Raises:
-        InputError: no trajectory, two of one name, one whose commands no drive has carried out, no marker in common, or
-            another number of channels.
+        InputError: no trajectory, two trajectories of the same name, commands that no drive executed, no common marker,
+            or another number of channels.
     """
     if not trajectories:
         raise InputError("no recordings", where="[data] fit", remedy="name at least one recording")
@@ -74,7 +74,7 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
         raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
     for trajectory in trajectories:
         if trajectory.unsent:
-            remedy = "leave it out: a session in the shadow shows what a policy would do"
+            remedy = "leave it out: a shadow session has commands that were not executed"
             raise InputError("no drive has carried its commands out", where=trajectory.name, remedy=remedy)
     length = max(len(trajectory.time) for trajectory in trajectories)
     markers = shared_markers(trajectories, simulator.marker_names)

@@ -17,9 +17,9 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 
-CLOCKS_AGREE = 0.1  # of a sample time: what the clocks of repeats may differ by
+CLOCKS_AGREE = 0.1  # of a sample time: largest difference of the clocks of repeats
 SURE = 1e-4  # p-value under the noise within recordings, below which shifts are there
-LEAST = 0.5  # of the noise's standard deviation: what is smaller changes no conclusion
+LEAST = 0.5  # of the noise's standard deviation: smaller differences change no conclusion
 ROWS = 10  # fewer tell no constant from slow noise
 
 Groups = tuple[tuple[int, ...], ...]
@@ -46,7 +46,7 @@ def group_recordings(recordings: RecordingSet, trajectories: Sequence[Trajectory
 
 
 def repeats_apart(recordings: RecordingSet, trajectories: Sequence[Trajectory], groups: Groups) -> tuple[str, ...]:
-    """Recordings that repeat the commands of another one and are not joined with it, as rows or clocks differ."""
+    """Recordings that repeat commands of another recording but are not grouped with it, as rows or clocks differ."""
     firsts = {group[0] for group in groups}
     repeats = [index for found in group_repeats(trajectories) for index in found[1:]]
     return tuple(recordings.names[index] for index in repeats if index in firsts)
@@ -59,7 +59,7 @@ def mean_of(channel: Series, groups: Groups) -> Float[np.ndarray, "group time *r
 
 
 def spread(channel: Series, groups: Groups) -> Float[np.ndarray, "recording time column"]:
-    """Every recording less the mean of its group, in the unit of the noise; zero where not valid."""
+    """Every recording less the mean of its group, in the unit of the noise; zero if not valid."""
     readings = np.asarray(channel.measured)
     about = np.empty_like(readings)
     for group, mean in zip(groups, mean_of(channel, groups), strict=True):
@@ -72,7 +72,7 @@ def mean_error(
     valid: Bool[np.ndarray, "recording time column"],
     groups: Groups,
 ) -> Float[np.ndarray, "*batch group time column"]:
-    """Mean of errors over each group, zero where nothing is valid."""
+    """Mean of errors over each group, zero if none is valid."""
     means = []
     for group in groups:
         own, index = valid[list(group)], list(group)
@@ -94,7 +94,7 @@ def deviations(
             own = own & (own.sum(axis=0) > 1)
             parts.append(np.where(own, errors[list(group)] - mean, 0.0))
             counted.append(own)
-            freedom += own.sum() - own.any(axis=0).sum()  # a mean for each row and column, of those that are there
+            freedom += own.sum() - own.any(axis=0).sum()  # a mean for each row and column that has values
             values += int(own.sum())
     return np.concatenate(parts), np.concatenate(counted), freedom / max(values, 1)
 
@@ -137,18 +137,17 @@ def repeat_shift(
 ) -> float | None:
     """Root mean square distance of a marker that constants, one for each repeat and column, make [m].
 
-    The noise within recordings is an autoregression; the means of such recordings have a variance that it predicts, and
-    of which the means that were found are a chi-squared multiple. Noise so slow that it differs little from a constant
-    within a recording counts as one.
+    The noise within recordings is an autoregression, which predicts the variance of recordings' means; the observed
+    variance is a chi-squared multiple of it. Noise that is nearly constant within a recording counts as a constant.
 
     Args:
-        deviations: of repeats from their mean.
-        valid: which may be used.
+        deviations: deviations of repeats from their mean.
+        valid: mask of usable values.
         share: degrees of freedom per value.
         steps: time between rows of each repeat [s].
 
     Returns:
-        None where the noise within the recordings accounts for all that they differ by, or nearly all.
+        None if the noise within the recordings explains all or nearly all of the difference.
     """
     rows = valid.sum(axis=1, keepdims=True)
     if rows.max(initial=0) < ROWS:
@@ -169,7 +168,7 @@ def repeat_shift(
 
 
 def _variance_of_mean(noise: Autoregression, rows: int) -> Float[np.ndarray, " column"]:
-    """Of the mean of so many successive rows of the process."""
+    """Variance of the mean of ``rows`` successive rows of the process."""
     memory = np.zeros(rows)
     memory[: len(noise.autocorrelation)] = noise.autocorrelation[:rows]
     coefficients = noise.predictors[0][-1][: noise.order]

@@ -1,4 +1,4 @@
-"""Commands around the audit: what the simulator lacks, and what to measure next."""
+"""Commands around the audit: effects that the simulator lacks, and the next experiment."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def audit(
     fit: Fit = None,
     between: Annotated[
         tuple[str, str] | None,
-        typer.Option("--between", metavar="GROUP GROUP", help="name what differs between two of [model.groups]"),
+        typer.Option("--between", metavar="GROUP GROUP", help="name the difference between two of [model.groups]"),
     ] = None,
     seed: Seed = None,
     resume: Resume = False,
@@ -42,7 +42,7 @@ def audit(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Name what the simulator lacks. Writes audit.json, extended.toml and report.html."""
+    """Name the effects that the simulator lacks. Writes audit.json, extended.toml and report.html."""
     see_calibration(fit, "--from")
     folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model

@@ -1,4 +1,4 @@
-"""The command that says what an experiment is, before anything long is run."""
+"""The command that describes an experiment before a long run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ def check(
     ] = None,
     overrides: Overrides = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="read only: do not simulate what a fit could determine")
+        bool, typer.Option("--quick", help="read only: skip the simulations that estimate what a fit can determine")
     ] = False,
 ) -> None:
-    """Say what was read, before a fit. Names faults, draws every recording, measures the errors of time step and mesh,
-    and says what a fit could determine and how long it takes."""
+    """Check an experiment before a fit. Names faults, draws every recording, and measures the errors of time step and
+    mesh. Predicts which parameters a fit can determine, and its run time.
+    """
     from rfdropo_bayes.verbs.check import run_check
 
     folder = out or Path("runs") / f"{experiment_name(experiment)}-check"

@@ -32,7 +32,7 @@ class Questions:
         self.ask, self.assumed = ask, set[str]()
 
     def answer(self, key: str, given: Any, question: str, default: Any) -> Any:
-        """The answer that an option gave, or what a question brings."""
+        """The answer that an option gave, or the reply to a question."""
         if given is not None:
             return given
         reply = typer.prompt(question, default=default) if self.ask else default
@@ -41,7 +41,7 @@ class Questions:
         return reply
 
     def names(self, file: Path, given: str | None, commands: int | None, markers: str | None) -> list[str] | None:
-        """Names of the columns of a CSV without names; None where it has names."""
+        """Names of the columns of a CSV without names; None if it has names."""
         from rfdropo_bayes.data.csv_table import unnamed_rows
         from rfdropo_bayes.data.mapped_formats import recognised_format
         from rfdropo_bayes.verbs.column_names import suggested_names
@@ -66,7 +66,7 @@ class Questions:
         )
 
     def counts(self, guess: Any, given: float | None) -> float | None:
-        """Counts in one turn of the spool; None where nothing is in counts. They have no default: gears differ."""
+        """Counts in one turn of the spool; None if nothing is in counts. They have no default: gears differ."""
         if given is not None or not guess.counts:
             return given
         if not self.ask:
@@ -132,7 +132,7 @@ Gravity = Annotated[
     str | None,
     typer.Option(help="direction of gravity: +z for a robot that hangs, -z for a robot that stands, -y, ..."),
 ]
-Mass = Annotated[float | None, typer.Option("--mass-g", help="mass of the body [g]; by default that of silicone")]
+Mass = Annotated[float | None, typer.Option("--mass-g", help="mass of the body [g]; silicone by default")]
 Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's modulus of the body [MPa]")]
 Markers = Annotated[
     str | None,
@@ -177,7 +177,7 @@ def init(
     markers: Markers = None,
     defaults: Defaults = False,
 ) -> None:
-    """Write a first robot file and experiment file. Asks for what options and recordings do not say."""
+    """Write a first robot file and experiment file. Asks for facts that are neither in options nor in recordings."""
     from rfdropo_bayes.verbs.init import (
         assumed_of_columns,
         matching_commands,
@@ -209,7 +209,7 @@ def init(
     if unit in ANGLES:
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
-    answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0: that of silicone", 0.0) or None
+    answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0 for silicone", 0.0) or None
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
     outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
@@ -224,7 +224,7 @@ def init(
 
 
 def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:
-    """What the columns of the first recording are."""
+    """Guessed meaning of the columns of the first recording."""
     from rfdropo_bayes.verbs.column_names import guess_columns
 
     return guess_columns(file, sent[0] if sent else None, names, _listed(command_names))
@@ -244,8 +244,8 @@ def _check_unit(unit: str, guess: Guess | None) -> None:
     raise InputError(
         f"commands are in {unit!r} ({', '.join(guess.commands)}), neither lengths of cable nor angles of a motor",
         where="--recording",
-        remedy="record what the cables or motors do, or convert it; if a turn of the spool is so many of them, give "
-        "--command-unit counts and --counts-per-turn",
+        remedy="record cable lengths or motor angles, or convert the commands; if they are counts of the spool, "
+        "give --command-unit counts and --counts-per-turn",
     )
 
 
@@ -268,7 +268,7 @@ def _body(
     tip: float | None,
     cables: float | None,
 ) -> dict[str, Any]:
-    """Shape and size of the body, and how far off its axis the cables begin [mm]."""
+    """Shape and size of the body, and distance of the cables from its axis at the base [mm]."""
     from rfdropo_bayes.robots.outline import CABLES_AT
 
     form = ask.answer("shape", shape, "Shape: cylinder, cone, tube or disks", "cylinder")
@@ -296,13 +296,13 @@ def _outline(name: str, disks: int | None, unit: str, answers: dict[str, Any], a
 
 
 def _name(folder: Path) -> str:
-    """A robot's name from that of a folder."""
+    """A robot's name from the name of a folder."""
     letters = "".join(c if c.isascii() and c.isalnum() else "_" for c in folder.resolve().name.lower()).strip("_")
     return letters if letters[:1].isalpha() else f"robot_{letters}".rstrip("_")
 
 
 def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: bool | None) -> tuple[int, bool]:
-    """Cables of a segment, and whether opposite ones share a motor: as many channels as a recording has commands."""
+    """Cables of a segment, and whether opposite cables share a motor; both must match the number of commands."""
     if guess is None:
         return ask.answer("cables", cables, "Cables of each segment", 4), bool(pairs)
     commands = len(guess.commands)
@@ -312,13 +312,13 @@ def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: b
         raise InputError(
             f"{commands} commands ({', '.join(guess.commands)}) for {parts} segments of {number} cables",
             where="--recording",
-            remedy="give --segments and --cables, and --pairs where opposite cables share a motor",
+            remedy="give --segments and --cables, and --pairs if opposite cables share a motor",
         )
     return number, paired
 
 
 def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> dict[str, float]:
-    """Heights [mm] of the markers by name; evenly spaced where they are not given."""
+    """Heights [mm] of the markers by name; evenly spaced if they are not given."""
     names = guess.markers if guess is not None else ["m1", "m2", "m3"]
     spaced = ",".join(f"{name}={length * (k + 1) / len(names):.4g}" for k, name in enumerate(names))
     text = ask.answer("markers", given, "Markers and their heights [mm]", spaced)

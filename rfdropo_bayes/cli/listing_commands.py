@@ -1,4 +1,4 @@
-"""Commands that list what there is to choose from."""
+"""Commands that list robots, methods, mechanisms and formats."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=RO
 
     if name is None:
         _show(robot_rows())
-        typer.echo("\nrfdropo robots NAME says more, and where its file is; rfdropo init writes one for your own.")
+        typer.echo("\nrfdropo robots NAME describes a robot and its file; rfdropo init writes one for your own.")
     else:
         _say(named_robot_facts(name))
 
 
 def mechanisms(
-    name: Annotated[str | None, typer.Argument(metavar="[MECHANISM]", help="say more of this one")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[MECHANISM]", help="describe this mechanism")] = None,
     robot: Annotated[str, typer.Option(help="robot to list parameters per cable for")] = "smooth_arm",
 ) -> None:
     """List the mechanisms, or describe a mechanism. Its cause, remedy, parameters and priors."""
@@ -55,7 +55,7 @@ def methods() -> None:
 
 
 def _show(rows: list[dict[str, str]]) -> None:
-    """A table; its last column is wrapped where a terminal says how wide it is."""
+    """A table; its last column is wrapped to the width of a terminal."""
     *columns, last = rows[0]
     widths = [max(len(row[key]) for row in [*rows, {key: key for key in columns}]) for key in columns]
     terminal = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize

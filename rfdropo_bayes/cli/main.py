@@ -41,7 +41,7 @@ from rfdropo_bayes.interrupts import EXIT_STATUS, NOTHING_LOST, watch_interrupts
 from rfdropo_bayes.runtime import keep_compilations
 
 INPUT_ERROR = 2
-# What a disk or its rights keep a command from writing is no fault of the program.
+# A full or protected disk is not a fault of the program.
 OF_THE_USER = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EISDIR, errno.ENOTDIR)
 
 # Typer carries its own copy of click, or uses the installed one, depending on its version.
@@ -173,11 +173,11 @@ def run(commands: typer.Typer, name: str) -> None:
 
 
 def _after(stop: BaseException, name: str) -> str:
-    """What an interrupted user can do next."""
+    """Next step for the user after an interrupt."""
     again = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
     if isinstance(stop, Interrupted) and stop.going_on is not None:
         command = shlex.join([*name.split(), *again, *stop.going_on.split()])
-        return f"interrupted; what is done is kept in {stop.folder}; to go on: {command}"
+        return f"interrupted; finished work is kept in {stop.folder}; to go on: {command}"
     if isinstance(stop, Interrupted):
         return f"interrupted; {stop.folder} holds no result; to start again: {shlex.join(['rfdropo', *again])}"
     return NOTHING_LOST

@@ -1,4 +1,4 @@
-"""Commands around motors: simulated drives, a session on drives, and what this machine is fit for."""
+"""Commands around motors: simulated drives, a session on drives, and checks of this machine."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def deploy(
     mode: Annotated[str, typer.Option(help="check, home, dry-run, shadow, run or replay")] = "dry-run",
     out: Annotated[Path | None, typer.Option("--out", help="folder of the session; by default runs/NAME-TIME")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
-    recording: Annotated[Path | None, typer.Option(help="what to replay: a session's folder, or a trajectory")] = None,
+    recording: Annotated[Path | None, typer.Option(help="session folder or trajectory to replay")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no live view")] = False,
     overrides: Annotated[
         list[str] | None,

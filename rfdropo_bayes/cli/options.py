@@ -29,7 +29,7 @@ Overrides = Annotated[
         help="value of a parameter in SI units, or table.key=value of the experiment file; may be repeated",
     ),
 ]
-Seed = Annotated[int | None, typer.Option(help="seed; that of the experiment file by default")]
+Seed = Annotated[int | None, typer.Option(help="seed; by default from the experiment file")]
 Resume = Annotated[bool, typer.Option("--resume", help="go on from the checkpoint of an interrupted run")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="start anew, whatever the folder holds")]
 WRITTEN = ("experiment", "config", "extended")  # names of the experiment files that init, runs and audits write
@@ -62,7 +62,7 @@ def folder_for(
 
 
 def experiment_name(experiment: Path) -> str:
-    """The name that default folders have: that of the file, or of its folder for the names that commands give files."""
+    """The name that default folders have: the name of the file, or of its folder if the file has a default name."""
     folder = experiment.resolve().parent.name
     if not folder or experiment.stem not in WRITTEN:
         return experiment.stem

@@ -16,9 +16,7 @@ def view(
     recording: Annotated[
         str | None, typer.Option(help="which recording of an experiment; the first by default")
     ] = None,
-    robot: Annotated[
-        Path | None, typer.Option(help="file of the robot, where a NetCDF file has none beside it")
-    ] = None,
+    robot: Annotated[Path | None, typer.Option(help="file of the robot, if a NetCDF file has none beside it")] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="as in simulate; for an experiment")
     ] = None,

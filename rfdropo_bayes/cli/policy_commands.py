@@ -30,9 +30,9 @@ def train(
     fit: Annotated[
         Path | None, typer.Option("--from", help="folder of a calibration: its model, under draws of its posterior")
     ] = None,
-    task: Annotated[str | None, typer.Option("--task", help="reach or push; that of the experiment by default")] = None,
+    task: Annotated[str | None, typer.Option("--task", help="reach or push; by default from the experiment")] = None,
     goal: Annotated[
-        str | None, typer.Option("--goal", help="X,Y,Z [m] in the frame of the base; by default those of the task")
+        str | None, typer.Option("--goal", help="X,Y,Z [m] in the frame of the base; by default from the task")
     ] = None,
     out: OutFolder = None,
     resume: Resume = False,

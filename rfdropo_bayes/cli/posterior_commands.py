@@ -19,7 +19,7 @@ def export(
         bool, typer.Option("--model", help="the model of another simulator (MJCF), with posterior means in it")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace what an earlier export wrote")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace files of an earlier export")] = False,
 ) -> None:
     """Write parts of a calibration for other programs. The distribution to randomise over as tables with units, a
     posterior small enough to keep, or a calibrated model."""

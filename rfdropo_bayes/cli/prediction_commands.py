@@ -18,7 +18,7 @@ Group = Annotated[
 ]
 PredictedGroup = Annotated[
     str | None,
-    typer.Option("--group", help="the day or robot; by default that of adapt, or else as [model.groups] has it"),
+    typer.Option("--group", help="the day or robot; by default from adapt, or else from [model.groups]"),
 ]
 
 Episode = Annotated[int | None, typer.Option("--episode", help="number of the episode, of a LeRobotDataset")]
@@ -36,7 +36,7 @@ def predict(
         str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
     ] = None,
     episode: Episode = None,
-    seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
+    seed: Annotated[int | None, typer.Option(help="seed of the draws; by default from the experiment")] = None,
     group: PredictedGroup = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -75,20 +75,22 @@ def adapt(
     recording: Annotated[str, typer.Option("--recording", help="file of observations, in the experiment's format")],
     out: Annotated[Path, typer.Option("--out", help="folder to write to")],
     commands: Annotated[
-        str | None, typer.Option("--commands", help="file of its commands, where the format has one of their own")
+        str | None, typer.Option("--commands", help="file of its commands, if the format has a separate file")
     ] = None,
     episode: Episode = None,
     seconds: Annotated[
         float | None, typer.Option(help="length of the beginning that is used, in seconds; all by default")
     ] = None,
     group: Group = None,
-    seed: Annotated[int | None, typer.Option(help="seed; that of the experiment by default")] = None,
+    seed: Annotated[int | None, typer.Option(help="seed; by default from the experiment")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Adapt a calibration to another day. One short recording moves what days change; the body keeps its posterior."""
+    """Adapt a calibration to another session. One short recording updates the parameters that vary between sessions;
+    the body keeps its posterior.
+    """
     see_calibration(run, "DIR")
     check_folder(out, "adapt", overwrite=overwrite)
     from rfdropo_bayes.data import RecordingEntry
@@ -114,5 +116,5 @@ def adapt(
 
 
 def _from_here(name: str) -> str:
-    """A path that counts from the current folder, where there is such a recording; else as the experiment has it."""
+    """A path that counts from the current folder, if the file exists; otherwise relative to the experiment."""
     return str(Path(name).resolve()) if Path(name).exists() else name

@@ -1,4 +1,4 @@
-"""The command that draws the page of a run again, or says where the results of a run without one are."""
+"""The command that draws the page of a run again, or lists the results of a run without a page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TO_VIEW = {"predict": "prediction.nc"}
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder that a run has written")],
 ) -> None:
-    """Draw the page of a calibration or a motor session again. Of other runs, say where their results are."""
+    """Draw the page of a calibration or a motor session again. Lists the results of other runs."""
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder), remedy="name the folder that --out gave a run")
     if (folder / JOURNAL).is_file():
@@ -36,10 +36,10 @@ def report(
 
 
 def _say_results(folder: Path) -> list[str]:
-    """What a folder without a posterior holds, in lines.
+    """Lines about a folder without a posterior.
 
     Raises:
-        InputError: no run, one that has not ended, or one whose page is gone.
+        InputError: no run, an unfinished run, or a run whose page is gone.
     """
     command = command_of(folder)
     if command is None or command not in COMMANDS:
@@ -53,7 +53,7 @@ def _say_results(folder: Path) -> list[str]:
     if PAGE in kind.results:
         again = f"rfdropo {command} {shlex.quote(str(folder / CONFIG))} --out ANOTHER_FOLDER"
         raise InputError(
-            f"the page of this run of {command} is gone, and what it was drawn from is not kept",
+            f"the page of this run of {command} is gone, and its data are not kept",
             where=str(folder),
             remedy=f"run it again: {again}" if (folder / CONFIG).is_file() else "run it again",
         )

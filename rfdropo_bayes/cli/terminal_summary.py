@@ -1,4 +1,4 @@
-"""What a calibration or an audit found, on the terminal: the verdict, a table of parameters, where the report is."""
+"""Result of a calibration or an audit on the terminal: the verdict, a table of parameters, the path of the report."""
 
 from __future__ import annotations
 
@@ -43,8 +43,9 @@ def say(found: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> No
 
 
 def show_calibration(found: Calibration, experiment: Path | None = None, *, quiet: bool, as_json: bool) -> None:
-    """Print the result of a finished calibration: headline, table of parameters, cautions, what to type next, and where
-    the report is. An audit of ``experiment`` comes next, if one is given, unless nothing speaks against the fit."""
+    """Print the result of a finished calibration: headline, table of parameters, cautions, next command, and path of
+    the report. The next command is an audit of ``experiment`` if there are cautions.
+    """
     summary, folder = found.content, found.folder or Path()
     report = folder / "report.html"
     if as_json or quiet:
@@ -55,7 +56,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
     for sentence in summary["headline"]:
         style = COLOURS[found.verdict] if sentence == found.sentence else ""
         console.print(Text(sentence, style=style), soft_wrap=True)
-    moved = summary["details"].get("moved", [])  # by an adaptation: what the reader looks for
+    moved = summary["details"].get("moved", [])  # by an adaptation: its main result
     rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
     rows.sort(key=lambda row: row[0] not in moved)
     console.print(_parameters(rows[:MOST_ROWS]))
@@ -127,7 +128,7 @@ def _off(error: Mapping[str, float] | None) -> str:
 
 
 def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
-    """Print what a prediction is of; ``facts`` is the content of prediction.json."""
+    """Print a description of a prediction; ``facts`` is the content of prediction.json."""
     start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
     lines = [f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}"]
     if facts["group_fitted"] is not None:

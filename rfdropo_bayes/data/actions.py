@@ -12,15 +12,15 @@ from rfdropo_bayes.errors import InputError
 CABLES = 8
 CABLE_NAMES = tuple(f"cable{index}" for index in range(CABLES))
 DISPLACEMENT = 5e-3  # [m] per action, nominal
-INITIAL = -1  # recorded in the row of the initial state, where no action has been taken yet
+INITIAL = -1  # in the row of the initial state, before the first action
 SETTINGS = {"displacement_per_action": DISPLACEMENT, "updates_per_action": 5, "displacement_per_update": 1e-3}
 
 
 def cumulative_displacement(actions: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 8"]:
     """Commanded displacement [m] of each cable after each action, pull > 0, without any limit.
 
-    Action a moves cable a % 8: pulled if a < 8, released otherwise; the initial one moves none. How the 5 mm are spread
-    over the action, and what the motors' limits leave of them, is the model's business.
+    Action a moves cable a % 8: pulled if a < 8, released otherwise; the initial action moves none. The model
+    distributes the 5 mm over the action and applies the motors' limits.
     """
     change = np.zeros((len(actions), CABLES))
     moved = np.where(actions < CABLES, DISPLACEMENT, -DISPLACEMENT) * (actions != INITIAL)
@@ -38,8 +38,8 @@ def actions_of(command: Float[np.ndarray, "n 8"], initial: Float[np.ndarray, " 8
 def actions_towards(target: Float[np.ndarray, "n 8"], initial: Float[np.ndarray, " 8"]) -> Int[np.ndarray, " m"]:
     """At most one action per row, each of which brings the cable that is farthest from its target [m] nearer.
 
-    No cable passes its target. Where all are within an action of theirs, the next targets are gone for; after the last
-    nothing is left to do.
+    No cable passes its target. Once all cables are within an action of their targets, the next targets apply; the
+    actions end after the last targets.
     """
     level, row, found = np.array(initial, dtype=float), 0, list[int]()
     while row < len(target) and len(found) < len(target):

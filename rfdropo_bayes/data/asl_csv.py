@@ -1,8 +1,8 @@
 """Recordings of the ASL trunk: motion capture of three disks, and six motor commands, in two files.
 
 Timing. Both files run at 100 Hz. Row k of the observations is the state just before command row k is sent, so command
-row k is in force from ``time[k]`` until ``time[k + 1]``, and the observations have one row more than the commands. What
-was in force before row 0 is not recorded, but the motors' angles show it (`first_command`); ``initial_command`` repeats
+row k is in force from ``time[k]`` until ``time[k + 1]``, and the observations have one row more than the commands. The
+command before row 0 is not recorded, but the motors' angles show it (`first_command`); ``initial_command`` repeats
 command row 0.
 
 Frame. Motion capture has y up and the trunk hangs. Base frame: x = mocap x, y = mocap z, z = -mocap y (down, along the
@@ -96,10 +96,10 @@ def _origin(name: str, provenance: str, settings: Mapping[str, Any]) -> Origin:
 def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
     """Commands with the start pose at most, from ``row`` of a file of observations; see `commands_alone`.
 
-    Of row 0 the motors' angles are taken, too.
+    The motor angles of row 0 are read as well.
 
     Raises:
-        InputError: on a damaged file, or one without that row.
+        InputError: on a damaged file, or a file without that row.
     """
     command = _read_commands(commands)
     start = angle = None

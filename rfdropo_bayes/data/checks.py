@@ -1,4 +1,4 @@
-"""What every trajectory must satisfy, whichever file it came from."""
+"""Conditions on every trajectory, from any file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DIMS: dict[str, tuple[str, ...]] = {
     "orientation": ("time", "section", "quaternion"),
 }
 GAPPED = frozenset({"object_pose", "orientation"})
-"""What may be missing in a row."""
+"""Quantities that may be missing in a row."""
 MASKS = frozenset({"position_mask", "tension_mask", "motor_angle_mask"})
 _LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres taken for metres always do
 _SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are
@@ -64,7 +64,7 @@ def check_dataset(dataset: xr.Dataset) -> None:
 
 
 def _check_turns(turn: np.ndarray, what: str, name: str) -> None:
-    """Raise an InputError where quaternions are not of unit length."""
+    """Raise an InputError if quaternions are not of unit length."""
     norm = np.linalg.norm(turn, axis=1)
     norm = np.where(np.isfinite(norm), norm, 1.0)
     if np.any(np.abs(norm - 1.0) > 1e-2):
@@ -74,7 +74,7 @@ def _check_turns(turn: np.ndarray, what: str, name: str) -> None:
 
 
 def check_pose(pose: np.ndarray | None, rows: int, name: str) -> None:
-    """Raise an InputError where the poses of an object are not seven numbers a row."""
+    """Raise an InputError if the poses of an object are not seven numbers a row."""
     if pose is not None and np.shape(pose) != (rows, 7):
         raise InputError(
             f"poses of the object have the shape {np.shape(pose)}, not ({rows}, 7)",
@@ -133,6 +133,6 @@ def _check_commands(dataset: xr.Dataset, name: str) -> None:
         raise InputError(
             f"commands reach {largest:.4g} {unit} with steps of {step:.4g} {unit}",
             where=name,
-            remedy=f"they look like {other}: state the unit the file is in; where drives do go so far, as a winch or a "
-            "lead screw of many turns does, state largest_command beside it",
+            remedy=f"they look like {other}: state the unit the file is in; if drives really travel this far, as "
+            "a winch or lead screw does, also state largest_command",
         )

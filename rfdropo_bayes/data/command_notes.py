@@ -1,4 +1,4 @@
-"""What is allowed of the times of commands, and perhaps not meant: lost commands, and two programs that command."""
+"""Notes on valid but suspicious command times: lost commands, and two commanding programs."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ REGULAR, NEAR = 0.7, 0.25
 FEWEST = 10
 """Intervals from which a rate is told."""
 HOLE = 4.0
-"""Usual intervals: a longer one is noted."""
+"""Multiple of the usual interval above which an interval is noted."""
 LOST = 0.04
 """Share of commands that are lost one by one, from which on they are noted."""
 ALTERNATING = 8
 """Commands in a row that go to and fro between two others, from which on two programs are suspected."""
 SAME = 0.2
-"""Share of a change of command within which the command after the next one is the same as this one."""
+"""Share of a change of command within which the command after the next one counts as equal."""
 
 
 def command_notes(time: Float[np.ndarray, " command"], command: Float[np.ndarray, "command channel"]) -> list[str]:
-    """What a user should look at, by time, and what to do.
+    """Suspicious times, each with a remedy for the user.
 
     Args:
-        time: of commands with times of their own [s], increasing.
-        command: in any unit.
+        time: times of the commands [s], increasing.
+        command: values in any unit.
     """
     return [*_lost(time), *_alternating(time, command)]
 
@@ -50,7 +50,7 @@ def _lost(time: np.ndarray) -> list[str]:
 
 
 def _alternating(time: np.ndarray, command: np.ndarray) -> list[str]:
-    """Commands that go to and fro, as those of two programs do that publish the same channels."""
+    """Notes on alternating commands, as from two programs that publish the same channels."""
     if len(time) < ALTERNATING:
         return []
     next_one = np.linalg.norm(command[1:-1] - command[:-2], axis=1)
@@ -63,6 +63,7 @@ def _alternating(time: np.ndarray, command: np.ndarray) -> list[str]:
     first = int(starts[np.argmax(runs >= ALTERNATING)])
     zero = (command[first : first + 2] == 0.0).all(axis=1).any()
     return [
-        f"commands go to and fro between two values{', one of them zero,' * bool(zero)} {int(runs.sum())} times, first "
-        f"from {time[first]:.4g} s on: if two programs sent the same channels, record the one that the drives obeyed"
+        f"commands go to and fro between two values{', one of them zero,' * bool(zero)} {int(runs.sum())} "
+        f"times, first from {time[first]:.4g} s on: if two programs sent the same channels, record the "
+        "program that the drives obeyed"
     ]

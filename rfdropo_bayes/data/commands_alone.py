@@ -1,4 +1,4 @@
-"""Commands as a recording whose measurements are unknown, but for where the markers are in one row."""
+"""Commands as a recording whose measurements are unknown, except the marker positions in one row."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def commands_alone(
     start_file: str = "",
     motor_angle: Float[np.ndarray, "row channel"] | None = None,
 ) -> Trajectory:
-    """Commands with the start pose at most; they begin from the first one.
+    """Commands with at most a start pose; the recording begins at the first command.
 
-    Observations are due at the times of the commands, and once more as long after the last as two are apart.
+    Observations are due at the times of the commands, and once one interval after the last command.
 
     Args:
-        origin: where they come from.
-        sent: the commands; before the first one, it was in force already.
-        marker_names: of the robot.
-        start: places of the markers [m], of which one row counts; None where none is known.
-        row: that of the start pose; a single row has it, whatever its number.
-        start_file: that it was read from.
-        motor_angle: [rad], not a number where it is not known.
+        origin: origin of the commands.
+        sent: the commands; the first was already in force before its time.
+        marker_names: names of the robot's markers.
+        start: marker positions [m], of which one row is used; None if unknown.
+        row: number of the row with the start pose; ignored if there is a single row.
+        start_file: file of the start pose.
+        motor_angle: motor angles [rad], NaN if unknown.
 
     Raises:
         InputError: a start without that row.

@@ -1,8 +1,8 @@
-"""Counters and angles that begin anew at a turn, or elsewhere after a restart: found by jumps that no marker follows.
+"""Detection of wrapped or restarted counters and angles, by jumps that no marker follows.
 
-A counter that wraps shows two kinds of steps: short ones, and ones that are nearly a turn long, against the motion
-before and after. A command that really jumps looks the same, so the markers decide: they are regressed on the commands
-as they stand, and on the commands without the jumps. A jump is doubtful if the regression is better without it.
+A wrapped counter has short steps, and steps of nearly a turn against the motion before and after. A command that really
+jumps looks the same, so the markers decide: they are regressed on the commands with and without the jumps. A jump is
+doubtful if the regression is better without it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FEWEST = 5
 SEVERAL = 2
 """Jumps that it takes to believe in a turn of no known counter."""
 EXCEPTIONAL = 3.0
-"""A step that is so many times as long as 19 of 20 steps may be a restart."""
+"""Multiple of the 95 % quantile of step sizes above which a step may be a restart."""
 BETTER, MUCH_BETTER = 0.9, 0.5
 """Ratio of the errors without and with the jumps of a turn, and of a restart, below which markers did not follow."""
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.4)  # [s] of the markers after the commands
@@ -44,12 +44,12 @@ class Wraps(NamedTuple):
 
 
 class Column(NamedTuple):
-    """One column as the file has it.
+    """One column of a file.
 
     Attributes:
-        name: in the file.
-        values: one for each row; not a number where it is missing.
-        turns: of counters that the unit allows.
+        name: name in the file.
+        values: one value per row; NaN if missing.
+        turns: possible turns of counters in this unit.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Column(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the markers did: times of the rows of the columns [s], times of the positions [s], and positions."""
+    """Motion of the markers: times of the rows of the columns [s], times of the positions [s], and positions."""
 
     sent: Float[np.ndarray, " rows"]
     time: Float[np.ndarray, " time"]
@@ -66,7 +66,7 @@ class Motion(NamedTuple):
 
 
 def unwrapped(values: Float[np.ndarray, " rows"], turn: float) -> Float[np.ndarray, " rows"]:
-    """Values of a counter that begins anew at every ``turn``, read on across its jumps; missing ones stay missing."""
+    """Unwrapped values of a counter that restarts at every ``turn``; missing values stay missing."""
     found, known = np.array(values, dtype=float), np.isfinite(values)
     found[known] = np.unwrap(found[known], period=turn)
     return found
@@ -75,7 +75,7 @@ def unwrapped(values: Float[np.ndarray, " rows"], turn: float) -> Float[np.ndarr
 def read_on(
     values: Float[np.ndarray, "rows column"], names: Sequence[str], turns: Mapping[str, float]
 ) -> Float[np.ndarray, "rows column"]:
-    """Columns with those that have a turn in ``turns`` read on across it."""
+    """Columns, unwrapped if ``turns`` has their turn."""
     columns = [unwrapped(own, turns[name]) if name in turns else own for name, own in zip(names, values.T, strict=True)]
     return np.stack(columns, axis=1)
 
@@ -93,8 +93,8 @@ def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wr
     """Jumps of about one turn, against the motion around them; None if there are none, or steps of every length.
 
     Args:
-        values: of one column; missing ones are passed over.
-        turns: of known counters.
+        values: values of one column; missing values are skipped.
+        turns: turns of known counters.
     """
     rows = np.flatnonzero(np.isfinite(values))
     step = np.diff(values[rows])
@@ -118,7 +118,7 @@ def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wr
 
 
 def _towards(step: np.ndarray, k: int, short: np.ndarray) -> float:
-    """How far the motion around a jump goes in one row against the jump; 0 where it does not."""
+    """Motion per row around a jump, against the jump's direction; 0 if it has the same direction."""
     beside = [step[j] for j in (k - 1, k + 1) if 0 <= j < len(step) and short[j]]
     return max(0.0, -float(np.sign(step[k])) * float(np.mean(beside))) if beside else 0.0
 
@@ -175,15 +175,15 @@ def find_restart(columns: Sequence[Column], motion: Motion) -> Restart | None:
 
 
 def _usual(size: np.ndarray) -> float:
-    """The length that 19 of 20 steps do not exceed, of those that are steps; 0 where there are too few."""
+    """The 95 % quantile of the sizes of nonzero steps; 0 if there are too few."""
     moving = size[np.isfinite(size) & (size > 0.0)]
     return float(np.quantile(moving, 0.95)) if len(moving) >= 4 * FEWEST else 0.0
 
 
 def regression_error(values: Float[np.ndarray, "rows channel"], motion: Motion) -> float:
-    """Root mean square error of the markers as a linear function of the values in force, at the delay that is best.
+    """Root mean square error of the markers as a linear function of the values in force, at the best delay.
 
-    Infinite where there are fewer rows than the regression has unknowns.
+    Infinite if there are fewer rows than the regression has unknowns.
     """
     position = np.asarray(motion.position, dtype=float)
     stride = max(1, len(position) // ROWS)
@@ -204,7 +204,7 @@ def regression_error(values: Float[np.ndarray, "rows channel"], motion: Motion) 
 
 
 def counter_notes(columns: Sequence[Column], motion: Motion, unit: str) -> list[str]:
-    """What is doubtful of columns in one unit, in words, with the line to type."""
+    """Notes on doubtful columns in one unit, each with the line to type."""
     if not len(motion.position) or not columns:
         return []
     wraps = wraps_of(columns, motion)

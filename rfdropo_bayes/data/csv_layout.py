@@ -28,7 +28,7 @@ _UNITS = re.compile(
 
 
 class Dialect(NamedTuple):
-    """How a CSV file separates its values, and what stands before their decimals."""
+    """Separator and decimal sign of a CSV file."""
 
     separator: str
     decimal: str
@@ -46,8 +46,8 @@ def cells_of(line: str, separator: str) -> list[str]:
 def dialect_of(lines: Sequence[str]) -> Dialect:
     """Separator and decimal sign of a table whose first line may hold names.
 
-    The separator is the one between which the most of the first rows' cells are values. Decimals follow a comma if any
-    cell has a comma in a number; commas that separate are in quotes then.
+    The chosen separator yields the most numeric cells in the first rows. Decimals follow a comma if any cell has a
+    comma in a number; separating commas are then quoted.
     """
     separator = max(SEPARATORS, key=lambda sign: _fit(lines, sign))
     rows = lines[1:] or lines
@@ -106,10 +106,10 @@ def units_above(rows: Sequence[str], separator: str) -> list[str] | None:
 
 
 def header_of(path: Path, lines: Sequence[str], separator: str, names: Sequence[str] | None) -> list[str]:
-    """The names of the columns: those in the first line, or ``names`` if the first line holds values.
+    """The names of the columns: the first line, or ``names`` if the first line holds values.
 
     Raises:
-        InputError: a first line of values and no names for them, or another number of names.
+        InputError: a first line of values and no names for them, or a different number of names.
     """
     first = [cell.strip() for cell in cells_of(lines[0], separator)]
     if not without_names(lines, separator):

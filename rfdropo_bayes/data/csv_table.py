@@ -63,7 +63,7 @@ def read_text(path: Path) -> str:
 
 
 def _decoded(raw: bytes) -> str:
-    """Text in UTF-8 or, with its byte order mark, UTF-16; what is neither is in Latin-1, as older loggers write it."""
+    """Text in UTF-8 or, with its byte order mark, UTF-16; other text is read as Latin-1, as older loggers write it."""
     marked = raw[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     with suppress(UnicodeDecodeError):
         text = raw.decode("utf-16" if marked else "utf-8-sig")
@@ -88,22 +88,22 @@ def unnamed_rows(path: Path) -> list[list[str]] | None:
 class CsvTable:
     """A rectangular table of numbers with named columns.
 
-    Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma
-    (`dialect_of`). A second line of units is no row: ``units`` maps the names of columns to what it says.
+    Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma (`dialect_of`).
+    A second line of units is no row: ``units`` maps the names of columns to their units.
 
     Args:
         path: the file, plain or gzipped.
         required: columns that must be there.
-        names: of the columns, if the first line holds values.
+        names: names of the columns, if the first line holds values.
         machine_written: the format has a writer and columns of its own: it ends every line with a newline, so a last
-            line without one was cut. Else a table [data.columns] names the columns.
+            line without a newline was cut. Otherwise a table [data.columns] names the columns.
 
     Raises:
         InputError: empty file, header without rows, ragged or cut rows, a missing, renamed or repeated column.
     """
 
     missing_remedy = "correct its name in [data.columns]"
-    """What to do about a column that is not there."""
+    """Remedy for a missing column."""
 
     def __init__(
         self, path: Path, required: Sequence[str], *, names: Sequence[str] | None = None, machine_written: bool = True
@@ -139,7 +139,7 @@ class CsvTable:
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
         bare = [lines[0].removeprefix("#"), *lines[1:]]
-        if dialect_of(bare).separator == " ":  # NumPy marks the names so where it separates by spaces
+        if dialect_of(bare).separator == " ":  # NumPy marks the names this way if it separates by spaces
             lines = bare
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
@@ -176,12 +176,12 @@ class CsvTable:
 
     @classmethod
     def of_frame(cls, frame: pd.DataFrame, name: str, required: Sequence[str]) -> CsvTable:
-        """A table that is in memory; ``name`` stands for its path.
+        """A table in memory; ``name`` stands for its path.
 
-        An index with a name is a column, too; one of dates without a name is the column "index".
+        A named index is also a column; an unnamed index of dates is the column "index".
 
         Raises:
-            InputError: no rows, a column that appears twice, or a missing one.
+            InputError: no rows, a column that appears twice, or is missing.
         """
         if frame.index.name is not None or isinstance(frame.index, pd.DatetimeIndex | pd.TimedeltaIndex):
             called = frame.index.name if frame.index.name is not None else "index"
@@ -202,7 +202,7 @@ class CsvTable:
         return name in self.frame.columns
 
     def require(self, names: Sequence[str]) -> None:
-        """Raise an InputError that names those of ``names`` that are no columns, and the nearest to the first."""
+        """Raise an InputError if some ``names`` are not columns; it lists them and the nearest column to the first."""
         columns = list(self.frame.columns)
         missing = [name for name in names if name not in columns]
         if not missing:
@@ -260,7 +260,7 @@ class CsvTable:
         return values.loc[:, told]
 
     def _number(self, cells: pd.Series) -> pd.Series:
-        """Cells of a column as numbers; pandas leaves those of a column with any text as they were. Dates are none."""
+        """Cells of a column as numbers; pandas leaves a column with any text unchanged. Dates are not numbers."""
         if dated(cells):
             return pd.Series(np.nan, index=cells.index)
         if self.decimal == "," and not pd.api.types.is_numeric_dtype(cells):
@@ -276,7 +276,7 @@ class CsvTable:
     def pose(
         self, names: Sequence[str], unit: float, *, allow_missing: bool = False
     ) -> Float[np.ndarray, "rows 7"] | None:
-        """Columns of a position in a ``unit`` of so many metres, then of a quaternion; None where there are none."""
+        """Position and quaternion from columns whose length ``unit`` is in metres; None without columns."""
         if not any(name in self for name in names):
             return None
         values = self.numbers(names, allow_missing=allow_missing)
@@ -291,7 +291,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
 
 
 def _told_apart(header: Sequence[str]) -> list[str]:
-    """Names of columns, a number in place of those that are empty."""
+    """Names of columns, with a number for each empty name."""
     return [name or f"Unnamed: {column}" for column, name in enumerate(header)]
 
 
@@ -303,16 +303,16 @@ def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: 
         if found != fields:
             last = row == len(rows) - 1
             raise InputError(
-                f"has {found} values where the header names {fields}" + (": the file is cut short" if last else ""),
+                f"has {found} values, but the header names {fields}" + (": the file is cut short" if last else ""),
                 where=f"{path}, row {row}",
-                remedy="separate values by semicolons where decimals follow a comma"
+                remedy="separate values by semicolons if decimals follow a comma"
                 if found == 2 * fields
                 else ("fetch the file again or drop the row" if last else "repair the row"),
             )
 
 
 def _check_first_line(path: Path, lines: Sequence[str], separator: str) -> None:
-    """Raise an InputError if the table begins further down, below what a program says of itself."""
+    """Raise an InputError if the table begins further down, below a program's preamble."""
     width = len(cells_of(lines[-1], separator))
     first = next(row for row, line in enumerate(lines) if len(cells_of(line, separator)) == width)
     cells = cells_of(lines[first], separator)

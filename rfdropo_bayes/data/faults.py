@@ -1,17 +1,17 @@
 """Faults of a motion-capture recording: found and masked, never fitted.
 
-Five kinds, each by what it looks like in the numbers:
+Five kinds, each with its pattern in the numbers:
 
 - *missing*: a position that is NaN (a marker was lost).
-- *zero*: a position that is exactly 0, 0, 0, far from where the marker is before and after: how some trackers write a
-  lost marker.
+- *zero*: a position that is exactly 0, 0, 0, far from the marker before and after: some trackers write a lost marker
+  this way.
 - *held*: the tracker repeated its last pose. Real measurements carry noise in their last digits, so a position equal to
-  the one before it in all three coordinates is no new measurement. The first row of a held run counts as measured.
-- *jump*: the tracker fitted the wrong rigid body for a row or a short run of rows, and then came back; two markers
-  that swap for a row jump both. A jump is a step that differs from the neighbouring ones by more than
-  ``tolerance + max_acceleration * dt**2``. What is kept of each marker is its longest smooth path: the largest set of
-  rows in which every row can be reached from the one kept before it. Leaving out more rows than ``longest_run`` is
-  never worth it, so a lasting change of level (a moved frame, an impact) is kept and counted among the *breaks*.
+  its predecessor in all three coordinates is no new measurement. The first row of a held run counts as measured.
+- *jump*: the tracker fitted the wrong rigid body for a row or a short run of rows, and then came back; two markers that
+  swap for a row jump both. A jump is a step that differs from the neighbouring steps by more than ``tolerance +
+  max_acceleration * dt**2``. The longest smooth path of each marker is kept: the largest set of rows in which every row
+  can be reached from its predecessor. At most ``longest_run`` rows are left out at a time, so a lasting change of level
+  (a moved frame, an impact) is kept and counted among the *breaks*.
 - *renamed*: the place of a marker under the name of another (`identities`).
 
 At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: jumps cannot be told from it, none is masked.
@@ -30,13 +30,13 @@ from rfdropo_bayes.data.identities import Change, changed_names
 from rfdropo_bayes.data.sample_times import check_times, clock_notes, evened
 from rfdropo_bayes.errors import InputError
 
-NOTES = "notes"  # among the settings of a recording: what is allowed of it, and perhaps not meant
+NOTES = "notes"  # key of a recording's settings: valid but suspicious facts
 
 TOLERANCE = 1.5e-3  # [m]
-MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, in excess of what the neighbouring rows show
+MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, beyond the acceleration of the neighbouring rows
 LONGEST_RUN = 0.25  # [s]
-MOST_ROWS = 250  # of a run: as many as the longest has at 1 kHz; motion capture is not faster, and memory grows with it
-FAR = 10e-3  # [m] from a zero to where the marker is before and after
+MOST_ROWS = 250  # of a run: the longest run at 1 kHz; motion capture is not faster, and memory grows with it
+FAR = 10e-3  # [m] from a zero to the marker before and after
 FAR_STEPS = 3.0  # the same in steps of a fast row
 _VELOCITY_ROWS = 5
 _DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
@@ -47,11 +47,11 @@ _FEW = 5.0  # quanta
 
 
 class Faults(NamedTuple):
-    """What is wrong with a recording.
+    """Faults of a recording.
 
-    ``mask(time, marker)`` is True where the position may be used. ``counts`` maps each kind to its number of
-    positions per marker, and ``breaks`` to the number of lasting changes of level; kinds "zero" and "renamed" are there
-    where there are any. ``notes`` say what a user should look at, by row, and what to do.
+    ``mask(time, marker)`` is True for usable positions. ``counts`` maps each kind to its number of positions per
+    marker, and ``breaks`` to the number of lasting changes of level; kinds "zero" and "renamed" are present if they
+    occur. ``notes`` list suspicious rows, each with a remedy for the user.
     """
 
     mask: Bool[np.ndarray, "time marker"]
@@ -74,16 +74,16 @@ def find_faults(
     max_acceleration: float = MAX_ACCELERATION,
     longest_run: float = LONGEST_RUN,
 ) -> Faults:
-    """Mask lost, held, jumping and renamed positions of a measured recording (not meant for simulated ones).
+    """Mask lost, held, jumping and renamed positions of a measured recording (not meant for simulated recordings).
 
     Args:
         time: times of the rows [s].
-        position: marker positions [m]; NaN where a marker was lost.
-        where: what errors call the recording.
-        names: of the markers, for the notes; numbers by default.
+        position: marker positions [m]; NaN if a marker was lost.
+        where: name of the recording in errors.
+        names: marker names for the notes; numbers by default.
         tolerance: distance that is no fault at any rate [m].
         max_acceleration: largest acceleration a marker can have [m/s2].
-        longest_run: longest run of wrong positions that can be told from a lasting change [s].
+        longest_run: longest run of wrong positions that is distinguished from a lasting change [s].
 
     Raises:
         InputError: fewer than two rows, another number of positions than times, or times that do not increase.
@@ -126,10 +126,11 @@ def _check_rows(time: np.ndarray, position: np.ndarray, where: str) -> None:
 def find_zeros(
     position: Float[np.ndarray, "time marker 3"],
 ) -> tuple[Bool[np.ndarray, "time marker"], Bool[np.ndarray, "time marker"]]:
-    """True where a marker is exactly at 0, 0, 0 and was certainly lost, and True where it may have been.
+    """Masks of positions exactly at 0, 0, 0 whose marker was certainly lost, and possibly lost.
 
-    Lost: where it was seen before and after the zeros is farther from them than it moves in a fast row. Not lost: a
-    marker that is near. Those between, at low sampling rates, and those that are never elsewhere are in doubt.
+    A marker was lost if its positions before and after the zeros are farther away than a fast motion reaches in a row.
+    A marker near zero was not lost. Distances between, at low sampling rates, and markers that are always at zero are
+    in doubt.
     """
     zero = (position == 0.0).all(axis=2)
     lost, doubtful = np.zeros_like(zero), np.zeros_like(zero)
@@ -154,8 +155,8 @@ def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) ->
     """Markers at exactly 0, 0, 0, with the first row of each."""
     said = []
     for kind, words in (
-        (zero, "taken for lost and left out; leave such cells empty to say so"),
-        (doubtful, "taken as it stands; where it was lost, leave the cells empty, or the marker out"),
+        (zero, "taken for lost and left out; leave such cells empty to avoid this note"),
+        (doubtful, "taken as it stands; if it was lost, leave the cells empty, or omit the marker"),
     ):
         for marker in np.flatnonzero(kind.any(axis=0)).tolist():
             rows = np.flatnonzero(kind[:, marker])
@@ -164,7 +165,7 @@ def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) ->
 
 
 def _mostly_masked(seen: np.ndarray, counts: dict[str, list[int]], names: Sequence[str]) -> list[str]:
-    """Markers of which more positions are masked than kept: what was found is hardly a fault then."""
+    """Notes on markers with more masked than kept positions: the detected pattern is then hardly a fault."""
     said, rows = [], len(seen)
     for marker in np.flatnonzero(2 * seen.sum(axis=0) < rows).tolist():
         found = {kind: each[marker] for kind, each in counts.items() if kind not in ("breaks", "renamed")}
@@ -191,7 +192,7 @@ def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[
 
 
 def find_held(position: Float[np.ndarray, "time marker 3"]) -> Bool[np.ndarray, "time marker"]:
-    """True where a marker's position repeats the row before and that cannot be rest.
+    """Mask of positions that repeat the previous row although the marker is not at rest.
 
     Not held: markers that never move, signals so coarsely rounded that repeats are natural, and rows in which the whole
     body repeats when that is common (the rest of a noise-free recording).
@@ -248,7 +249,7 @@ def _off_path(
 
 
 def _around(rows: np.ndarray, margin: int, length: int) -> list[slice]:
-    """Parts of so many rows on both sides of some rows; parts that touch are one."""
+    """Slices of ``margin`` rows on both sides of some rows; touching slices are merged."""
     groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * margin) + 1) if len(rows) else []
     return [slice(max(int(group[0]) - margin, 0), min(int(group[-1]) + margin, length)) for group in groups]
 
@@ -269,10 +270,10 @@ class _Motion(NamedTuple):
         return self._replace(**{key: getattr(self, key)[rows] for key in ("time", "position", "arriving", "leaving")})
 
     def smooth(self, apart: int) -> Bool[np.ndarray, " row"]:
-        """Whether the motion from each row to the one that is ``apart`` rows later is one a body can make.
+        """Whether a body can move from each row to the row ``apart`` rows later.
 
-        It is, if it agrees with the mean of the velocities before and after it; a short one may agree with either
-        alone, as the onset of a motion does.
+        It can if the motion agrees with the mean of the velocities before and after it; a short one may agree with
+        either alone, as the onset of a motion does.
         """
         first, last = slice(0, len(self.time) - apart), slice(apart, len(self.time))
         gap = (self.time[last] - self.time[first])[:, None]
@@ -290,8 +291,8 @@ class _Motion(NamedTuple):
 def _longest_path(motion: _Motion, reach: int) -> tuple[np.ndarray, int]:
     """Rows off the longest smooth path, and its breaks.
 
-    Dynamic programming over "the best path that ends in this row": it extends a path that ended shortly before if the
-    step between them is smooth, or breaks with it at the price of half the longest run (a wrong run takes two breaks).
+    Dynamic programming over the best path that ends in each row. A path is extended if the step is smooth. A break
+    costs half the longest run, because a wrong run takes two breaks.
     """
     rows = len(motion.time)
     smooth = np.zeros((rows, reach), dtype=bool)  # from row r - 1 - b to row r
@@ -315,7 +316,9 @@ def _longest_path(motion: _Motion, reach: int) -> tuple[np.ndarray, int]:
 
 
 def _end_velocities(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median velocity of the few steps that arrive at each row, and of those that leave it: one bad step is ignored."""
+    """Median velocity of the few steps that arrive at each row, and of the few steps that leave it: a single bad step
+    is ignored.
+    """
     velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
     edge = np.full((_VELOCITY_ROWS, 3), np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([edge, velocity, edge]), _VELOCITY_ROWS, axis=0)

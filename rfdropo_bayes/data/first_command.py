@@ -1,9 +1,9 @@
 """The command in force before the first row, which many files do not hold.
 
-It is given, or measured, or recognised from how the recording begins. Motors whose angles are measured show where they
-stand in the first row. Without them, either the first command was in force already, so that the
-robot stays where it is until commands change; or no command was, and the robot sets out from its rest. Each says what
-a linear robot with a dead time and a lag would do, and the one that meets the first rows better is taken.
+It is given, or measured, or recognised from how the recording begins. Measured motor angles show it in the first row.
+Without them, either the first command was in force already, so that the robot rests until commands change, or no
+command was, and the robot starts from its rest pose. A linear robot with a dead time and a lag is fitted for both
+cases; the case with the smaller error in the first rows is taken.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 sta
 
 MEMORY = "memory"  # the format of recordings from arrays
 UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot", MEMORY)
-"""Formats that do not tell what was in force before their first command."""
+"""Formats that do not state the command before their first row."""
 
 MEASURED = {"rule": "measured", "why": "the motors' angles in the first row"}
 
 
 def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
-    """The recording with the command before its first row as a rule has it, its file, its motors, or as recognised.
+    """The recording with the command before its first row: from a rule, its file, its motors, or its first rows.
 
     Args:
         trajectory: a whole recording.
         rule: "first", "zero", or one value per channel [m or rad].
 
     Raises:
-        InputError: another number of values than channels, or a rule where every row is a pose at rest.
+        InputError: another number of values than channels, or a rule for a recording of poses at rest.
     """
     settled = bool(trajectory.settings.get("settled_poses"))
     if rule is None:
@@ -77,9 +77,9 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
 
 
 def angle_at_first(trajectory: Trajectory) -> Float[np.ndarray, " channel"] | None:
-    """Motor angles [rad] in the first row, where all were measured and commands are angles; None elsewhere.
+    """Motor angles [rad] in the first row, if all were measured and commands are angles; None otherwise.
 
-    A reading that a slower loop holds counts, too: it is a few rows old, of a robot that stood still.
+    A held reading of a slower loop also counts: it is a few rows old, of a robot at rest.
     """
     angle, mask = trajectory.motor_angle, trajectory.motor_angle_mask
     if angle is None or trajectory.command_unit != "rad":
@@ -89,7 +89,7 @@ def angle_at_first(trajectory: Trajectory) -> Float[np.ndarray, " channel"] | No
 
 
 def common_beginning(trajectories: Sequence[Trajectory]) -> str | None:
-    """The rule by which all of some recordings begin, "first" or "zero"; None where they differ, or need none."""
+    """The rule by which all of some recordings begin, "first" or "zero"; None if they differ or need no rule."""
     rules = {trajectory.settings.get(FIRST_COMMAND, {}).get("rule") for trajectory in trajectories}
     rule = rules.pop() if len(rules) == 1 else None
     return rule if rule in ("first", "zero") else None
@@ -103,7 +103,7 @@ class Beginning(NamedTuple):
 
 
 def recognised(trajectory: Trajectory) -> Beginning:
-    """Which command was in force before the first row, by how the first rows move; "first" where they do not tell."""
+    """Which command was in force before the first row, from the motion in the first rows; "first" if undecided."""
     if not np.any(trajectory.command[0]):
         return Beginning("first", "the first command is zero")
     errors = beginning_errors(trajectory)
@@ -123,8 +123,8 @@ def recognised(trajectory: Trajectory) -> Beginning:
 def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
     """Root mean square error [m] in the first rows of a linear robot that starts at the first command, and at zero.
 
-    For each start, the dead time and lag are the ones with which a regression meets all rows looked at best. None where
-    there are fewer rows than the regression has unknowns, or neither commands nor rows tell one from the other.
+    For each start, the dead time and lag are chosen for the least error of a regression over the rows used. None if
+    there are fewer rows than unknowns, or if the data cannot distinguish the cases.
     """
     time = trajectory.time[trajectory.time <= LOOKED_AT]
     mask = trajectory.position_mask[: len(time)]
@@ -136,7 +136,7 @@ def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
     position = trajectory.position[rows][:, mask.mean(axis=0) > 0.5].reshape(len(rows), -1)
     time = time[rows]
     if not _changes(trajectory) and not _sets_out(position):
-        return None  # a motion that dies away under one command may have begun anywhere
+        return None  # a decaying motion under a single command may have begun anywhere
     scale = np.abs(trajectory.command).max()
     best: dict[str, tuple[float, float, np.ndarray]] = {}
     for lag in LAGS:
@@ -167,7 +167,7 @@ def _sets_out(position: Float[np.ndarray, "rows coordinate"]) -> bool:
 
 
 def _states(trajectory: Trajectory, lag: float) -> Float[np.ndarray, "command channel"]:
-    """Where a first-order lag stands when each command comes, after the first command for ever."""
+    """State of a first-order lag at the time of each command, started at the first command."""
     command = trajectory.command
     kept = np.exp(-np.diff(trajectory.command_time) / lag)
     state = np.empty_like(command)
@@ -180,7 +180,7 @@ def _states(trajectory: Trajectory, lag: float) -> Float[np.ndarray, "command ch
 def _followed(
     trajectory: Trajectory, time: Float[np.ndarray, " n"], lag: float, state: Float[np.ndarray, "command channel"]
 ) -> tuple[Float[np.ndarray, "n channel"], Float[np.ndarray, " n"]]:
-    """Commands after the lag at these times, and the share that is left of what was there before the first command."""
+    """Commands after the lag at these times, and the remaining share of the state before the first command."""
     row = np.maximum(np.searchsorted(trajectory.command_time, time + 1e-9, side="right") - 1, 0)
     elapsed = np.maximum(time - trajectory.command_time[row], 0.0)
     kept = np.exp(-elapsed / lag)[:, None]

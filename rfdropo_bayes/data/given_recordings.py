@@ -1,4 +1,4 @@
-"""Recordings as a call of a verb is given them: a list, or an error that says how to make one."""
+"""Recordings given to a verb: checked to be a list."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def given_recordings(given: Any, where: str) -> list[Trajectory]:
     """A list of recordings; a single recording is a list of one.
 
     Args:
-        given: recordings, or what a caller took for recordings.
-        where: what the caller calls them.
+        given: argument of the caller.
+        where: name of the argument.
 
     Raises:
-        InputError: something else was given.
+        InputError: the argument holds no recordings; the remedy shows how to read them.
     """
     if isinstance(given, Trajectory):
         return [given]
@@ -46,5 +46,5 @@ def given_recording(given: Any, where: str) -> Trajectory:
 
 
 def _words(given: Any) -> str:
-    """A short name of what was given."""
+    """A short name of the argument."""
     return repr(given) if isinstance(given, str | int | float) or given is None else f"a {type(given).__name__}"

@@ -1,4 +1,4 @@
-"""Readings of sensors: those that are missing, and those that a slower loop repeats (a zero-order hold)."""
+"""Readings of sensors: missing readings, and readings that a slower loop repeats (a zero-order hold)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ HELD = 1.5  # samples: readings that last longer are held
 
 
 def present_readings(reading: np.ndarray | None) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Readings with the last one (or else the next) in place of those that are not a number, and True where they were.
+    """Readings with NaN replaced by the last (or else the next) reading, and a mask of measured readings.
 
-    The second is None where none is missing.
+    The mask is None if nothing is missing.
     """
     values = None if reading is None else np.array(reading, dtype=float)
     if values is None or values.ndim != 2 or np.isfinite(values).all():
@@ -25,7 +25,7 @@ def present_readings(reading: np.ndarray | None) -> tuple[np.ndarray | None, np.
 
 
 def hold_time(time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"]) -> float:
-    """For how long a reading is repeated, the median over the recording [s]; 0 where there are too few changes."""
+    """Median time for which a reading is repeated [s]; 0 if there are too few changes."""
     changes = np.flatnonzero(_changed(np.asarray(present_readings(reading)[0])))
     return float(np.median(np.diff(evened(time)[changes]))) if changes.size > 2 else 0.0
 
@@ -33,11 +33,11 @@ def hold_time(time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time
 def new_readings(
     time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"], hold: float
 ) -> Bool[np.ndarray, "time channel"]:
-    """True where a reading was made since the row before.
+    """Mask of readings that were made since the previous row.
 
-    All are new unless they are held for longer than the sample time. Of held ones the new show themselves by a change
-    of any channel, because all are read together; when the first row was read is not known. A new reading that equals
-    the last in every channel goes unnoticed, which loses only what a drive at rest would have repeated.
+    All are new unless they are held for longer than the sample time. A change of any channel marks a new held reading,
+    because all channels are read together. The first row counts as held. A new reading that equals the last in every
+    channel goes unnoticed, which loses only repeated readings of a drive at rest.
     """
     if hold <= HELD * sample_time(time):
         return np.ones(reading.shape, dtype=bool)

@@ -1,8 +1,8 @@
 """Markers that change names: from a row on, a tracker gives the places of some markers under the names of others.
 
-A change shows in one row: each of these markers is where another one was expected, and far from where itself was. Two
-points of one body do not trade places within a row, so the change is certain; which of the names are right is not told
-by the rows, and those of the beginning are taken.
+A change shows in one row: each of these markers is at the expected position of another marker, and far from its own.
+Two points of one body do not trade places within a row, so the change is certain; the rows do not show which names are
+right; the names at the beginning are taken.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
 
-APART = 5e-3  # [m]: markers that are nearer to each other are not told apart
+APART = 5e-3  # [m]: nearer markers are not distinguishable
 NEARER = 0.25  # share of the distance from itself within which the other marker was expected
 
 
 class Change(NamedTuple):
-    """From ``row`` on column ``taken_by[marker]`` shows what column ``marker`` showed before."""
+    """From ``row`` on column ``taken_by[marker]`` has the marker that column ``marker`` had before."""
 
     row: int
     taken_by: dict[int, int]
@@ -27,11 +27,11 @@ class Change(NamedTuple):
 def changed_names(
     position: Float[np.ndarray, "time marker 3"], usable: Bool[np.ndarray, "time marker"]
 ) -> tuple[Bool[np.ndarray, "time marker"], list[Change]]:
-    """True where a marker's place stands under the name of another, and the rows in which names change.
+    """Mask of positions under the name of another marker, and the rows in which names change.
 
     Args:
-        position: of the markers [m].
-        usable: True where a marker was measured.
+        position: positions of the markers [m].
+        usable: True if a marker was measured.
     """
     wrong, changes = np.zeros_like(usable), list[Change]()
     if len(position) < 2 or position.shape[1] < 2:
@@ -56,7 +56,7 @@ def changed_names(
 def _expected(
     position: Float[np.ndarray, "time marker 3"], usable: Bool[np.ndarray, "time marker"]
 ) -> tuple[Float[np.ndarray, "2 time marker 3"], Bool[np.ndarray, "time marker"]]:
-    """Where each marker is expected in a row: where it was last, and where it goes on to; and whether it was seen."""
+    """Expected positions of each marker in a row: its last position and its extrapolation; and whether it was seen."""
     rows = np.arange(len(position))[:, None]
     last = np.maximum.accumulate(np.where(usable, rows, -1), axis=0)
     last = np.concatenate([np.full((1, last.shape[1]), -1), last[:-1]])
@@ -79,7 +79,7 @@ def _assigned(
     seen: np.ndarray,
     own: Float[np.ndarray, " marker"],
 ) -> dict[int, int]:
-    """The markers that are where others were expected, by the column they are in; empty where that is not certain."""
+    """Markers at the expected positions of others, by column; empty if uncertain."""
     cost = _distance(expected[:, seen, None], found[None, None, seen])
     markers, columns = linear_sum_assignment(cost)
     moved = markers != columns

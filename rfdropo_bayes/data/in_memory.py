@@ -1,4 +1,4 @@
-"""Recordings from what a program holds: arrays, a table of pandas, a data set of xarray; units are converted here."""
+"""Recordings from objects in memory: arrays, a table of pandas, a data set of xarray; units are converted here."""
 
 from __future__ import annotations
 
@@ -43,27 +43,27 @@ def from_arrays(
     """A recording from arrays that begins with its first command; `Trajectory.from_arrays` is the way in.
 
     Args:
-        time: of the observations, in ``time_unit``, or dates or durations of any type.
-        position: of the markers, in the robot's base frame: x, y across, z along the axis away from the base. Positions
-            that are not a number are left out and counted.
+        time: times of the observations, in ``time_unit``, or dates or durations of any type.
+        position: positions of the markers, in the robot's base frame: x, y across, z along the axis away from the base.
+            NaN positions are masked and counted.
         command: cumulative commands, pull > 0, each in force until the next.
         markers, channels: their names, in the order of the arrays.
-        command_time: from when each command is in force, on the clock of ``time``; the first times of the observations
-            by default.
+        command_time: start time of each command, on the clock of ``time``; the first times of the observations by
+            default.
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
         command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
-        largest_command: that is to be believed, in ``command_unit``, of drives that go farther than 20 rad or 5 m.
-        tension: [N]; not a number where it is missing.
-        motor_angle: [rad]; not a number where it is missing.
+        largest_command: largest plausible command, in ``command_unit``, for drives that travel more than 20 rad or 5 m.
+        tension: cable tensions [N]; NaN if missing.
+        motor_angle: motor angles [rad]; NaN if missing.
         object_pose: centre and unit quaternion x, y, z, w of a pushed body.
-        orientation: of sections, unit quaternions x, y, z, w from the base's axes to the section's, which are the same
-            in the undeformed body; not a number where it is missing.
+        orientation: orientations of sections, unit quaternions x, y, z, w from the base's axes to the section's, which
+            are the same in the undeformed body; NaN if missing.
         sections: names of these sections.
-        name: of the recording; robot: that was recorded.
+        name: name of the recording; robot: name of the recorded robot.
 
     Raises:
-        InputError: an unknown unit, what is not a number, shapes that do not fit, times that do not increase, or
+        InputError: an unknown unit, values that are not numbers, shapes that do not fit, times that do not increase, or
             lengths that cannot be in the unit that was given.
     """
     metres, (unit, factor) = _unit(position_unit, METRES, name), _unit(command_unit, COMMAND_UNITS, name)
@@ -138,7 +138,7 @@ def _table(frame: Any, name: str) -> pd.DataFrame:
     raise InputError(
         f"a {type(frame).__name__} is no table",
         where=name,
-        remedy="give a DataFrame of pandas, or a table that has to_pandas(), as those of Polars and PyArrow",
+        remedy=("give a DataFrame of pandas, or a table that has to_pandas(), as tables of Polars and PyArrow have"),
     )
 
 
@@ -175,7 +175,7 @@ def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
 
 
 _UNITS = {"position": "m", "command": "m", "time": "s"}
-"""Units of a data set's variables where they state none."""
+"""Units of a data set's variables if they state none."""
 
 
 def _further_units(stated: Mapping[str, str], where: str) -> dict[str, tuple[str, dict[str, float]]]:
@@ -200,7 +200,7 @@ def _rescaled(key: str, values: np.ndarray, factor: float) -> np.ndarray:
 
 
 def beginning(rule: str | None, where: str) -> Rule | None:
-    """The rule for the command before the first row that has this name; None where it is to be recognised."""
+    """The rule for the command before the first row that has this name; None if it is to be recognised."""
     rules: dict[str | None, Rule | None] = {None: None, "first": "first", "zero": "zero"}
     if rule not in rules:
         remedy = 'give "first", "zero", or one value per channel'
@@ -209,7 +209,7 @@ def beginning(rule: str | None, where: str) -> Rule | None:
 
 
 def initial_command(values: Any, unit: str, channels: int, where: str) -> Float[np.ndarray, " channel"]:
-    """Values of the command before the first row [m or rad] from those in ``unit``."""
+    """Values of the command before the first row [m or rad] from values in ``unit``."""
     return COMMAND_UNITS[unit][1] * _numbers(values, "initial commands", {"channels": channels}, where)
 
 
@@ -224,7 +224,7 @@ def _known(unit: str, known: Mapping[str, Any], where: str) -> str:
 
 
 def _numbers(values: Any, what: str, sizes: Mapping[str, int | None], where: str) -> np.ndarray:
-    """Values as floats, NaN where they are missing, in the shape of these sizes by their names; None: of any size."""
+    """Values as floats, NaN if missing, with one axis per entry of ``sizes``; a size of None allows any."""
     try:
         found = np.ma.filled(np.ma.asarray(values).astype(float), np.nan)
     except (TypeError, ValueError):  # None and pd.NA among others, or text

@@ -1,8 +1,8 @@
 """LeRobotDatasets of versions 2 and 3, folders of JSON and Parquet files: read with pyarrow, not the package lerobot.
 
 Each episode is a recording. A column is called by its feature, a full stop and its name there, such as
-``observation.state.tip_x``; by its number where the dataset names none, ``action[0]``; and by the feature alone if that
-is a single number, ``timestamp``. Pictures, videos and texts are passed over.
+``observation.state.tip_x``; by its number if the dataset has no names, ``action[0]``; and by the feature alone if that
+is a single number, ``timestamp``. Pictures, videos and texts are skipped.
 
 Timing. The action of a frame is commanded after its observation, and in force until the next frame.
 """
@@ -31,7 +31,7 @@ ROUNDING = 1e-6
 
 
 class _Episode(NamedTuple):
-    """Where an episode is: its number, frames and file."""
+    """Location of an episode: its number, frames and file."""
 
     number: int
     length: int
@@ -57,12 +57,14 @@ def read_episode(folder: Path, number: int) -> pd.DataFrame:
     info = _info(folder)
     episode = next((found for found in _episodes(folder, info) if found.number == number), None)
     if episode is None:
-        raise InputError(f"has no episode {number}", where=str(folder), remedy="see meta/episodes for those it has")
+        raise InputError(
+            f"has no episode {number}", where=str(folder), remedy="see meta/episodes for the existing numbers"
+        )
     features = {name: fact for name, fact in info["features"].items() if str(fact["dtype"]).startswith(NUMBERS)}
     rows = _parquet(episode.file, list(dict.fromkeys([*features, *INDICES])), [("episode_index", "==", number)])
     if len(rows["episode_index"]) != episode.length:
         raise InputError(
-            f"episode {number} has {len(rows['episode_index'])} frames where its description tells {episode.length}",
+            f"episode {number} has {len(rows['episode_index'])} frames, but its description has {episode.length}",
             where=str(episode.file),
             remedy="fetch the dataset again",
         )
@@ -81,12 +83,12 @@ def read_episode(folder: Path, number: int) -> pd.DataFrame:
 
 
 def _unrounded(time: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Times that are those of a grid in single precision, in double precision."""
+    """Times in double precision if they equal a grid in single precision."""
     return grid if np.allclose(time, grid, rtol=ROUNDING, atol=ROUNDING) else time
 
 
 def _names(feature: str, fact: dict[str, Any], count: int) -> list[str]:
-    """What the numbers of a feature are called."""
+    """Names of the numbers of a feature."""
     if count == 1 and math.prod(fact.get("shape") or [1]) == 1:
         return [feature]
     given = fact.get("names") or []
@@ -149,7 +151,7 @@ def _path(info: dict[str, Any], number: int, chunk: int) -> str:
 def _parquet(
     path: Path, columns: Sequence[str], filters: list[tuple[str, str, int]] | None = None
 ) -> dict[str, list[Any]]:
-    """Columns of a Parquet file, those rows that filters keep."""
+    """Columns of a Parquet file, restricted to the rows that filters keep."""
     try:
         import pyarrow
         from pyarrow import parquet

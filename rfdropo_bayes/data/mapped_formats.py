@@ -1,4 +1,4 @@
-"""Formats whose columns may be anything, so that the table [data.columns] says what each is; and what a file is."""
+"""Formats whose columns may be anything, described by the table [data.columns]; and the kind of a file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAGIC = {b"#ROSBAG": rosbag.FORMAT, b"\x89MCAP0": rosbag.FORMAT, b"SQLite forma
 
 
 class Observed(NamedTuple):
-    """A table of observations, and its columns with what the file itself tells of them."""
+    """A table of observations, and its columns, completed with facts from the file."""
 
     table: CsvTable
     columns: CsvColumns
@@ -112,9 +112,9 @@ def read_mapped(
     Args:
         format: one of `MAPPED`.
         path: file or folder with the observations, and the commands unless they have a file of their own.
-        columns: what each column is.
+        columns: mapping of the columns.
         commands: a CSV of the commands.
-        episode: of a LeRobotDataset.
+        episode: number of the episode in a LeRobotDataset.
         mask_missing: mask lost marker positions instead of rejecting the file.
 
     Raises:
@@ -126,7 +126,7 @@ def read_mapped(
     if format == rosbag.FORMAT and source is None:
         source, clock = rosbag.read_commands(path, columns), rosbag.clock_of(columns)
         columns = changed(columns, where=str(path), command_time=clock, command_time_unit="s")
-        if columns.time is None:  # rows are numbered from the first one on, and so are the times of commands
+        if columns.time is None:  # rows are numbered from 0, and so are the times of commands
             source.frame[clock] -= table.frame[clock].iloc[0]
     if format == motive_csv.FORMAT and source is None:
         raise InputError(

@@ -23,7 +23,7 @@ def shared_markers(trajectories: Sequence[Trajectory], markers: Sequence[str]) -
                 where=trajectory.name,
                 remedy="name them under [data.columns] markers"
                 if trajectory.dataset.attrs["format"] in MAPPED
-                else "use the robot that was recorded, or name the markers alike in its file",
+                else "use the robot that was recorded, or use the same marker names in its file",
             )
     shared = set.intersection(*(set(trajectory.marker_names) for trajectory in trajectories))
     found = tuple(name for name in markers if name in shared)
@@ -38,7 +38,7 @@ def shared_markers(trajectories: Sequence[Trajectory], markers: Sequence[str]) -
 
 
 def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -> None:
-    """Raise InputError where the commands of a recording are not those of a robot's ``channels``, in ``unit``."""
+    """Raise InputError if the commands of a recording do not match a robot's ``channels``, in ``unit``."""
     own = trajectory.cable_names
     plain = trajectory.dataset.attrs["format"] in MAPPED
     if len(own) != len(channels):

@@ -1,12 +1,12 @@
-"""Motive's own export to CSV, of format versions 1.2x: what OptiTrack's software writes.
+"""Motive's own export to CSV, of format versions 1.2x: as OptiTrack's software writes it.
 
-The first line tells facts in pairs, among them the unit of lengths. Rows of types, names, IDs, perhaps parents, and
+The first line has facts in pairs, among them the unit of lengths. Rows of types, names, IDs, perhaps parents, and
 quantities follow, then the row of axes and one row per frame. A column here is called by type, name, quantity and axis,
-such as ``Rigid Body.tip.Position.X``, ``Marker.tip:Marker 001.Position.Y`` or ``Rigid Body.tip.Rotation.W``; where two
-have the same name, their IDs follow it, and then numbers. Cells are empty where a marker was lost. Errors and qualities
-are passed over.
+such as ``Rigid Body.tip.Position.X``, ``Marker.tip:Marker 001.Position.Y`` or ``Rigid Body.tip.Rotation.W``; if two
+have the same name, their IDs follow it, and then numbers. Cells of a lost marker are empty. Errors and qualities are
+skipped.
 
-Motive knows no commands: these are in a file of their own (`CsvColumns.command_time`). Its times begin with the take.
+Motive stores no commands: they are in a separate file (`CsvColumns.command_time`). Its times begin with the take.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class MotiveFile(NamedTuple):
 
     Attributes:
         table: times [s], positions in the file's unit, and rotations.
-        length_unit: "m", "cm" or "mm"; None where the header does not tell.
+        length_unit: "m", "cm" or "mm"; None if the header does not state it.
     """
 
     table: CsvTable
@@ -68,7 +68,7 @@ def read_motive(path: Path) -> MotiveFile:
 
 
 def _names(rows: list[list[str]], path: Path) -> list[str]:
-    """What each column is called; columns of anything but times, positions and rotations are only numbered."""
+    """Names of the columns; columns of anything but times, positions and rotations are only numbered."""
     *above, axes = [[cell.strip() for cell in row] for row in rows]
     if len(above) < 3:
         remedy = "export it again, with header information"

@@ -37,10 +37,10 @@ def array_format(path: Path, first: bytes) -> str | None:
 
 
 def read_arrays(path: Path) -> pd.DataFrame:
-    """The arrays of a file that have as many rows as most of them, side by side.
+    """The arrays of a file with the most common number of rows, side by side.
 
     Raises:
-        InputError: a damaged file, or one without arrays of numbers.
+        InputError: a damaged file, or a file without arrays of numbers.
     """
     try:
         arrays = _of_npz(path) if path.suffix != ".mat" else _of_mat(path)

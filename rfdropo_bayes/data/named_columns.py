@@ -1,8 +1,8 @@
-"""The table [data.columns]: which column of a table is what, and the recording that is read by it.
+"""The table [data.columns]: the meaning of each column of a table, and the recording read with it.
 
-Timing. The command in row k is in force from the time of row k until that of row k + 1, as a loop that measures, then
-commands, writes it; what was in force before row 0 is another matter (`first_command`). Commands may stand in a
-table of their own, with as many rows as the observations or one fewer; or with their own times and any number of rows.
+Timing. The command in row k is in force from the time of row k until the time of row k + 1, as for a loop that measures
+and then commands; `first_command` finds the command before row 0. Commands may stand in a table of their own, with n or
+n - 1 rows for n observations; or with their own times and any number of rows.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "-": ("-", 1.0),
 }
 COUNTS = "counts"
-"""Of an encoder, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
+"""Encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
 CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "-"]
 
 
@@ -63,7 +63,7 @@ _POSITIONS_ONLY = (
 
 
 class CsvColumns(BaseModel):
-    """The table [data.columns]: which column is what, in which unit. Columns that are not named are not read.
+    """The table [data.columns]: the meaning and unit of each column. Other columns are not read.
 
     Times come from the column ``time`` or from a constant ``sample_time``.
     """
@@ -80,7 +80,7 @@ class CsvColumns(BaseModel):
         default=None,
         description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; "
         '"rows" for rows without any time, such as poses at rest: one a second is assumed; for '
-        '"rosbag": "header", stamps where messages have them, or "log", the recorder\'s times',
+        '"rosbag": "header", stamps if messages have them, or "log", the recorder\'s times',
     )
     time_unit: TimeUnit = Field(
         default="s",
@@ -89,7 +89,7 @@ class CsvColumns(BaseModel):
     sample_time: float | None = Field(
         default=None,
         gt=0,
-        description="time between rows [s], where no column holds times, or one holds those of arrival",
+        description="time between rows [s], if no column has times or the times are of arrival",
     )
     commands: list[str] = Field(
         min_length=1,
@@ -97,7 +97,7 @@ class CsvColumns(BaseModel):
     )
     command_unit: CommandUnit = Field(
         description="unit of the commands: a length of cable, an angle of a motor or its counts, a force or torque; "
-        '"-" for what a simulator of one\'s own takes'
+        '"-" for commands of your own simulator'
     )
     counts_per_turn: float | None = Field(
         default=None,
@@ -108,12 +108,12 @@ class CsvColumns(BaseModel):
     largest_command: float | None = Field(
         default=None,
         gt=0,
-        description="largest command that is to be believed, in command_unit, where drives go farther than 20 rad or "
-        "5 m, as a winch or a lead screw of many turns does",
+        description="largest plausible command, in command_unit, if drives travel more than 20 rad or 5 m, as a "
+        "winch or lead screw does",
     )
     units: dict[str, str] = Field(
         {},
-        description="unit of each column of commands or positions that has another one than command_unit or "
+        description="unit of each column of commands or positions whose unit differs from command_unit or "
         "position_unit, by the name of the column",
     )
     command_time: str | None = Field(
@@ -121,13 +121,11 @@ class CsvColumns(BaseModel):
         description="column of the commands' own times, in their file; by default command k is sent in row k of the "
         "observations",
     )
-    command_time_unit: TimeUnit | None = Field(
-        default=None, description="unit of command_time; that of time by default"
-    )
+    command_time_unit: TimeUnit | None = Field(default=None, description="unit of command_time; time_unit by default")
     command_offset: float = Field(
         default=0.0,
-        description="added to the commands' own times [s]: what the clock of the observations shows when that of the "
-        "commands shows zero",
+        description="added to the commands' own times [s]: reading of the observations' clock when the commands' "
+        "clock shows zero",
     )
     positions: list[tuple[str, str, str]] = Field(
         min_length=1, description="columns of x, y and z of each marker, base to tip"
@@ -143,14 +141,14 @@ class CsvColumns(BaseModel):
     )
     origin: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0),
-        description="where the robot's base is in the file's frame: x, y, z along the file's axes, in position_unit; "
-        "the base is the middle of the body where it leaves the clamp",
+        description="position of the robot's base in the file's frame: x, y, z along the file's axes, in "
+        "position_unit; the base is the centre of the body at the clamp",
     )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
     )
     cables: list[str] | None = Field(
-        default=None, description="name of each channel in commands; those of the columns by default"
+        default=None, description="name of each channel in commands; the column names by default"
     )
     tensions: list[str] | None = Field(
         default=None, description="columns of the cable tensions [N], one for each command; empty cells are left out"
@@ -222,7 +220,7 @@ class CsvColumns(BaseModel):
                 what = "marker in positions" if key == "markers" else "channel in commands"
                 raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
         if len(self.orientations or ()) != len(self.sections or ()):
-            raise ValueError("sections names each of orientations: give as many")
+            raise ValueError("give one name in sections for each of orientations")
         for turn in self.orientations or ():
             if len(turn) not in (3, 4):
                 raise ValueError(f"an orientation has 4 columns (quaternion) or 3 (rotation vector), not {len(turn)}")
@@ -253,7 +251,7 @@ class CsvColumns(BaseModel):
         return bool(np.linalg.det(axes_matrix(self.axes)) < 0.0)
 
     def factors(self, names: Sequence[str]) -> Float[np.ndarray, " column"]:
-        """What brings columns of commands or positions to command_unit or position_unit."""
+        """Factors from the columns' units to command_unit or position_unit."""
         return np.array([self._factor(name) if name in self.units else 1.0 for name in names])
 
     def _factor(self, name: str) -> float:
@@ -304,7 +302,7 @@ def read_tables(
 ) -> Recorded:
     """The recording in a table, whose commands are in ``source``, which may be the same.
 
-    ``origin`` is that of a CSV by default.
+    ``origin`` describes a CSV by default.
     """
     position, time = points(table, columns, mask_missing=mask_missing), _times(table, columns)
     markers = marker_names(columns)
@@ -337,14 +335,14 @@ def read_tables(
 
 
 def read_commands(table: CsvTable, columns: CsvColumns) -> SentCommands:
-    """The commands in a table that may hold nothing else; their times count from the first one."""
+    """The commands in a table, which may have no other columns; times count from the first command."""
     clock, unit = command_clock(columns)
     time = _times(table, columns) if clock is None else _from_first(table, clock, unit)
     return SentCommands(time, _commands(table, table, columns), *_channels(columns), largest=_largest(columns))
 
 
 def origin_of(table: CsvTable, columns: CsvColumns) -> Origin:
-    """What a recording in a CSV is called."""
+    """Origin of a recording in a CSV."""
     file = table.path.name
     return Origin(file.removesuffix(".gz").removesuffix(".csv"), columns.robot, FORMAT, provenance=file)
 
@@ -360,7 +358,7 @@ def _channels(columns: CsvColumns) -> tuple[str, list[str]]:
 
 
 def _largest(columns: CsvColumns) -> float | None:
-    """Largest command that is to be believed, in the unit of a recording; None for what most drives do."""
+    """Largest plausible command, in the unit of a recording; None for the default limits."""
     stated = columns.largest_command
     return None if stated is None else columns.sized(columns.command_unit)[1] * stated
 
@@ -371,7 +369,7 @@ def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float
 
 
 def in_base(place: Float[np.ndarray, "*rows marker 3"], columns: CsvColumns) -> Float[np.ndarray, "*rows marker 3"]:
-    """Positions [m] in the base frame of those that a file has."""
+    """Positions of a file, converted to the base frame [m]."""
     place = place * columns.factors(coordinates(columns)).reshape(-1, 3)
     return METRES[columns.position_unit] * (place - columns.origin) @ axes_matrix(columns.axes).T
 
@@ -388,7 +386,7 @@ def untimed(columns: CsvColumns) -> bool:
 
 
 def _timing_notes(table: CsvTable, columns: CsvColumns, time: Float[np.ndarray, " rows"]) -> list[str]:
-    """What the form of the times lets doubt."""
+    """Notes on doubtful times."""
     if untimed(columns):
         return [UNTIMED]
     return [] if columns.time is None else rounded_notes(table.stamps(columns.time, columns.time_unit), time)
@@ -422,8 +420,8 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
         raise InputError(
             f"commands were sent from {sent[0]:.6g} to {sent[-1]:.6g} s, and {last:.6g} s were recorded from 0 s on",
             where=where,
-            remedy="correct command_offset, or pair what was recorded together; for a bag whose stamps are of several "
-            'clocks write time = "log"',
+            remedy="correct command_offset, or pair files that were recorded together; "
+            'for a bag with stamps of several clocks write time = "log"',
         )
     return sent
 
@@ -457,7 +455,7 @@ def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[n
     values = factors * read_on(source.numbers(columns.commands), columns.commands, columns.unwrap)
     if columns.command_time is None and len(values) not in (len(table), len(table) - 1):
         raise InputError(
-            f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",
+            f"{len(table)} observations do not fit {len(values)} commands: give the same number, or one fewer",
             where=f"{table.path} with {source.path}",
             remedy="pair the files that were recorded together, or name the commands' own times: command_time",
         )
@@ -476,7 +474,7 @@ def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] |
 
 
 def _orientations(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows section 4"] | None:
-    """Quaternions from the base's axes to those of the sections, which are the same in the undeformed body."""
+    """Quaternions from the base's axes to the sections' axes, which coincide in the undeformed body."""
     if not columns.orientations:
         return None
     turned = np.full((len(table), len(columns.orientations), 4), np.nan)

@@ -2,11 +2,10 @@
 
 Timing. The recording loop notes the time, reads the last motion-capture frame, and only then sends the next action: row
 k carries the pose at ``time[k]`` and action k leaves right after it. Command row k, the cumulative nominal displacement
-after action k, is therefore in force from ``time[k]``; row k + 1 shows what about 0.1 s of it did. Action 0 is the
-exception: reading the first frame took until row 1 was due (rows 0 and 1 hold the very same frame, which the frame
-counter puts at row 1), so that action 0 left within one frame before ``time[1]``, and action 1 right after it. While
-rows go on to show the initial action nothing was sent. When the motors acted on a command is not recorded: delays,
-ramps and limits are parameters of the model.
+after action k, is therefore in force from ``time[k]``; row k + 1 shows its effect after about 0.1 s. Action 0 is the
+exception: reading the first frame took until row 1 was due (rows 0 and 1 hold the same frame, taken at row 1), so that
+action 0 left within one frame before ``time[1]``, and action 1 right after it. Nothing was sent while rows repeat the
+initial action. The motors' response is not recorded: delays, ramps and limits are parameters of the model.
 
 The cube's pose is not masked: a jump of the cube alone does not make the trunk's markers wrong.
 """

@@ -1,4 +1,4 @@
-"""Any CSV, plain or gzipped, through a mapping of its columns (`named_columns`): the way in for one's own robot."""
+"""Any CSV, plain or gzipped, through a mapping of its columns (`named_columns`): for any robot."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def read_plain_csv(
 
     Args:
         path: file with the observations, and the commands unless they have a file of their own.
-        columns: what each column is.
-        commands: file of the commands.
+        columns: mapping of the columns.
+        commands: file of the commands, if it is another.
         mask_missing: mask lost marker positions instead of rejecting the file.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a reader found in a file or a program held, in SI units: the parts that a `Trajectory` is built of."""
+"""Content of a file or of a program's arrays, in SI units: the parts that a `Trajectory` is built of."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ MISSING = "missing_readings"  # among the settings: how many tensions, motor ang
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a recording comes from.
+    """Origin of a recording.
 
     Attributes:
-        name: of the recording, in reports.
-        robot: name of the robot description; empty where the file does not say.
-        format: of the file, as in an experiment's [data].
+        name: name of the recording in reports.
+        robot: name of the robot description; empty if the file does not state it.
+        format: format of the file, as in an experiment's [data].
         synthetic: whether a simulator made it.
-        provenance: the file, or how it was made, in words.
-        frame: of the positions, in words.
-        settings: facts about the recording that a model may need (JSON); of motor angles with a ``motor_angle_hold``
-            [s] among them only new readings are to be used (`held_readings`).
+        provenance: file or creation of the recording, in words.
+        frame: frame of the positions, in words.
+        settings: facts about the recording that a model may need (JSON); with a ``motor_angle_hold`` [s], only new
+            motor angles are used (`held_readings`).
     """
 
     name: str
@@ -53,12 +53,12 @@ class SentCommands:
     """Commands as they were sent, cumulative, pull > 0, each in force until the next.
 
     Attributes:
-        command_time: from when each is in force [s], on the clock of the observations.
+        command_time: start time of each command [s], on the clock of the observations.
         command: values, unclipped.
         command_unit: "m" of cable or "rad" of a motor.
-        cable_names: of the channels.
-        initial_command: in force before the first; zero by default.
-        largest: that is to be believed, in their unit, where it is more than most drives do; None for what these do.
+        cable_names: names of the channels.
+        initial_command: command before the first; zero by default.
+        largest: largest plausible command, in their unit; None for the default limits.
     """
 
     command_time: Float[np.ndarray, " command_time"]
@@ -76,18 +76,18 @@ class SentCommands:
 
 @dataclass(frozen=True)
 class Measured:
-    """What was observed; tensions, motor angles and poses that are not a number are missing.
+    """Observations; NaN marks missing tensions, motor angles and poses.
 
     Attributes:
-        time: of the observations [s]; the first one becomes 0.
-        position: of the markers in the robot's base frame [m].
+        time: times of the observations [s]; the first becomes 0.
+        position: positions of the markers in the robot's base frame [m].
         marker_names: base to tip.
-        position_mask: False where a position is a recording fault; all True by default.
-        tension: of the cables [N].
-        motor_angle: [rad].
+        position_mask: False for a recording fault; all True by default.
+        tension: cable tensions [N].
+        motor_angle: motor angles [rad].
         object_pose: centre [m] and unit quaternion x, y, z, w of a pushed body.
-        orientation: of sections, unit quaternions x, y, z, w from the base's axes to the section's.
-        section_names: of these sections.
+        orientation: orientations of sections, unit quaternions x, y, z, w from the base's axes to the section's.
+        section_names: names of these sections.
     """
 
     time: Float[np.ndarray, " time"]

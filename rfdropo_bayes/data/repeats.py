@@ -44,7 +44,7 @@ def _span(trajectory: Trajectory) -> float:
 
 
 def _of_one_rate(one: float, other: float) -> bool:
-    """Whether two times are equal but for the jitter of clocks; no time is that of a single command."""
+    """Whether two times are equal but for the jitter of clocks; a zero time means a single command."""
     return one == other or (min(one, other) > 0.0 and max(one, other) < ONE_RATE * min(one, other))
 
 
@@ -69,7 +69,8 @@ def command_openings(trajectory: Trajectory) -> dict[str, str]:
 
 def same_opening(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
     """Whether two recordings have the same commands at the same speed, as far as both can be compared
-    (`command_openings`); what earlier versions kept says nothing of the speed."""
+    (`command_openings`); keys without a speed are compared without it.
+    """
     shared = set(one) & set(other)
     if not shared:
         return False
@@ -115,7 +116,7 @@ def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
 
 
 def _in_rows_alike(repeats: Sequence[Trajectory]) -> list[list[Trajectory]]:
-    """Repeats, divided where rows follow one another faster than in others."""
+    """Repeats, grouped by the time between rows."""
     groups: list[list[Trajectory]] = []
     for repeat in repeats:
         own = sample_time(repeat.time)

@@ -1,13 +1,13 @@
 """Bags of ROS 1 (``.bag``) and ROS 2 (folders, ``.db3``, ``.mcap``), read by the package rosbags without ROS.
 
 A column is named as ``rqt_plot`` names it: the topic, a full stop, and the path within the message, such as
-``/mocap/tip.pose.position.x`` or ``/commands.data[0]``. Elements of a list are named by what the message calls them,
-and numbered where it calls them nothing: ``/joint_states.position[motor1]``,
-``/tf.transforms[tip].transform.translation.x``, ``/rigid_bodies.rigidbodies[tip].pose.position.x``. So every message of
-numbers is read, also one that only the bag itself defines.
+``/mocap/tip.pose.position.x`` or ``/commands.data[0]``. Elements of a list are named by the message, and numbered if it
+has no names: ``/joint_states.position[motor1]``, ``/tf.transforms[tip].transform.translation.x``,
+``/rigid_bodies.rigidbodies[tip].pose.position.x``. Every message of numbers is read, even if only the bag defines its
+type.
 
-Times are header stamps where a topic has them, else the times at which the recorder received the messages; or these for
-all topics. Elements with a header of their own, as transforms, have its stamps.
+Times are header stamps if a topic has them, else the recorder's times of arrival; or the recorder's times for all
+topics. Elements with a header of their own, as transforms, have its stamps.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Reading(NamedTuple):
 
 
 def bag_file(path: Path) -> Path:
-    """What to open: a folder with its metadata, or the one file of a folder whose recorder wrote none.
+    """Path to open: a folder with metadata, or the single file of a folder without metadata.
 
     Raises:
         InputError: no file or several.
@@ -74,9 +74,9 @@ def read_streams(path: Path, topics: Collection[str] | None = None, clock: Clock
     """All numbers of a bag, in streams of equal times.
 
     Args:
-        path: of the bag.
-        topics: to read; all by default, those of unknown messages left out.
-        clock: "header" for stamps where there are any, "log" for the recorder's times.
+        path: path of the bag.
+        topics: topics to read; by default all with known messages.
+        clock: "header" for stamps if there are any, "log" for the recorder's times.
 
     Raises:
         InputError: rosbags is not installed, a bag that is damaged, or a topic that it does not have or define.
@@ -108,7 +108,7 @@ def read_streams(path: Path, topics: Collection[str] | None = None, clock: Clock
 
 
 def read_observations(path: Path, columns: CsvColumns) -> CsvTable:
-    """What was measured, at the times of the first marker.
+    """Observations at the times of the first marker.
 
     Raises:
         InputError: see `read_streams`; a column that is not there; positions in several coordinate frames.
@@ -121,7 +121,7 @@ def read_observations(path: Path, columns: CsvColumns) -> CsvTable:
 
 
 def read_commands(path: Path, columns: CsvColumns) -> CsvTable:
-    """What was commanded, and when.
+    """Commands and their times.
 
     Raises:
         InputError: see `read_streams`; a column that is not there or holds nothing.
@@ -136,7 +136,7 @@ def _topics(names: Sequence[str]) -> set[str]:
 
 
 def clock_of(columns: CsvColumns) -> Clock:
-    """The clock of a bag, which is the name of its column of times [s]; header stamps where rows are numbered.
+    """The clock of a bag, which is the name of its column of times [s]; header stamps if rows are numbered.
 
     Raises:
         InputError: a bag has no such clock.
@@ -148,7 +148,7 @@ def clock_of(columns: CsvColumns) -> Clock:
     raise InputError(
         f"time = {columns.time!r} is no clock of a bag",
         where="[data.columns]",
-        remedy='write "header", for header stamps where there are any, or "log", for the recorder\'s times',
+        remedy='write "header", for header stamps if there are any, or "log", for the recorder\'s times',
     )
 
 
@@ -163,7 +163,9 @@ def _streams(reader: AnyReader, path: Path, topics: Collection[str] | None, cloc
             raise InputError(
                 f"does not define the message {there[topic]} of {topic}",
                 where=str(path),
-                remedy="convert it to MCAP where the message is installed (`ros2 bag convert`): MCAP holds definitions",
+                remedy=(
+                    "convert it to MCAP on a machine with the message type (`ros2 bag convert`): MCAP holds definitions"
+                ),
             )
     wanted = [
         connection
@@ -186,12 +188,12 @@ def _stream(name: str, readings: list[tuple[float, float, str, dict[str, float]]
 
 
 def _stamp(header: Any) -> float:
-    """The stamp of a header [s]; zero where there is none, or none was set."""
+    """The stamp of a header [s]; zero if there is none or it was not set."""
     return 0.0 if header is None else header.stamp.sec + NANOSECOND * header.stamp.nanosec
 
 
 def _readings(message: Any, topic: str) -> Iterator[_Reading]:
-    """The numbers of a message, those of elements with a header of their own apart."""
+    """The numbers of a message, with separate readings for elements that have their own header."""
     values: dict[str, float] = {}
     apart: list[tuple[str, Any]] = []
     _gather(message, f"{topic}.", values, apart)
@@ -238,6 +240,6 @@ def _gather_list(
 
 
 def _element_name(element: Any) -> str:
-    """What a message calls an element of a list; empty where it calls it nothing."""
+    """Name of an element of a list in a message; empty without a name."""
     fields = (getattr(element, key, "") for key in ELEMENT_NAMES)
     return next((str(field) for field in fields if field != "" and isinstance(field, str | int)), "")

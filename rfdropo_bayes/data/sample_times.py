@@ -1,7 +1,7 @@
-"""Clocks of recordings: stamps of any kind as seconds from the first one, and what is wrong with them.
+"""Clocks of recordings: stamps of any kind as seconds from the first stamp, and checks of them.
 
-Stamps are numbers in a unit, or dates and durations as NumPy, pandas, PyArrow or ISO 8601 write them. Those that count
-in whole numbers are subtracted as such: nanoseconds since 1970 have more digits than a float holds.
+Stamps are numbers in a unit, or dates and durations as NumPy, pandas, PyArrow or ISO 8601 write them. Integer stamps
+are subtracted as integers: nanoseconds since 1970 have more digits than a float holds.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ _NANOSECONDS = 1e9
 _DECIMAL_COMMA = r"(?<=:\d\d),(?=\d)"  # of seconds, as loggers of Python write them
 
 SHORT = 0.1  # share of the local interval below which a row came in one delivery with the row before
-BUNCHED = 0.1  # share of such rows from which on stamps are those of deliveries
+BUNCHED = 0.1  # share of such rows above which stamps are of arrival
 LONGEST_WINDOW, SHORTEST_WINDOW = 100, 8  # rows that a local interval is a mean of: several deliveries
-JUMP = 10.0  # intervals: a longer one is a jump of the clock, or lost rows
+JUMP = 10.0  # intervals: a longer interval is a jump of the clock, or lost rows
 COARSE = 0.1  # share of repeated stamps from which on the clock is coarser than the rows
-ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
+ONE_RATE = 1.1  # times between rows that differ by less are of the same rate: clocks jitter
 GRAIN = 0.02  # of the usual interval: stamps of single precision that are coarser are said
-ON_GRID = 0.2  # of the grain: stamps are as near to single precision where text has rounded them
-SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: what follows a moving robot lies between
+ON_GRID = 0.2  # of the grain: largest distance of rounded stamps from single precision
+SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: range of recordings of a moving robot
 SET_BACK = 0.01  # share of rows out of order up to which the clock was set back; else rows are not sorted
 
 
 class Stamps(NamedTuple):
-    """Times as they stand: ``ticks``, in whole numbers where they are, of which a second has ``per_second``."""
+    """Times in the file's unit: ``ticks``, integers if possible, with ``per_second`` ticks per second."""
 
     ticks: np.ndarray
     per_second: float
     dated: bool
 
     def since(self, origin: Stamps, where: str) -> Float[np.ndarray, " rows"]:
-        """Seconds from the first stamp of ``origin``; InputError where one is dates and the other numbers."""
+        """Seconds from the first stamp of ``origin``; InputError if dates meet numbers."""
         if self.dated != origin.dated:
             raise InputError(
                 "some times are dates and others numbers", where=where, remedy="give all on one clock, in one form"
@@ -59,10 +59,10 @@ def read_stamps(values: Any, unit: str = "s", *, where: str, column: str = "time
     Args:
         values: numbers in ``unit``, dates, durations or text of these; dates and durations have no unit.
         unit: a key of `PER_SECOND`.
-        where: the recording; column: what its times are called.
+        where: the recording; column: name of its times.
 
     Raises:
-        InputError: no stamps, one that is missing, or one that is neither a number nor a date.
+        InputError: no stamps, a missing stamp, or a stamp that is neither a number nor a date.
     """
     if np.ndim(values) != 1 or len(values) == 0:
         raise InputError(f"{column} has the shape {np.shape(values)}", where=where, remedy="give one time per row")
@@ -92,7 +92,7 @@ def dated(cells: pd.Series) -> bool:
 
 
 def numbers_of(cells: pd.Series) -> pd.Series:
-    """Numbers of a column, whole ones as such; NaN where a cell is missing or is none."""
+    """Numbers of a column, integers as such; NaN for cells that are missing or not numeric."""
     if not pd.api.types.is_numeric_dtype(cells.dtype):
         cells = cells.astype(object)  # text of PyArrow has a NaN that counts as present
     numbers = pd.to_numeric(cells, errors="coerce")
@@ -132,11 +132,11 @@ def _of_text(cells: pd.Series, unit: str, where: str, column: str) -> Stamps:
 
 
 def check_times(time: Float[np.ndarray, " rows"], where: str, key: str = "time") -> None:
-    """Raise an InputError that names the first row whose time is not finite, or not later than that of the row before.
+    """Raise an InputError that names the first row whose time is not finite, or not later than its predecessor.
 
     Args:
-        time: of the rows [s].
-        where: the recording; key: what its times are called.
+        time: times of the rows [s].
+        where: the recording; key: name of its times.
     """
     if np.ndim(time) != 1:
         raise InputError(f"{key} has the shape {np.shape(time)}", where=where, remedy="give one time per row")
@@ -155,8 +155,8 @@ def check_times(time: Float[np.ndarray, " rows"], where: str, key: str = "time")
     elif 0 < back.sum() <= max(1.0, SET_BACK * len(gaps)):
         row = int(np.argmax(back)) + 1
         remedy = (
-            f"the clock was set back by {-gaps[row - 1]:.4g} s before row {row}: split the file there, or give "
-            f"sample_time where rows are evenly spaced; else {remedy}"
+            f"the clock was set back by {-gaps[row - 1]:.4g} s before row {row}: split the file there, or "
+            f"give sample_time if rows are evenly spaced; else {remedy}"
         )
     raise InputError(
         f"{key} does not increase ({stuck.size} times)", where=f"{where}, row {int(stuck[0]) + 1}", remedy=remedy
@@ -164,7 +164,7 @@ def check_times(time: Float[np.ndarray, " rows"], where: str, key: str = "time")
 
 
 def _of_groups(time: np.ndarray, gaps: np.ndarray) -> float:
-    """Time from row to row [s] where several share a stamp, between the first rows of the first and last group."""
+    """Time from row to row [s] of rows that share stamps, from the first rows of the first and last group."""
     starts = np.flatnonzero(gaps > 0.0) + 1
     return float(time[starts[-1]] - time[0]) / float(starts[-1]) if len(starts) else 0.0
 
@@ -180,7 +180,7 @@ def _window(time: np.ndarray) -> int:
 
 
 def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
-    """Rows that came in one delivery with the row before, if so many did that stamps are those of deliveries."""
+    """Rows that came in one delivery with the row before, if enough rows did to show that stamps are of arrival."""
     usual, window = pace(time), _window(time)
     gaps = np.minimum(np.diff(time), window * usual)  # one gap of hours makes no others short
     means = np.convolve(gaps, np.ones(window) / window, "valid")
@@ -190,13 +190,13 @@ def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
 
 
 def evened(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-    """Times from which rates can be taken [s]: evenly spaced where stamps are those of deliveries, else the stamps."""
+    """Times from which rates can be taken [s]: evenly spaced if stamps are of arrival, else the stamps."""
     short = short_intervals(time)
     return time if not len(short) else time[0] + _between(time, short) * np.arange(len(time))
 
 
 def sample_time(*times: Float[np.ndarray, " rows"]) -> float:
-    """Median time from row to row [s] of one or more recordings, evenly spaced where stamps are those of deliveries."""
+    """Median time from row to row [s] of one or more recordings, evenly spaced if stamps are of arrival."""
     return float(np.median(np.concatenate([np.diff(evened(time)) for time in times])))
 
 
@@ -230,27 +230,28 @@ def rounded_notes(stamps: Stamps, time: Float[np.ndarray, " rows"]) -> list[str]
 
 
 def clock_notes(time: Float[np.ndarray, " rows"]) -> list[str]:
-    """What is allowed of times that increase [s], and perhaps not meant: by row, and with what to do."""
+    """Notes on valid but suspicious times [s], by row, each with a remedy."""
     gaps, usual, notes = np.diff(time), pace(time), []
     short = short_intervals(time)
     if len(short):
         notes.append(
-            f"{len(short)} of {len(time)} rows, first row {short[0]}, have stamps that follow the row before at once, "
-            f"where one comes every {1e3 * usual:.4g} ms: stamps of arrival, not of measurement; for rows that were "
-            f"measured evenly give sample_time = {_between(time, short):.4g} in place of time"
+            f"{len(short)} of {len(time)} rows, first row {short[0]}, have stamps that follow the row "
+            f"before at once, although rows come every {1e3 * usual:.4g} ms: stamps of arrival, not of "
+            "measurement; for rows that were measured evenly give sample_time = "
+            f"{_between(time, short):.4g} in place of time"
         )
     if not SLOWEST >= usual >= FASTEST:
         notes.append(
-            f"rows are {usual:.4g} s apart, from row 0 on: where that is not so, correct time_unit under "
+            f"rows are {usual:.4g} s apart, from row 0 on: if this is wrong, correct time_unit under "
             f"[data.columns] ({', '.join(PER_SECOND)})"
         )
-    long = float(np.quantile(np.delete(gaps, short - 1), 0.95))  # between deliveries, where there are any
+    long = float(np.quantile(np.delete(gaps, short - 1), 0.95))  # between deliveries, if there are any
     jumps = np.flatnonzero(gaps > JUMP * max(usual, long)) + 1
     for row in jumps[:1]:
         more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
         notes.append(
-            f"the clock jumps by {gaps[row - 1]:.4g} s before row {row}, where rows come every {1e3 * usual:.4g} ms"
-            f"{more}: it is taken for time that passed; where the clock was set or rows are missing, read two pieces, "
-            f"rows = [0, {row - 1}] and rows = [{row}, {len(time) - 1}]"
+            f"the clock jumps by {gaps[row - 1]:.4g} s before row {row}, although rows come every "
+            f"{1e3 * usual:.4g} ms{more}: it is taken for time that passed; if the clock was set or rows "
+            f"are missing, read two pieces, rows = [0, {row - 1}] and rows = [{row}, {len(time) - 1}]"
         )
     return notes

@@ -28,7 +28,7 @@ _MILLIMETRE = 1e-3
 
 
 def read_sofa_csv(path: Path) -> Trajectory:
-    """One episode: 21 centre-line points p00 (base) ... p20 (tip), eight cables, and the cube where there is one.
+    """One episode: 21 centre-line points p00 (base) ... p20 (tip), eight cables, and the cube if there is one.
 
     Raises:
         InputError: on a damaged file (see ``CsvTable``), a wrong action, or an episode that was cut short.

@@ -35,7 +35,7 @@ class RecordingEntry(BaseModel):
 
     observations: str = Field(description="file, or several by wildcards; a folder for a ROS 2 bag or LeRobotDataset")
     commands: str | None = Field(
-        default=None, description='file of the commands, where they have one of their own; "none": zero commands'
+        default=None, description='file of the commands, if they have a separate file; "none": zero commands'
     )
     rows: tuple[int, int] | None = Field(
         default=None, description="keep observation rows first to last only, both included, counted from 0"
@@ -47,7 +47,7 @@ class RecordingEntry(BaseModel):
 
 
 class DataSpec(BaseModel):
-    """The [data] table: where the recordings are and how to read them."""
+    """The [data] table: files and format of the recordings."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -56,8 +56,8 @@ class DataSpec(BaseModel):
     test: list[RecordingEntry] = Field([], description="recordings that no fit sees")
     columns: CsvColumns | None = Field(
         default=None,
-        description="what the columns are, for formats that have them in any order: csv, motive-csv, rosbag, lerobot, "
-        "mat, npz",
+        description="meaning of the columns, for formats with any order of columns: csv, motive-csv, rosbag, "
+        "lerobot, mat, npz",
     )
     resample: float | None = Field(
         default=None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"
@@ -68,14 +68,14 @@ class DataSpec(BaseModel):
     initial_command: InitialCommand = Field(
         default=None,
         description='command before the first row of a file: "first" (its first command was in force already), "zero", '
-        "or one value per channel [m or rad]; where the file does not say, recognised from the first rows by default",
+        "or one value per channel [m or rad]; recognised from the first rows by default if the file does not state it",
     )
     lead_in: float = Field(
         default=2.0,
         ge=0,
-        description="for so long [s] before the first of rows commands are simulated, too: a piece that starts in "
-        "motion is then in motion; with 0 it starts at rest under the command in force, as every piece does in which "
-        "an object was tracked, since that starts where the first of rows shows it",
+        description="time [s] before the first row during which commands are also simulated, so that a piece may "
+        "start in motion; with 0 it starts at rest under the command in force, as does every piece with "
+        "a tracked object, whose pose starts at the first row",
     )
 
     @field_validator("fit", "test", mode="before")
@@ -123,7 +123,7 @@ class _Source(NamedTuple):
 
     @property
     def recording(self) -> tuple[Path, int | None]:
-        """What was recorded, whichever rows of it are meant."""
+        """Identity of the recording, regardless of rows."""
         return self.observations.resolve(), self.episode
 
 
@@ -132,11 +132,12 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
 
     Args:
         spec: the [data] table.
-        base: folder that paths are relative to, where the folder that RFDROPO_DATA names does not have them.
+        base: folder that paths are relative to, if the folder named by RFDROPO_DATA does not have them.
         role: "fit" or "test".
 
     Raises:
-        InputError: if a file is missing or bad, a glob matches nothing, or a test recording shares rows with a fit one.
+        InputError: if a file is missing or bad, a glob matches nothing, or a test recording shares rows with a fit
+            recording.
     """
     fit, test = list(_sources(spec, spec.fit, base)), list(_sources(spec, spec.test, base))
     sources = fit if role == "fit" else test
@@ -156,11 +157,11 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
 
 
 def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Path:
-    """A file beside the recordings, e.g. a mesh, looked for as they are: in RFDROPO_DATA if set, then in ``base``.
+    """A file beside the recordings, e.g. a mesh, found in RFDROPO_DATA if set, else in ``base``.
 
     Args:
-        name: of the file; a pattern that one file alone matches will do.
-        base: folder that it is relative to.
+        name: of the file; a pattern may match a single file.
+        base: folder of relative names.
         folders: whether a folder may stand for the files in it.
 
     Raises:
@@ -172,7 +173,7 @@ def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Pa
             f"matches {len(found)} files ({', '.join(file.name for file in found[:3])}{', ...' if found[3:] else ''}) "
             "where one is meant",
             where=str(name),
-            remedy="name the file; where every recording has commands of its own, give an entry for each recording",
+            remedy="name the file; if every recording has its own commands, give an entry for each recording",
         )
     return found[0]
 
@@ -189,7 +190,7 @@ def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Itera
 
 
 def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | list[None]:
-    """The episodes of a file that an entry means; None where it is a single recording."""
+    """The episodes of a file in an entry; None if the file is a single recording."""
     if spec.format == lerobot.FORMAT:
         return lerobot.episode_numbers(path) if entry.episodes is None else entry.episodes
     if entry.episodes is not None:
@@ -212,8 +213,8 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
             raise InputError(
                 "has no commands",
                 where=str(source.observations),
-                remedy="give {observations = ..., commands = ...}, or --commands FILE; "
-                "commands = 'none' where nothing was commanded",
+                remedy="give {observations = ..., commands = ...}, or --commands FILE; commands = 'none' if "
+                "nothing was commanded",
             )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
     if spec.columns is not None:
@@ -255,7 +256,7 @@ def _distinct_names(recordings: list[Trajectory], sources: list[_Source], listed
 
 
 def _folders(path: Path, others: Iterable[Path]) -> str:
-    """The folders that a file is in, as many from the last one on as tell it from the other files."""
+    """The shortest trailing part of a file's folders that differs from the other files."""
     parts = path.parent.parts
     apart = (count for count in range(1, len(parts)) if all(o.parent.parts[-count:] != parts[-count:] for o in others))
     return "/".join(parts[-next(apart, len(parts)) :])

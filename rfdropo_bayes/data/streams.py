@@ -1,7 +1,7 @@
 """Readings that each come at times of their own, such as the topics of a bag, brought to one table.
 
 Observations get the times of the first marker's stream. Readings of the other streams are interpolated linearly between
-two that are no further apart than one and a half rows; a lone reading goes to the row nearest to it; what is left is
+two that are no further apart than one and a half rows; a lone reading goes to the row nearest to it; other cells are
 missing. Nothing is held or extrapolated.
 
 Commands are events and keep their times: there is a row whenever any channel is given a command, and the other channels
@@ -23,16 +23,16 @@ from rfdropo_bayes.data.recorded import continuous_quaternions
 from rfdropo_bayes.errors import InputError
 
 ADJACENT = 1.5
-"""Readings so many rows apart at most are neighbours; two rows apart, one between them was lost."""
+"""Largest gap between neighbouring readings, in rows; a gap of two rows means a lost reading."""
 
 
 class Stream(NamedTuple):
     """Readings that share their times.
 
     Attributes:
-        name: of the topic, and of the element within its messages where elements have times of their own.
-        time: [s], increasing.
-        values: a column for each quantity, by its full name; not a number where a message has none.
+        name: name of the topic, and of the element if elements have their own times.
+        time: increasing times [s].
+        values: a column for each quantity, by its full name; NaN if a message has none.
         frames: coordinate frames that the messages name.
     """
 
@@ -43,28 +43,28 @@ class Stream(NamedTuple):
 
 
 def in_order(name: str, time: Float[np.ndarray, " reading"], values: pd.DataFrame, frames: frozenset[str]) -> Stream:
-    """A stream of readings sorted by time; of several at one time the last one counts."""
+    """A stream of readings sorted by time; the last of several readings at one time counts."""
     order = np.argsort(time, kind="stable")
     kept = order[np.append(np.diff(time[order]) > 0.0, True)]
     if len(kept) < len(time):
-        said = "%s: %d of %d readings have the time of another one and are left out"
+        said = "%s: %d of %d readings have the time of another reading and are left out"
         logging.getLogger(__name__).warning(said, name, len(time) - len(kept), len(time))
     return Stream(name, time[kept], values.iloc[kept].reset_index(drop=True), frames)
 
 
 def side_by_side(streams: Sequence[Stream]) -> pd.DataFrame:
-    """All columns, as long as the longest: what there is, without regard to times."""
+    """All columns, as long as the longest: all readings, without regard to times."""
     return pd.concat([stream.values for stream in streams], axis=1) if streams else pd.DataFrame()
 
 
 def observed(
     streams: Sequence[Stream], clock: str, names: Sequence[str], pose: Sequence[str] | None, where: str
 ) -> pd.DataFrame:
-    """Columns ``names`` at the times of the first one, which are the column ``clock``.
+    """Columns ``names`` at the times of the first column, stored in the column ``clock``.
 
     Args:
-        streams: that have these columns.
-        clock: name of the column of times [s].
+        streams: streams with these columns.
+        clock: name of the new column of times [s].
         names: columns that are interpolated one by one.
         pose: columns of a position and a unit quaternion x, y, z, w, which are interpolated together.
         where: the file, for messages.
@@ -106,7 +106,7 @@ def commanded(streams: Sequence[Stream], clock: str, names: Sequence[str], where
 
 
 def one_frame(streams: Sequence[Stream], names: Sequence[str], where: str) -> None:
-    """Raise an InputError where positions are told in several coordinate frames."""
+    """Raise an InputError if positions are given in several coordinate frames."""
     frames = {frame for name in names for stream in streams if name in stream.values for frame in stream.frames}
     if len(frames) > 1:
         raise InputError(
@@ -131,7 +131,7 @@ def _owners(streams: Sequence[Stream], names: Sequence[str], where: str) -> dict
 def _at_rows(
     rows: Float[np.ndarray, " row"], time: Float[np.ndarray, " reading"], value: pd.Series | np.ndarray
 ) -> Float[np.ndarray, " row"]:
-    """A quantity at the times of rows; not a number where no reading is near."""
+    """A quantity at the times of rows; NaN if no reading is near."""
     value = np.asarray(value, dtype=float)
     time, value = time[np.isfinite(value)], value[np.isfinite(value)]
     found = np.full(len(rows), np.nan)

@@ -12,8 +12,9 @@ MANY = 20_000
 LOOKED_AT = 50_000
 """Rows that show which rate a motion needs."""
 LIKE_NOISE, CLOSE = 1.6, 5e-3
-"""What lies between two rows is told if its error is at most so many times the error between every second row, or this
-share of the spread of the markers."""
+"""Limits of the interpolation error between rows: a multiple of the error between every second row, and a share of the
+spread of the markers.
+"""
 UNRESOLVED = 0.2
 """Share of the spread by which every second row is missed in a motion that needs every row."""
 SLOWEST = 0.1
@@ -31,7 +32,7 @@ def needed_interval(run: Trajectory) -> float:
     spread = float(np.sqrt(np.mean([place.var(axis=0).sum() for _, place in seen])))
 
     def error(every: int) -> float:
-        """Root mean square distance from a straight line between every so many rows."""
+        """Root mean square distance from a straight line between every n-th row."""
         squares = []
         for own, place in seen:
             inside = slice(0, (len(own) - 1) // every * every + 1)
@@ -59,7 +60,7 @@ def looked_at(run: Trajectory) -> Trajectory:
 
 
 def thinning_note(run: Trajectory) -> str | None:
-    """What to write for a recording of more rows than its motion needs; None for others."""
+    """Advice for a recording with more rows than its motion needs; None for others."""
     if len(run.time) <= MANY:
         return None
     needed, step = needed_interval(run), sample_time(run.time)

@@ -1,4 +1,4 @@
-"""The one type of measured or simulated motion that the rest of the program sees."""
+"""The type of all measured or simulated motion in the program."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ _OPTIONAL = ("tension", "tension_mask", "motor_angle", "motor_angle_mask", "obje
 
 @dataclass(frozen=True, repr=False)
 class Trajectory:
-    """One recording: what was commanded, what was observed, and when.
+    """One recording: commands, observations and their times.
 
     ``dataset`` holds, in SI units and in the robot's base frame (x, y across, z along the axis, away from the base):
 
-    - ``position(time, marker, axis)`` [m] and ``position_mask(time, marker)``: False where the position is a
-      recording fault; the value there is a finite placeholder that no likelihood may use;
+    - ``position(time, marker, axis)`` [m] and ``position_mask(time, marker)``: False for a recording fault; the value
+      there is a finite placeholder that no likelihood may use;
     - ``command(command_time, cable)``, unit in its attribute ("m" or "rad"): cumulative command, pull > 0, unclipped,
-      piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last one for ever;
-    - ``initial_command(cable)``: in force before ``command_time[0]``, hence the state the recording starts from;
-    - optionally ``tension(time, cable)`` [N] and its ``tension_mask``, False where one is missing;
-      ``motor_angle(time, cable)`` [rad] and its ``motor_angle_mask``, False where one is missing or an older reading is
-      repeated; ``object_pose(time, pose)`` (x y z [m], unit quaternion x y z w; not a number where it is missing);
-      ``orientation(time, section, quaternion)``, unit quaternions x y z w from the base's axes to those of a section.
+      piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last for ever;
+    - ``initial_command(cable)``: command before ``command_time[0]``, hence the initial state of the recording;
+    - optionally ``tension(time, cable)`` [N] and its ``tension_mask``, False for a missing tension; ``motor_angle(time,
+      cable)`` [rad] and its ``motor_angle_mask``, False for a missing or repeated reading; ``object_pose(time, pose)``
+      (x y z [m], unit quaternion x y z w; NaN if missing); ``orientation(time, section, quaternion)``, unit quaternions
+      x y z w from the base's axes to a section's axes.
 
     ``time`` is in seconds from the first observation row. ``command_time`` shares that clock.
 
@@ -82,23 +82,23 @@ class Trajectory:
         """A recording from arrays in any unit.
 
         Args:
-            initial_command: in force before the first one, in the unit of the others: "first" (that one was already),
-                "zero", or one value per channel; recognised from motor angles or the first rows by default, as in files
-                (`first_command`).
+            initial_command: command before the first command, in the same unit: "first" (the first command was already
+                in force), "zero", or one value per channel; recognised from motor angles or the first rows by default,
+                as in files (`first_command`).
             given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
                 marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
                 away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
-                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in
-                force until the next; ``markers`` and ``channels``, their names. These five are required.
-                ``command_time``: from when each command is in force, on the clock of ``time``; ``initial_command``, in
-                force before the first; ``largest_command`` that is to be believed, of drives of many turns.
-                ``tension`` (time, channel) [N], ``motor_angle`` (time, channel) [rad], ``object_pose`` (time, 7):
-                centre and unit quaternion x, y, z, w. ``orientation`` (time, section, 4), unit quaternions x, y, z, w,
-                and ``sections``, their names. ``name`` of the recording; ``robot`` that was recorded.
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in force
+                until the next; ``markers`` and ``channels``, their names. These five are required. ``command_time``:
+                start time of each command, on the clock of ``time``; ``largest_command``: largest plausible command of
+                drives of many turns. ``tension`` (time, channel) [N], ``motor_angle`` (time, channel) [rad],
+                ``object_pose`` (time, 7): centre and unit quaternion x, y, z, w. ``orientation`` (time, section, 4),
+                unit quaternions x, y, z, w, and ``sections``, their names. ``name`` of the recording; ``robot``: name
+                of the recorded robot.
 
         Raises:
-            InputError: an unknown or missing keyword, an unknown unit, what is not a number, shapes that do not fit,
-                times that do not increase, or lengths that cannot be in the unit that was given.
+            InputError: an unknown or missing keyword, an unknown unit, values that are not numbers, shapes that do not
+                fit, times that do not increase, or lengths that cannot be in the unit that was given.
         """
         see_keywords(given, in_memory.from_arrays, "Trajectory.from_arrays")
         recording = cls.build(*in_memory.from_arrays(**given))
@@ -121,13 +121,13 @@ class Trajectory:
 
         Args:
             frame: a table of pandas, Polars or PyArrow, one row per observation.
-            columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`. The index is a
+            columns: meaning of each column, as in an experiment file's [data.columns]; see `CsvColumns`. The index is a
                 column under its name, or "index".
-            name: of the recording.
-            mask_missing: leave out and count positions that are not a number; else they are an error.
+            name: name of the recording.
+            mask_missing: mask and count NaN positions; otherwise they are an error.
 
         Raises:
-            InputError: a column that is not there or is no number, or columns that do not fit together.
+            InputError: a missing or non-numeric column, or columns that do not fit together.
         """
         return begun_from(cls.build(*in_memory.from_pandas(frame, columns, name, mask_missing)), None)
 
@@ -136,9 +136,9 @@ class Trajectory:
         """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
 
         Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels
-        are named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing, and
-        "s" of ``time``, which may hold dates). Further variables are ``initial_command``, ``tension`` [N],
-        ``motor_angle`` [rad] and ``object_pose``; where they or ``command_time`` state units of their own, these count.
+        are named by their coordinates, units stand in the variables' attribute ``units`` ("m" if missing, and "s" of
+        ``time``, which may hold dates). Further variables are ``initial_command``, ``tension`` [N], ``motor_angle``
+        [rad] and ``object_pose``; their own units, and the unit of ``command_time``, count if stated.
 
         Raises:
             InputError: a variable, dimension or coordinate that is missing, or see `from_arrays`.
@@ -160,7 +160,7 @@ class Trajectory:
 
     @property
     def name(self) -> str:
-        """What the report calls this recording."""
+        """Name of this recording in reports."""
         return str(self.dataset.attrs["name"])
 
     @property
@@ -200,7 +200,7 @@ class Trajectory:
 
     @property
     def position_mask(self) -> Bool[np.ndarray, "time marker"]:
-        """True where the position may be used."""
+        """True for usable positions."""
         return self._array("position_mask")
 
     @property
@@ -215,7 +215,7 @@ class Trajectory:
 
     @property
     def motor_angle_mask(self) -> Bool[np.ndarray, "time cable"] | None:
-        """True where a motor angle is a new reading, if measured."""
+        """True for new readings of the motor angles; None if they were not measured."""
         return self._array("motor_angle_mask") if "motor_angle_mask" in self.dataset else None
 
     @property
@@ -235,7 +235,7 @@ class Trajectory:
 
     @property
     def tension_mask(self) -> Bool[np.ndarray, "time cable"] | None:
-        """True where a tension was measured; None where there are none."""
+        """True for measured tensions; None without tensions."""
         if "tension_mask" in self.dataset:
             return self._array("tension_mask")
         return np.ones(self.dataset["tension"].shape, dtype=bool) if "tension" in self.dataset else None
@@ -247,7 +247,7 @@ class Trajectory:
 
     @property
     def left_out(self) -> str:
-        """What is left out of this recording as faulty or missing, in words; empty if nothing is."""
+        """Masked parts of this recording, faulty or missing, in words; empty if nothing is."""
         faults = self.settings.get("faults", {})
         counts = {"held poses": "held", "jumps": "jump", "lost markers": "missing"}
         counts |= {"lost markers at zero": "zero", "positions under other markers' names": "renamed"}
@@ -256,7 +256,7 @@ class Trajectory:
 
     @property
     def notes(self) -> list[str]:
-        """What the importer saw that is allowed, and perhaps not meant: by row of the file, with what to do."""
+        """The importer's notes on valid but suspicious rows of the file, each with a remedy."""
         return list(self.settings.get(NOTES, ()))
 
     @property
@@ -321,8 +321,8 @@ class Trajectory:
     def slice_rows(self, first: int, last: int, lead_in: float = 0.0) -> Trajectory:
         """Observation rows ``first`` to ``last``, both included, with the clock set back to 0 at ``first``.
 
-        The commands kept begin before time[last], and at most ``lead_in`` seconds before time[first]: what drives and
-        body still do in the first row began earlier. ``initial_command`` becomes the one before these.
+        The commands kept begin before time[last], and at most ``lead_in`` seconds before time[first]: motion of drives
+        and body in the first row began earlier. ``initial_command`` becomes the last command before these.
 
         Raises:
             InputError: if there are no such rows.
@@ -357,11 +357,11 @@ class Trajectory:
     def resample(self, sample_time: float) -> Trajectory:
         """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).
 
-        Commands are events and stay as they are. A resampled value is masked if a row it draws on is masked.
-        Nothing is filtered: resampling to a coarser grid picks rows, and their noise stays independent.
+        Commands are events and are unchanged. A resampled value is masked if a row it draws on is masked. Nothing is
+        filtered: resampling to a coarser grid picks rows, and their noise stays independent.
 
         Raises:
-            InputError: if the sample time is not positive, longer than the recording, or far below that of its rows.
+            InputError: if the sample time is not positive, longer than the recording, or far below the recording's own.
         """
         duration = float(self.time[-1])
         if not (np.isfinite(sample_time) and 0.0 < sample_time <= duration):

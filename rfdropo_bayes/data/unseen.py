@@ -1,6 +1,6 @@
-"""Commands whose outcome is to be predicted, with at most the first row of what was measured.
+"""Commands whose outcome is to be predicted, with at most the first row of measurements.
 
-Whatever else a file holds is masked here, so that no prediction can have seen it.
+All other measurements are masked here, so that no prediction can have seen it.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ def load_unseen(
         spec: the [data] table of the experiment; its recordings are not read.
         base: folder that paths are relative to.
         commands: the file of commands.
-        start: the file of observations, where it is another; only one row of it counts.
-        rows: keep observation rows first to last, both included; the start pose is then that of row ``first``.
-        begun: how the fitted recordings begin, "zero" or "first" (`common_beginning`), where all begin alike: so do
-            these commands, unless [data] or the file says otherwise.
-        episode: number of the episode that is meant, where the file of observations is a LeRobotDataset.
+        start: the file of observations, if it is another file; only one row is used.
+        rows: keep observation rows first to last, both included; the start pose is then from row ``first``.
+        begun: how the fitted recordings begin, "zero" or "first" (`common_beginning`), if all begin by the same rule;
+            it then applies to these commands unless [data] or the file has another.
+        episode: number of the episode, if the file of observations is a LeRobotDataset.
 
     Raises:
-        InputError: a file that is missing or bad, a start where the format has it in the same file, or a dataset of
-            which no episode is named.
+        InputError: a file that is missing or bad, a start although the format has it in the same file, or a dataset
+            without an episode number.
     """
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
@@ -103,7 +103,7 @@ def _begun(whole: Trajectory, spec: DataSpec, begun: str | None) -> Trajectory:
         return whole.with_initial_command(angle, MEASURED)
     why = "assumed" if begun is None else "as in the fitted recordings"
     initial = 0.0 * whole.command[0] if begun == "zero" else whole.command[0]
-    beginning = {"rule": begun or "first", "why": f"{why}; set data.initial_command where it was another"}
+    beginning = {"rule": begun or "first", "why": f"{why}; set data.initial_command if it was another"}
     return whole.with_initial_command(initial, beginning)
 
 

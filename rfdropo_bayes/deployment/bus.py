@@ -1,4 +1,4 @@
-"""The CAN bus of a session: any interface of python-can, or our hub; every frame logged, sent ones too."""
+"""The CAN bus of a session: any interface of python-can, or our hub; every received and sent frame is logged."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class BusTable(BaseModel):
     Attributes:
         interface: "hub", or any interface of python-can ("socketcan" on a robot).
         channel: as the interface wants it; HOST:PORT or a path for the hub.
-        bitrate: [bit/s], where the interface sets it.
-        options: anything else that the interface takes.
+        bitrate: bit rate [bit/s], if the interface sets it.
+        options: further arguments of the interface.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -41,7 +41,7 @@ def open_bus(table: BusTable) -> can.BusABC:
     """Open the bus.
 
     Raises:
-        InputError: if it cannot be opened; says with what interface and why.
+        InputError: if it cannot be opened; names the interface and the reason.
     """
     if table.interface == "hub":
         return HubBus(table.channel, **table.options)
@@ -50,7 +50,7 @@ def open_bus(table: BusTable) -> can.BusABC:
         options["hop_limit"] = 0
     try:
         return can.Bus(interface=table.interface, channel=table.channel, **(options | table.options))
-    except Exception as error:  # each interface raises what its driver raises
+    except Exception as error:  # each interface passes on the exceptions of its driver
         raise InputError(
             f"cannot be opened ({type(error).__name__}: {error})",
             where=f"bus {table.interface} {table.channel}",
@@ -85,7 +85,7 @@ class FrameLog(can.Listener):
 
 
 class Reception(can.Listener):
-    """Keeps the first exception of the receiving thread, of any type: adapters raise what their driver raises.
+    """Keeps the first exception of the receiving thread, of any type: adapters pass on the exceptions of their drivers.
 
     python-can goes on receiving after it, so that the drives' status is seen while they brake.
     """
@@ -103,7 +103,7 @@ class Reception(can.Listener):
         time.sleep(_RETRY)
 
     def check(self) -> None:
-        """Tell of the exception, once: whoever hears of it stops the drives, and must not be kept from that.
+        """Raise the stored exception, once: the caller then stops the drives and must not be interrupted again.
 
         Raises:
             CanOperationError: if reception has failed.

@@ -1,4 +1,4 @@
-"""Why a session ends, and what is done about it."""
+"""Causes that end a session, and the reaction to each."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Cause(Enum):
 
     @property
     def reaction(self) -> Reaction:
-        """What is done."""
+        """Reaction of the drives to this cause."""
         return self.value[1]
 
 
 class Stop(Exception):
-    """Ends a session: a cause, and one line that says where it was seen."""
+    """Ends a session: a cause, and one line with the place of detection."""
 
     def __init__(self, cause: Cause, detail: str = "") -> None:
         self.cause, self.detail = cause, detail

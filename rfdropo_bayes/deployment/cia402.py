@@ -60,7 +60,7 @@ FAULT_RESET_BIT = 0x80
 
 
 class Transition(NamedTuple):
-    """One row of the table: its number in the standard, where from, where to."""
+    """One row of the table: its number in the standard, source state, target state."""
 
     number: int
     start: DriveState
@@ -139,11 +139,11 @@ def command_of(controlword: int) -> Controlword | None:
 
 
 def obey(state: DriveState, controlword: int, previous: int) -> int | None:
-    """Number of the transition that a controlword causes in a drive; None where it changes nothing.
+    """Number of the transition that a controlword causes in a drive; None if it changes nothing.
 
     Args:
-        state: of the drive.
-        controlword, previous: the word now and the one before: a fault is reset by the rising edge of bit 7 alone.
+        state: state of the drive.
+        controlword, previous: the present and the previous word: a fault is reset by the rising edge of bit 7 alone.
     """
     if state is DriveState.FAULT:
         rising = controlword & FAULT_RESET_BIT and not previous & FAULT_RESET_BIT
@@ -177,7 +177,7 @@ def controlword_towards(state: DriveState, target: DriveState, previous: int) ->
     Args:
         state: that the drive reports.
         target: SWITCH_ON_DISABLED, READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED or QUICK_STOP_ACTIVE.
-        previous: controlword sent last; after one with the fault reset bit the next leaves it out, so that it can rise.
+        previous: controlword sent last; the fault reset bit is cleared after each use, so that it can rise again.
 
     Raises:
         ValueError: if no command leads to ``target``.
@@ -193,7 +193,7 @@ def controlword_towards(state: DriveState, target: DriveState, previous: int) ->
     if target is DriveState.QUICK_STOP_ACTIVE:
         return int(
             Controlword.QUICK_STOP
-        )  # from lower states it leads to SWITCH ON DISABLED, where nothing moves either
+        )  # from lower states it leads to SWITCH ON DISABLED, in which nothing moves either
     if state is DriveState.QUICK_STOP_ACTIVE or target is DriveState.SWITCH_ON_DISABLED:
         return int(Controlword.DISABLE_VOLTAGE)
     if _RANK[state] < _RANK[target]:

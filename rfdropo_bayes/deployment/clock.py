@@ -1,4 +1,4 @@
-"""The clock of the control loop: absolute deadlines, real-time scheduling where permitted, and its lateness."""
+"""The clock of the control loop: absolute deadlines, real-time scheduling if permitted, and its lateness."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ class Tick(NamedTuple):
 
 
 class CycleClock:
-    """Beats at ``start + number x period``. A late beat shifts no later one; beats that have passed are left out."""
+    """Cycles start at ``start + number x period``. A late cycle does not shift its successors; missed cycles are
+    skipped.
+    """
 
     def __init__(self, period: float) -> None:
         self.period = period
@@ -57,15 +59,15 @@ class CycleClock:
 
 @contextlib.contextmanager
 def real_time(priority: int = PRIORITY, threads: Iterable[int] = (0,)) -> Iterator[bool]:
-    """Give threads real-time priority (SCHED_FIFO) for a while; yields False where the system does not permit it.
+    """Give threads real-time priority (SCHED_FIFO) for a while; yields False if the system refuses.
 
-    The block must sleep between its beats. It must not wait for the end of a process: Linux then clears that process
-    out of /proc, in a loop without sleep, until threads of it have done their share. Where these have a lower priority
-    on the same processor, they never run, and the loop never ends. For the same reason the block gives the priority
-    back: a thread must not end with it.
+    The block must sleep between its cycles. It must not wait for the end of a process: Linux then clears that process
+    out of /proc, in a loop without sleep, until threads of it have done their share. If these threads have a lower
+    priority on the same processor, they never run, and the loop never ends. For the same reason the block gives the
+    priority back: a thread must not end with it.
 
     Args:
-        priority: of the threads; the higher one runs first.
+        priority: SCHED_FIFO priority; a higher number runs first.
         threads: their numbers in the system; 0 is the calling one.
     """
     before = []
@@ -83,7 +85,7 @@ def real_time(priority: int = PRIORITY, threads: Iterable[int] = (0,)) -> Iterat
 
 
 def lock_memory(locked: bool) -> bool:
-    """Keep the pages that this process has touched in memory, or let them go; False where that is not permitted.
+    """Keep the pages that this process has touched in memory, or let them go; False if the system refuses.
 
     A page that the system has taken back is read from the disk again, which takes milliseconds.
     """
@@ -126,7 +128,7 @@ class Jitter(NamedTuple):
 
 
 def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:
-    """Run an idle loop, in a thread of its own so that this one keeps its priority."""
+    """Run an idle loop, in a thread of its own so that the calling thread keeps its priority."""
     found: list[Jitter] = []
 
     def loop() -> None:

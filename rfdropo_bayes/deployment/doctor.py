@@ -1,4 +1,4 @@
-"""What stands in the way of a session on this machine: versions, scheduling, jitter of the clock, bus, drives."""
+"""Checks whether this machine can run a session: versions, scheduling, jitter of the clock, bus, drives."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
 
     Args:
         bus: to look for drives on; None leaves that out.
-        rate_hz: of the loop whose jitter is measured.
-        seconds: of each idle run.
-        idle_runs: how many.
+        rate_hz: rate of the loop whose jitter is measured.
+        seconds: length of each idle run.
+        idle_runs: number of idle runs.
 
     Returns:
-        Versions, processors and load, the median of the idle runs' lateness [s], and the drives found; what is wrong
-        stands under "problems".
+        Versions, processors and load, the median of the idle runs' lateness [s], and the drives found; "problems" lists
+        everything that is wrong.
     """
     problems: list[str] = []
     versions = {name: _version(name) for name in PACKAGES}
@@ -80,7 +80,7 @@ def scan(bus: BusTable, patience: float = 0.5) -> dict[str, dict[str, int]]:
     """Ask every node number for its type and identity.
 
     Returns:
-        By node number: device type, and what object 0x1018 says.
+        Device type and identity (object 0x1018), by node number.
 
     Raises:
         InputError: if the bus cannot be opened or fails.
@@ -99,7 +99,7 @@ def scan(bus: BusTable, patience: float = 0.5) -> dict[str, dict[str, int]]:
             network.subscribe(0x580 + node, take)
         for node in range(1, 128):
             _ask(network, node, objects.Object.DEVICE_TYPE, 0)
-            time.sleep(0.002)  # a bus of 125 kbit/s carries so many
+            time.sleep(0.002)  # a bus of 125 kbit/s carries this rate
         time.sleep(patience)
         nodes = sorted(node for node, index, _ in answers if index == objects.Object.DEVICE_TYPE)
         for node in nodes:

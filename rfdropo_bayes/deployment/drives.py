@@ -1,7 +1,7 @@
 """The drives of a robot, seen from the master: set-up by SDO with read-back, one exchange of process data a cycle.
 
 canopen carries the object dictionary and the SDOs. Process data, SYNC, heartbeats and emergencies are handled here, in
-the thread of the control loop, because each needs a time and a defined end where canopen's own threads have neither.
+the thread of the control loop, because each needs a deadline, which canopen's own threads do not have.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Emergency(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What a drive's last TPDO said: statusword, position [counts], torque [per mille], when it came [s, monotonic]."""
+    """Content of a drive's last TPDO: statusword, position [counts], torque [per mille], arrival [s, monotonic]."""
 
     statusword: int
     position: int
@@ -76,12 +76,12 @@ class Drive:
     """One axis of a node, which drives one motor.
 
     Args:
-        node: that it is on.
-        motor: what it drives.
+        node: node of the axis.
+        motor: motor of the axis.
         offset: counts at length zero.
-        identifiers: of its frames.
-        units: of its objects, where vendors differ.
-        unguarded: guards that it may be without, by index.
+        identifiers: identifiers of its frames.
+        units: units of those objects that differ between vendors.
+        unguarded: guards that it may lack, by object index.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Drive:
         assert self.reading is not None
         return self.motor.tension(self.reading.torque)
 
-    # SDO; indices are those of a first axis
+    # SDO; indices are of a first axis
 
     def index(self, index: int) -> int:
         """Index of an object on this axis."""
@@ -156,11 +156,11 @@ class Drive:
     # Set-up
 
     def check(self, identity: Identity, check_eds: bool = True) -> dict[str, int]:
-        """Read who the drive is and whether it can do what is asked; nothing is written.
+        """Read the drive's identity and check its abilities; nothing is written.
 
         Args:
-            identity: what it must say of itself.
-            check_eds: whether vendor and product of its data sheet must be its own, too.
+            identity: identity that the drive must report.
+            check_eds: whether vendor and product of its data sheet must also equal the drive's own.
 
         Returns:
             Its identity, statusword, position, supported modes and rated torque.
@@ -202,10 +202,10 @@ class Drive:
         return found if self.knows(Object.RATED_TORQUE) else [*found, int(Object.RATED_TORQUE)]
 
     def _factors(self) -> tuple[float, float]:
-        """Counts per second in one of the unit of 0x6080, and per second squared in one of that of 0x6085.
+        """Counts per second in one unit of 0x6080, and counts per second squared in one unit of 0x6085.
 
         Raises:
-            InputError: where the units are not known, or contradict what the drive tells.
+            InputError: if the units are unknown or contradict the drive's own.
         """
         told = [self.read(i) if self.knows(i) else 0 for i in (Object.VELOCITY_UNIT, Object.ACCELERATION_UNIT)]
         turn = self.motor.counts_per_turn
@@ -217,7 +217,7 @@ class Drive:
         return speed, acceleration
 
     def _check_positions(self) -> None:
-        """Positions must be those of the encoder, neither reversed nor shifted."""
+        """Refuse a drive whose positions are reversed or shifted against the encoder."""
         if self.knows(Object.POLARITY):
             check_polarity(self.read(Object.POLARITY), self.name)
         if self.knows(Object.HOME_OFFSET):
@@ -267,7 +267,7 @@ class Drive:
                 raise InputError(f"{key} is 0x{found[key]:X}, not 0x{expected:X}", where=where, remedy=remedy)
             if stated.get(key) not in (None, found[key]):
                 raise InputError(
-                    f"{key} is 0x{found[key]:X}, that of the data sheet 0x{stated[key]:X}",
+                    f"{key} is 0x{found[key]:X}, but 0x{stated[key]:X} in the data sheet",
                     where=where,
                     remedy=f"{EDS_REMEDY}, or set check_eds = false",
                 )
@@ -296,13 +296,13 @@ class Drive:
         """Set mode, limits and guards, and map the process data; the node must be PRE-OPERATIONAL.
 
         Args:
-            period: of the set-points [s].
+            period: time between set-points [s].
             guards: see there.
             say: takes a line for every object that is left out, or set to less than was asked.
 
         Raises:
-            InputError: where the drive does not keep what is written, lacks a guard that it must have, or would wrap
-                its position within the travel.
+            InputError: if the drive does not keep a written value, lacks a guard that it must have, or would wrap its
+                position within the travel.
         """
         lacking = self.lacking()
         check_guards(lacking, self.unguarded, where=f"{self.name}, data sheet")
@@ -329,7 +329,8 @@ class Drive:
     def process_data(self) -> tuple[int, int, int]:
         """Numbers of its process data: RPDO of set-points, RPDO of the controlword alone, TPDO of its status.
 
-        CiA 402 has 64 of each for an axis; a node without process data 65 is taken to number those of all axes in turn.
+        CiA 402 has 64 of each for an axis; a node without process data 65 is assumed to number the process data of all
+        axes in turn.
 
         Raises:
             InputError: if the data sheet has too few.
@@ -343,7 +344,7 @@ class Drive:
         return wanted
 
     def _within(self, index: int, subindex: int, value: int, say: Callable[[str], None]) -> int:
-        """The value, or the drive's largest where that is less and stricter."""
+        """The value, or the drive's largest value if that is smaller."""
         variable = self.variable(index, subindex)
         largest = None if variable is None else variable.max
         if index not in STRICTER_BELOW or largest is None or value <= largest:
@@ -372,7 +373,7 @@ class Drive:
             (Object.MAX_MOTOR_SPEED, 0, max(1, round(1.5 * fastest / speed))),
             (Object.QUICK_STOP_DECELERATION, 0, max(1, round(braking / acceleration))),
             (Object.QUICK_STOP_OPTION, 0, 6),  # slow down on the quick stop ramp, and hold
-            (Object.ABORT_CONNECTION, 0, 3),  # quick stop where the master is lost
+            (Object.ABORT_CONNECTION, 0, 3),  # quick stop if the master is lost
             (Object.CONSUMER_HEARTBEAT, 1, guards.master_node << 16 | round(1e3 * guards.master_timeout_s)),
             (Object.PRODUCER_HEARTBEAT, 0, round(1e3 * guards.drive_heartbeat_s)),
         ]
@@ -398,7 +399,7 @@ class Drive:
             raise InputError(
                 f"the drive keeps another mapping ({said}; 0x{pdo.cob_id:X}, type {pdo.trans_type})",
                 where=where,
-                remedy="look into its manual: it may map only what its EDS says",
+                remedy="read its manual: it may map only the objects in its EDS",
             )
         # canopen would take frames of ours that the bus echoes for the drive's, and overwrite its buffer.
         network = self.node.network
@@ -430,9 +431,9 @@ def drives_of(
     """The drives of motors, several of which may be axes of one node.
 
     Args:
-        network: that they are on.
-        motors: what they drive.
-        offsets: counts of each at length zero.
+        network: network of the drives.
+        motors: one motor per drive.
+        offsets: counts of each motor at length zero.
         eds: path of their electronic data sheet.
         answer: how long a node has to answer an SDO request [s].
         units, unguarded: see `Drive`.
@@ -447,13 +448,14 @@ def drives_of(
 
 
 class Guards(NamedTuple):
-    """What watches over what.
+    """Guards between master and drives.
 
     Attributes:
         master_node: node number under which the master sends heartbeats.
-        master_timeout_s: drives quick-stop where none came for so long.
-        drive_heartbeat_s: how often drives send theirs.
-        following_error_m, following_time_s: a drive faults where it lags behind its set-point by so much for so long.
+        master_timeout_s: drives quick-stop if no heartbeat came for this long.
+        drive_heartbeat_s: time between heartbeats of a drive.
+        following_error_m, following_time_s: a drive faults if it lags behind its set-point by this length for this
+            time.
     """
 
     master_node: int = 127
@@ -525,7 +527,7 @@ class Drives:
 
         Args:
             timeout: how long to wait [s].
-            meanwhile: what is done before the wait.
+            meanwhile: called before the wait.
 
         Returns:
             Whether every drive has answered in time.
@@ -552,7 +554,7 @@ class Drives:
         return complete
 
     def send_heartbeat(self) -> None:
-        """The master's heartbeat, where it is due: four in the time that drives are patient."""
+        """Send the master's heartbeat if it is due: four times within the drives' timeout."""
         now = time.monotonic()
         if now >= self._next_heartbeat:
             self._next_heartbeat = now + 0.25 * self.guards.master_timeout_s - 1e-3
@@ -561,11 +563,11 @@ class Drives:
     def quick_stop(self, patience: float = 0.02) -> list[str]:
         """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
 
-        The controlword goes out in a PDO of its own that needs no SYNC. Where a frame cannot be sent, the others still
+        The controlword goes out in a PDO of its own that needs no SYNC. If a frame cannot be sent, the others still
         are, and the drive's own guard stops it.
 
         Returns:
-            What could not be sent.
+            One line for each frame that could not be sent.
         """
         self._stopped.set()
         # Behind a cycle that is being sent: its set-points still say "enable", and would undo the stop.

@@ -45,7 +45,7 @@ def file_hook(path: Path, pressed: str) -> Hook:
 
 
 class StopSignals:
-    """Keeps SIGINT, SIGTERM and SIGHUP from ending the program, and tells the emergency stop that one has come.
+    """Keeps SIGINT, SIGTERM and SIGHUP from ending the program, and reports each signal to the emergency stop.
 
     The interpreter writes each signal to a socket from whichever thread the system gave it to, at once; the main
     thread, which may be busy, is not asked. Outside the main thread Python cannot take signals: the program's own
@@ -81,10 +81,10 @@ class StopSignals:
 
 
 class EmergencyStop:
-    """Listens, and calls ``stop`` once: with what was pressed, or that the control loop is silent.
+    """Calls ``stop`` once, when a button is pressed or the control loop falls silent.
 
     Args:
-        stop: called from this object's thread with what happened and whether it was silence; it must not wait for the
+        stop: called from this object's thread with the event and whether it was silence; it must not wait for the
             control loop.
         hooks: each returns True while its button is pressed.
         pulse: time of the control loop's last cycle [s, monotonic], or None while none is due.
@@ -115,7 +115,7 @@ class EmergencyStop:
         self._thread.join()
 
     def press(self, what: str, silence: bool = False) -> None:
-        """Stop; what is pressed after the first counts no more."""
+        """Stop; presses after the first are ignored."""
         if not self.pressed:
             self.pressed = what
             self._stop(what, silence)

@@ -23,13 +23,13 @@ _MEDIAN = 5  # cycles: a torque is noisy, and one reading must not decide
 
 
 class Home(BaseModel):
-    """Where one channel's length zero is.
+    """Result of homing one channel.
 
     Attributes:
         channel: of the robot.
         offset_counts: counts at length zero.
-        tension_n: carried there.
-        travel_m: how far the search went from where it began.
+        tension_n: tension at length zero [N].
+        travel_m: distance from the start of the search to length zero [m].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -96,7 +96,7 @@ def homing_motors(motors: Sequence[Motor], table: HomingTable) -> list[Motor]:
 
 
 class Homing:
-    """The phases of a homing, for `ControlLoop.run`; lengths count from where each drive began.
+    """The phases of a homing, for `ControlLoop.run`; lengths count from each drive's start position.
 
     Args:
         table: caps and rate.
@@ -139,7 +139,7 @@ class Homing:
             goal[index] += step
             if goal[index] > motor.length_limit_m[1]:
                 way = 1e3 * self._table.travel_m
-                asked = "is its cable off, or its sign in the robot file the other one?"
+                asked = "is its cable off, or has it the opposite sign in the robot file?"
                 raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {way:.0f} mm: {asked}")
             loop.set_points.towards(loop.set_points.clamp(goal))
             loop.command = loop.set_points.length.copy()

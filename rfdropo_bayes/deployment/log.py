@@ -32,8 +32,8 @@ from rfdropo_bayes.robots import Robot
 JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
 FORMAT = "drive-session"
 SCHEMA_VERSION = 3
-_WRITE = 0.02  # [s]: how often what is waiting is written
-_SYNC = 1.0  # [s]: how often the disk is told to keep what it has
+_WRITE = 0.02  # [s]: time between writes
+_SYNC = 1.0  # [s]: time between syncs of the disk
 _HEADER = 4096  # [bytes]
 
 
@@ -57,9 +57,9 @@ def record_type(channels: int, markers: int) -> np.dtype[np.void]:
             ("controlword", "<u2", (channels,)),
             ("position", "<f8", (markers, 3)),
             ("seen", "?", (markers,)),
-            ("object_pose", "<f8", (POSE,)),  # centre in m, quaternion x, y, z, w; where the object was last seen
+            ("object_pose", "<f8", (POSE,)),  # centre in m, quaternion x, y, z, w; last seen pose
             ("object_seen", "?"),  # anew
-            ("seen_at", "<f8"),  # when markers and object were where this cycle saw them
+            ("seen_at", "<f8"),  # exposure time of the markers and the object in this cycle
         ]
     )
 
@@ -150,8 +150,9 @@ class SessionLog:
             what()
 
     def flush(self) -> None:
-        """Hand everything to the operating system; not for the thread that writes. What a full disk does not take waits
-        for the next time: a robot in motion must not stop for it."""
+        """Hand everything to the operating system; not for the thread that writes. Data that a full disk refuses wait
+        for the next call: a robot in motion must not stop for it.
+        """
         with self._writing, contextlib.suppress(OSError):
             while self._records:
                 self._append(self._records[0])
@@ -212,8 +213,9 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
 def _seen_when(
     rows: Shaped[np.ndarray, " cycle"],
 ) -> tuple[Float[np.ndarray, "cycle marker 3"], Bool[np.ndarray, "cycle marker"], Float[np.ndarray, "cycle 7"] | None]:
-    """Markers [m] in the cycles nearest to when they were there, not when the loop heard of it; which are new; and the
-    object's pose, not a number where it was not seen, None where it never was."""
+    """Marker positions [m] in the cycle nearest to their exposure, a mask of new positions, and the object's pose. The
+    pose is NaN in cycles without a sighting, and None if the object was never seen.
+    """
     heard = np.flatnonzero(rows["seen"].any(axis=1) | rows["object_seen"])
     edges = 0.5 * (rows["time"][1:] + rows["time"][:-1])
     place = np.searchsorted(edges, rows["seen_at"][heard])
@@ -229,14 +231,14 @@ def _seen_when(
 def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> Trajectory:
     """The recording of a session, from its journal.
 
-    Commands are those in force at the policy's rate, before the set-points' limits on rate and acceleration, after
-    those on length; drum angles [rad] are measured, tensions [N] come from the drives' torque. Where a drive was silent
-    the tension is missing. Statuswords, set-points and raw actions are kept beside,
-    outside the hash: they say how the session went, not what the robot did.
+    Commands are stored at the policy's rate, after the limits on length and before the limits on rate and acceleration;
+    drum angles [rad] are measured, tensions [N] come from the drives' torque. The tension is missing while a drive was
+    silent. Statuswords, set-points and raw actions are stored outside the hash: they describe the session, not the
+    robot's motion.
 
     Args:
-        folder: of the session.
-        phases: take the cycles of these phases alone, where there are at least two.
+        folder: folder of the session.
+        phases: take only the cycles of these phases, if there are at least two.
 
     Raises:
         InputError: if it has fewer than two cycles.

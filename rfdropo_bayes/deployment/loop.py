@@ -27,12 +27,12 @@ from rfdropo_bayes.deployment.watch import AfterStop, Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
-_AWAY = 1e-4  # [m]: a braked drive so far from the command in force holds another one
+_AWAY = 1e-4  # [m]: a braked drive farther than this from its command holds another command
 _ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep
 
 
 class Phase(IntEnum):
-    """What a cycle was for, as the log tells it."""
+    """Purpose of a cycle, as written to the log."""
 
     ENABLING = 1
     HOMING = 2
@@ -46,7 +46,7 @@ class Phase(IntEnum):
 
 
 class Snapshot(NamedTuple):
-    """What the display shows: phase, time left [s], last lateness [s], misses, act time [s] and the drives."""
+    """Content of the display: phase, time left [s], last lateness [s], misses, act time [s] and the drives."""
 
     phase: Phase | None
     left: float
@@ -61,13 +61,13 @@ class ControlLoop:
     """One session on configured drives. Runs in a thread of its own; `run` returns why it ended.
 
     Args:
-        robot: that is driven.
+        robot: robot to drive.
         drives: configured and operational.
-        markers: what is seen.
-        log: every cycle goes there.
-        safety: see there.
-        period: of the cycle [s].
-        say: takes a line for the log.
+        markers: view of the marker sensor.
+        log: receives every cycle.
+        safety: limits of the session.
+        period: length of a cycle [s].
+        say: receives lines for the log.
     """
 
     def __init__(
@@ -106,12 +106,12 @@ class ControlLoop:
     # One cycle
 
     def cycle(self, phase: Phase, acted: bool = False, meanwhile: Callable[[], None] | None = None) -> Tick:
-        """Wait for the beat; send set-points; take in status and markers; look at both; log.
+        """Wait for the cycle, send set-points, read status and markers, check both, and log.
 
         Args:
-            phase: for the log.
+            phase: phase for the log.
             acted: whether a command comes into force.
-            meanwhile: what is done while the drives answer.
+            meanwhile: called while the drives answer.
 
         Raises:
             Stop: if this cycle must be the last of its phase.
@@ -127,7 +127,7 @@ class ControlLoop:
             if state is DriveState.OPERATION_ENABLED:
                 drive.target = drive.motor.counts(length, drive.offset)
             elif drive.reading is not None:
-                drive.target = drive.reading.position  # a drive must find itself where it is when it is enabled
+                drive.target = drive.reading.position  # a drive must find its own position as target when it is enabled
         try:
             self.drives.exchange(_ANSWER * self.period, meanwhile)
         except can.CanError as error:
@@ -135,7 +135,7 @@ class ControlLoop:
         try:
             self.markers.update(self.pulse)
             if phase is not Phase.BRAKED:
-                if self.demanded is not None:  # what follows from a stop by another thread is not its cause
+                if self.demanded is not None:  # consequences of a stop by another thread are not its cause
                     raise self.demanded
                 self.watch.check(tick, self._expected, tension=not self._pulling)
         finally:
@@ -191,7 +191,7 @@ class ControlLoop:
         return self._come_to_rest(stop)
 
     def find(self) -> None:
-        """First status of every drive; set-points begin where the drives are."""
+        """Read the first status of every drive; set-points begin at the drives' positions."""
         end = time.monotonic() + 1.0
         while silent := [drive.name for drive in self.drives.all if drive.reading is None]:
             self.cycle(Phase.ENABLING)
@@ -201,10 +201,10 @@ class ControlLoop:
         self.command = self.set_points.length.copy()
 
     def enable(self) -> None:
-        """Bring every drive to OPERATION ENABLED, with the target where it stands.
+        """Bring every drive to OPERATION ENABLED, with its present position as target.
 
         Raises:
-            Stop: if one does not come within the time, or stands outside its limits.
+            Stop: if a drive is not enabled in time, or stands outside its limits.
         """
         self.find()
         for drive, low, high in zip(self.drives.all, self.set_points.low, self.set_points.high, strict=True):
@@ -240,13 +240,13 @@ class ControlLoop:
             acted = False
 
     def follow(self, source: CommandSource, duration: float, phase: Phase = Phase.RUNNING) -> None:
-        """Let the source command for so long [s], then let the last ramp end.
+        """Let the source command for ``duration`` seconds, then finish the last ramp.
 
         Every change of a command is carried out linearly over the robot's ``ramp_s``, within all limits: as its
         simulator does, so that the log is calibrated as it stands.
 
         Raises:
-            Stop: if it commands what cannot be followed, or a marker or the object that it needs is lost.
+            Stop: if a command cannot be followed, or a marker or object that the source needs is lost.
         """
         cycles = round(1.0 / (source.rate_hz * self.period))
         steps = max(1, round(self.robot.command.ramp_s / self.period))
@@ -272,7 +272,7 @@ class ControlLoop:
             self.cycle(phase, acting, source.rehearse if (number + 1) % cycles == 0 else None)
 
     def _check_sight(self, source: CommandSource) -> None:
-        """Raise a Stop where a marker or the object that a source needs is lost, or was never seen."""
+        """Raise a Stop if a marker or the object that a source needs is lost, or was never seen."""
         if source.sees_markers and (name := self.markers.lost(time.monotonic())):
             raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
         if source.sees_object and self.markers.object_lost(time.monotonic()):
@@ -375,7 +375,7 @@ class ControlLoop:
         return Stop(cause, "; ".join(filter(None, [stop.detail, *after.found])))
 
     def _hold_where_it_is(self) -> bool:
-        """Let the command be where the drives have come to, as they no longer follow one; whether it is another now."""
+        """Set the command to the drives' positions once they no longer follow it; returns whether it changed."""
         if any(drive.reading is None for drive in self.drives.all):
             return False
         length = self.lengths()

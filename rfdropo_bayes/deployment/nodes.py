@@ -42,7 +42,7 @@ class Node:
         network.add_node(self.remote)
         self._sdo = threading.Lock()
         self.nmt: int | None = None
-        self.heartbeat = 0.0  # time of the last one [s, monotonic]
+        self.heartbeat = 0.0  # time of the last heartbeat [s, monotonic]
         network.subscribe(objects.HEARTBEAT + number, self._on_heartbeat)
 
     def _on_heartbeat(self, identifier: int, data: bytearray, timestamp: float) -> None:
@@ -55,10 +55,10 @@ class Node:
 
     @contextlib.contextmanager
     def sdo(self, what: str, where: str) -> Iterator[None]:
-        """Have the SDO client alone; its errors become those of the user.
+        """Lock the SDO client; its errors become InputErrors.
 
         Raises:
-            InputError: with ``what`` could not be done, and why.
+            InputError: names the failed action ``what`` and the reason.
         """
         try:
             with self._sdo:

@@ -24,7 +24,7 @@ class Object(IntEnum):
     CONSUMER_HEARTBEAT = 0x1016  # node << 16 | ms
     PRODUCER_HEARTBEAT = 0x1017  # [ms]
     IDENTITY = 0x1018
-    ERROR_BEHAVIOUR = 0x1029  # :1, where communication fails: 0 PRE-OPERATIONAL, 1 none, 2 STOPPED
+    ERROR_BEHAVIOUR = 0x1029  # :1, if communication fails: 0 PRE-OPERATIONAL, 1 none, 2 STOPPED
     RPDO = 0x1400
     RPDO_MAP = 0x1600
     TPDO = 0x1800
@@ -46,7 +46,7 @@ class Object(IntEnum):
     RATED_TORQUE = 0x6076  # [mN m]; vendors differ
     TORQUE = 0x6077  # [per mille of rated]
     TARGET_POSITION = 0x607A
-    POSITION_RANGE = 0x607B  # where positions wrap; 0, 0 for nowhere
+    POSITION_RANGE = 0x607B  # range in which positions wrap; 0, 0 for none
     HOME_OFFSET = 0x607C
     POSITION_LIMIT = 0x607D
     POLARITY = 0x607E
@@ -61,11 +61,13 @@ class Object(IntEnum):
 
 
 _DEVICE, _AXIS, AXES = 0x6000, 0x800, 8  # first index of a device profile; indices of an axis; axes of a node at most
-PDOS_OF_AXIS = 64  # process data of the second axis follow so many numbers after those of the first
+PDOS_OF_AXIS = 64  # offset of the second axis's process data from the first's
 
 
 def of_axis(index: int, axis: int) -> int:
-    """Index of an object of the first axis on another one: 0x800 for each; what is not of the profile is the node's."""
+    """Index of a first-axis object on another axis, 0x800 further per axis. Objects outside the profile belong to the
+    node.
+    """
     return index + _AXIS * (axis - 1) if index >= _DEVICE else int(index)
 
 
@@ -97,7 +99,7 @@ _FREE = range(0x680, 0x6E0)  # CiA 301 gives them to nobody
 
 
 class Identifiers(NamedTuple):
-    """Of the frames of one axis: its set-points, its controlword alone, its status."""
+    """Frame identifiers of one axis: set-points, controlword alone, status."""
 
     set_point: int
     command: int
@@ -107,8 +109,7 @@ class Identifiers(NamedTuple):
 def identifiers(places: Sequence[tuple[int, int]]) -> list[Identifiers]:
     """Identifiers of axes, given as (node, axis); no two of them share one.
 
-    The predefined connection set has two RPDOs for each of two axes. Those of further axes are numbers that CiA 301
-    leaves free.
+    The predefined connection set has two RPDOs for each of two axes. Further axes use numbers that CiA 301 leaves free.
 
     Raises:
         InputError: if there are too many axes beyond the second.

@@ -1,8 +1,8 @@
-"""Where commands come from: a policy as an ONNX file with its layout, or the commands of an earlier session.
+"""Sources of commands: a policy as an ONNX file with its layout, or the commands of an earlier session.
 
-The metadata of the ONNX file hold the layout that training and motors share (`robots.policy_layout`): what goes in,
-what comes out, in which order and unit, how often. Normalisation, clipping and scaling are baked into the graph. A
-policy is refused unless its layout fits the robot and the session to the letter.
+The metadata of the ONNX file hold the layout that training and motors share (`robots.policy_layout`): inputs, outputs,
+their order and units, and the rate. Normalisation, clipping and scaling are baked into the graph. A policy is refused
+unless its layout fits the robot and the session to the letter.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ METADATA = "rfdropo_layout"
 
 
 class PolicyScene(NamedTuple):
-    """What a policy may see.
+    """Inputs that a policy may see.
 
     Attributes:
-        position: of the markers [m]; the newest known of each.
-        moved: how far each marker has moved since the last act [m].
-        command: in force [command unit].
-        length: cable on each drum, measured [m].
-        tension: of each cable [N].
-        object_pose: centre [m] and unit quaternion x, y, z, w of what the robot pushes; the newest known.
+        position: newest known position of each marker [m].
+        moved: displacement of each marker since the last act [m].
+        command: present command [command unit].
+        length: measured cable length on each drum [m].
+        tension: tension of each cable [N].
+        object_pose: newest known centre [m] and unit quaternion x, y, z, w of the pushed object.
     """
 
     position: Float[np.ndarray, "marker 3"]
@@ -56,13 +56,13 @@ class PolicyScene(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """What is told of tensions in the evaluation that a policy was kept for.
+    """Tensions in the evaluation for which a policy was selected.
 
     Attributes:
-        peak: largest of a cable, with what episodes overshot the limit by [N]; NaN if not told.
-        limit: at which episodes were stopped [N]; infinite if there was none.
-        stopped: episodes that were.
-        episodes: all of them.
+        peak: largest tension of a cable, including the overshoot over the limit [N]; NaN if not recorded.
+        limit: tension at which an episode is stopped [N]; infinite without a limit.
+        stopped: number of stopped episodes.
+        episodes: number of episodes.
     """
 
     peak: float
@@ -78,14 +78,14 @@ class Pull(NamedTuple):
 
 
 class Act(NamedTuple):
-    """What is commanded: the raw output, and the command it asks for, both before the motors' limits."""
+    """Raw output of a policy and the requested command, both before the motors' limits."""
 
     raw: Float[np.ndarray, " channel"]
     command: Float[np.ndarray, " channel"]
 
 
 class CommandSource(Protocol):
-    """Where commands come from."""
+    """A source of commands."""
 
     rate_hz: float
     start: Float[np.ndarray, " channel"]
@@ -95,10 +95,10 @@ class CommandSource(Protocol):
     """Whether a lost object does."""
 
     def act(self, scene: PolicyScene) -> Act | None:
-        """The next command [command unit]; None where there is no more.
+        """The next command [command unit]; None after the last command.
 
         Raises:
-            Stop: if it has none that can be followed.
+            Stop: if no command can be followed.
         """
         ...
 
@@ -113,14 +113,14 @@ class OnnxPolicy:
     """A policy from an ONNX file, as `rfdropo train` exports it.
 
     Args:
-        path: of the file.
-        robot: that it is to drive.
-        goal: x, y and z of its goal [m].
+        path: path of the file.
+        robot: robot to drive.
+        goal: position of the goal [m].
         sha256: hash that the file must have; None accepts any.
-        markers: those that it sees, where it does not see all of the robot's.
+        markers: names of the markers that it sees; all of the robot's by default.
 
     Attributes:
-        pull: its tensions in the evaluation that it was kept for.
+        pull: its tensions in the evaluation for which it was selected.
 
     Raises:
         InputError: if the file cannot be read, or its layout, hash or shapes do not fit.
@@ -169,7 +169,7 @@ class OnnxPolicy:
         self._answer(self._last)
 
     def act(self, scene: PolicyScene) -> Act:
-        """Run the network: what it gives is the change of the command, which the layout's limits end.
+        """Run the network. Its output is the change of the command, clipped to the layout's limits.
 
         Raises:
             Stop: if its output is not finite, or more than any of its actions.
@@ -186,7 +186,7 @@ class OnnxPolicy:
         if not np.all(np.isfinite(raw)):
             raise Stop(Cause.ACTION_NOT_FINITE, f"the policy's output is {raw.tolist()}")
         if np.any(np.abs(raw) > self._reach * (1.0 + 1e-4)):  # single precision
-            raise Stop(Cause.ACTION_OUTSIDE, f"the policy's output {raw.tolist()} is outside what its layout states")
+            raise Stop(Cause.ACTION_OUTSIDE, f"the policy's output {raw.tolist()} is outside the range of its layout")
         return Act(raw, np.clip(scene.command + raw, self._low, self._high))
 
     def _observe(self, scene: PolicyScene) -> Float[np.ndarray, " feature"]:
@@ -206,7 +206,7 @@ class OnnxPolicy:
         return self._network(observation)
 
     def _answer(self, scene: PolicyScene) -> tuple[Float[np.ndarray, " feature"], Float[np.ndarray, " channel"]]:
-        """Observation, and what the network makes of it."""
+        """Observation, and the network's output for it."""
         observation = self._observe(scene)
         try:
             return observation, self._run(observation)
@@ -229,7 +229,7 @@ class OnnxPolicy:
 
 
 def pulls_too_hard(pull: Pull, motors: Sequence[Motor]) -> str | None:
-    """A warning where a policy pulled more in its training's evaluation than a motor bears; None where not."""
+    """A warning if a policy's tensions in its evaluation exceed a motor's limit; None otherwise."""
     weakest = min(motors, key=lambda motor: motor.tension_limit_n[1])
     limit = weakest.tension_limit_n[1]
     if not pull.peak > limit:
@@ -242,7 +242,7 @@ def pulls_too_hard(pull: Pull, motors: Sequence[Motor]) -> str | None:
 
 
 def _bound(session: Any, size: int, channels: int) -> Callable[[np.ndarray], Float[np.ndarray, " channel"]]:
-    """A network whose input and output stay where they are in memory, from observation to output."""
+    """A network with fixed input and output buffers, as a function from observation to output."""
     import onnxruntime
 
     seen, given = np.zeros((1, size), np.float32), np.zeros((1, channels), np.float32)
@@ -345,8 +345,8 @@ _INSTANT = 1e-6  # periods: a command that comes half a period late belongs to t
 def replay_rate(recording: Trajectory, rate_hz: float) -> float:
     """Rate at which commands are sent again [Hz].
 
-    It divides the loop's ``rate_hz``: the nearest one to the commands' own where they come evenly at it, as those of a
-    session do; else the loop's own.
+    It divides the loop's ``rate_hz``: the divisor nearest to the commands' own rate if the commands are evenly spaced,
+    as in a session; otherwise ``rate_hz``.
     """
     gaps = np.diff(recording.command_time)
     nearest = rate_hz / max(1, round(rate_hz * (float(np.median(gaps)) if gaps.size else 0.1)))
@@ -360,16 +360,16 @@ def _evenly(periods: Float[np.ndarray, " gap"]) -> bool:
 
 
 class RecordedCommands:
-    """The commands of a recording, sent again: those before its first row, too.
+    """The commands of a recording, sent again, including the commands before its first row.
 
-    Commands that came evenly at the rate each stay in force for whole periods: a beat that their session missed must
+    Commands that came evenly at the rate each stay in force for whole periods: a cycle that their session missed must
     not turn into a command twice or never. Others are sent in the period that is nearest to their own time, and the
-    last one where several fall into one period.
+    last command wins if several fall into one period.
 
     Args:
         recording: of an earlier session, or any trajectory of this robot.
-        robot: that is to be driven.
-        rate_hz: of the periods; see `replay_rate`.
+        robot: robot to drive.
+        rate_hz: rate of the periods; see `replay_rate`.
 
     Raises:
         InputError: if channels or unit do not fit.

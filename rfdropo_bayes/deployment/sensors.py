@@ -1,4 +1,4 @@
-"""Where marker positions come from: motion capture (NatNet), a simulation, or a recording that is played again."""
+"""Sources of marker positions: motion capture (NatNet), a simulation, or a recording that is played again."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Sighting(NamedTuple):
     Attributes:
         number: rises with every frame; 0 before the first.
         time: when it came [s, monotonic].
-        position: of each marker in the robot's base frame [m].
-        seen: False where the marker was lost; its position is then of no use.
-        object_pose: centre [m] and unit quaternion x, y, z, w of what the robot pushes; None where it was not seen.
+        position: positions of the markers in the robot's base frame [m].
+        seen: False for a lost marker, whose position is then invalid.
+        object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen.
     """
 
     number: int
@@ -55,16 +55,16 @@ class SensorTable(BaseModel):
 
     Attributes:
         kind: "natnet", "simulated" or "none".
-        server, local: addresses of Motive's machine and of this one (natnet).
+        server, local: addresses of Motive's machine and of this machine (natnet).
         multicast: how Motive streams (natnet).
         rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
         object_body: identifier of the rigid body that the robot pushes (natnet); its pivot is the object's centre.
             Create it in Motive while the object is aligned with the robot's base.
         rotation: rows of the matrix from the sensor's frame to the robot's base frame.
         origin_m: origin of the base frame in the sensor's frame.
-        port: that a simulation sends to (simulated).
+        port: UDP port that a simulation sends to (simulated).
         stale_s: older frames count as lost.
-        lost_s: a policy that sees markers or the object ends where one of them is lost for so long.
+        lost_s: a policy that sees markers or the object ends if one of them is lost for this long.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -129,13 +129,12 @@ class SimulatedMarkers:
 
     @property
     def address(self) -> str:
-        """Where to send to."""
+        """Address to send to, HOST:PORT."""
         host, port = self._socket.getsockname()
         return f"{host}:{port}"
 
     def latest(self) -> Sighting:
-        """Read what has come, markers with an object or without; a datagram of another size belongs to another robot
-        and is left out."""
+        """Read the datagrams received so far; a datagram of another size belongs to another robot and is ignored."""
         markers = len(self._sighting.seen)
         size = DATAGRAM.size + 24 * markers
         while True:
@@ -173,7 +172,7 @@ class RecordedMarkers:
         self._start: float | None = None
 
     def latest(self) -> Sighting:
-        """The row that is due; after the last one nothing new comes."""
+        """The row that is due; the last row is repeated."""
         now = time.monotonic()
         self._start = now if self._start is None else self._start
         row = int(np.searchsorted(self._recording.time, now - self._start, side="right")) - 1
@@ -205,10 +204,10 @@ class NatNetMarkers:
         self._identifiers = {table.rigid_bodies[name]: place for place, name in enumerate(robot.marker_names)}
         if len(self._identifiers) < len(robot.marker_names):
             remedy = "give each marker the identifier of its own"
-            raise InputError("two markers have the same one", where="sensor.rigid_bodies", remedy=remedy)
+            raise InputError("two markers have the same rigid body", where="sensor.rigid_bodies", remedy=remedy)
         if table.object_body in self._identifiers:
             remedy = "give the identifier of the object's own"
-            raise InputError("a marker has the same one", where="sensor.object_body", remedy=remedy)
+            raise InputError("a marker has the same rigid body", where="sensor.object_body", remedy=remedy)
         self._object = table.object_body
         self._rotation, self._origin = np.array(table.rotation), np.array(table.origin_m)
         self._lock = threading.Lock()
@@ -287,12 +286,13 @@ def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
 
 
 class MarkerView:
-    """What the loop sees of a sensor: each marker's last good position, its age, how far it moved; and the object.
+    """A sensor as the control loop sees it: each marker's last good position, its age, how far it moved; and the
+    object.
 
     Args:
-        sensor: that is asked.
-        table: says what is stale, and when a marker is lost.
-        names: of the markers.
+        sensor: sensor to read.
+        table: gives the times after which a marker is stale or lost.
+        names: names of the markers.
     """
 
     def __init__(self, sensor: MarkerSensor, table: SensorTable, names: tuple[str, ...]) -> None:
@@ -331,7 +331,7 @@ class MarkerView:
         return now - self._object_last > self._table.lost_s
 
     def act(self) -> None:
-        """Note an act of the policy: markers have moved since the one before."""
+        """Note an act of the policy: marker displacements count from the previous act."""
         if self._acted is not None:
             self.moved = self.position - self._acted
         self._acted = self.position.copy()

@@ -46,10 +46,10 @@ from rfdropo_bayes.robots import Motor, Robot
 
 
 class Mode(StrEnum):
-    """What a session does.
+    """Kind of a session.
 
     ``CHECK`` reads and writes nothing; ``HOME`` finds length zero; ``DRY_RUN`` is ``RUN`` on simulated drives;
-    ``SHADOW`` lets the policy see and command while nothing moves; ``REPLAY`` sends the commands of a recording again.
+    ``SHADOW`` runs the policy while nothing moves; ``REPLAY`` sends the commands of a recording again.
     """
 
     CHECK = "check"
@@ -64,11 +64,11 @@ class Outcome(NamedTuple):
     """How a session ended.
 
     Attributes:
-        cause, detail: why.
-        folder: what it wrote.
+        cause, detail: reason of the end, and one line about it.
+        folder: folder with the session's files.
         figures: lateness, misses, the policy's time, the time to a stop; as in summary.json.
-        drives: what each drive said of itself when it was checked.
-        without: what each drive lacks of what would be set or asked, and what that costs.
+        drives: identity of each drive as read at the check.
+        without: objects that each drive lacks, with the consequence of each.
     """
 
     cause: Cause
@@ -103,17 +103,17 @@ def deploy(
         settings: the deployment, or its file.
         mode: see `Mode`.
         out: folder for log, frames, recording and summary.
-        simulated: use simulated drives whatever the mode; a dry run always does.
-        commands: what `Mode.REPLAY` sends, a session's folder or a trajectory of ours; or a source of commands in the
-            place of the policy.
+        simulated: use simulated drives in any mode; a dry run always does.
+        commands: commands for `Mode.REPLAY`, as a session's folder or a trajectory file; or a source of commands that
+            replaces the policy.
         hooks: each returns True while its emergency button is pressed.
         show: live view in the terminal.
         keyboard: keys of the terminal stop the drives.
-        bus, sensor: instead of those that the settings describe.
+        bus, sensor: replace the bus and sensor of the settings.
 
     Raises:
         InputError: if anything does not fit: a drive's identity, data sheet or mapping, units, rates, the policy's card
-            or hash, the homing. Nothing has been enabled then, and the log says why.
+            or hash, the homing. No drive has been enabled then, and the log has the reason.
     """
     settings = load_deployment(Path(settings)) if isinstance(settings, Path | str) else settings
     mode = Mode(mode)
@@ -137,7 +137,7 @@ def deploy(
 
 
 class _Session:
-    """What `deploy` holds together; everything opened is closed by the stack."""
+    """State of one `deploy` call; the stack closes everything that was opened."""
 
     def __init__(
         self,
@@ -189,7 +189,7 @@ class _Session:
         return [float(home.offset_counts) for home in result.homes]
 
     def open(self, bus: can.BusABC | None, sensor: MarkerSensor | None) -> None:
-        """Start the simulation where there is one; open sensor, bus and drives."""
+        """Start the simulation if needed; open sensor, bus and drives."""
         settings, sensor_table = self.settings, self.settings.sensor
         bus_table, identity = settings.bus, settings.drives
         if self.simulated:

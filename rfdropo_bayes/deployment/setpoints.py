@@ -44,9 +44,9 @@ class SetPoints:
         """The next set-points [m].
 
         Args:
-            goal: where the motion ends [m].
-            ramp: where it should be at the next cycle on its way there [m]; the goal itself by default.
-            rate_limit: slower than the motors' own [m/s].
+            goal: end of the motion [m].
+            ramp: planned set-point at the next cycle [m]; the goal itself by default.
+            rate_limit: rate limit below the motors' own [m/s].
         """
         ramp = goal if ramp is None else ramp  # ramps that overlap may pass the goal, and come back
         fastest = np.minimum(self.rate_limit, rate_limit)

@@ -24,20 +24,21 @@ class _Table(BaseModel):
 
 
 class DrivesTable(_Table):
-    """Who the drives are, in which units they speak, and what they may be without.
+    """Identity and units of the drives, and the guards that they may lack.
 
     Attributes:
-        eds: their electronic data sheet; that of the simulated drive by default.
-        vendor, product, revision: what object 0x1018 must say; not asked where left out.
+        eds: their electronic data sheet; the simulated drive's sheet by default.
+        vendor, product, revision: required values in object 0x1018; unchecked if left out.
         serial: channel -> serial number.
-        check_eds: whether vendor and product in the data sheet must be those that the drive says; some makers leave
-            them out of step.
+        check_eds: whether vendor and product in the data sheet must equal the drive's own; some makers leave them out
+            of step.
         answer_s: a drive has this long to answer an SDO request; more for drives that write to slow memory.
         torque_unit: of the rated torque, object 0x6076; "uN m" for maxon's EPOS4.
-        speed_unit: of the greatest motor speed, object 0x6080; rpm where left out, as the standard has it.
-        acceleration_unit: of the quick stop's deceleration, object 0x6085; where left out, what object 0x60AA tells,
-            else counts/s2.
-        unguarded: guards that the drives may be without, by index; `check` says which they lack, and what that costs.
+        speed_unit: of the greatest motor speed, object 0x6080; rpm by default, as in the standard.
+        acceleration_unit: of the quick stop's deceleration, object 0x6085; by default from object 0x60AA, else
+            counts/s2.
+        unguarded: guards that the drives may lack, by object index; `check` lists missing guards and their
+            consequences.
     """
 
     eds: str = str(SIMULATED_EDS)
@@ -58,7 +59,7 @@ class DrivesTable(_Table):
         for index in indexes:
             if index not in WITHOUT:
                 known = ", ".join(f"0x{guard:04X}" for guard in sorted(WITHOUT))
-                raise ValueError(f"0x{index:04X} is no guard that a drive may be without; those are {known}")
+                raise ValueError(f"0x{index:04X} is not an optional guard of a drive; optional guards are {known}")
         return indexes
 
     @property
@@ -74,17 +75,17 @@ class DrivesTable(_Table):
                 raise InputError(f"no channel {channel!r}", where="[drives] serial", remedy=remedy)
 
     def identity(self, channel: str) -> Identity:
-        """What the drive of a channel must say of itself."""
+        """Identity that the drive of a channel must report."""
         return Identity(self.vendor, self.product, self.revision, self.serial.get(channel))
 
 
 class PolicyTable(_Table):
-    """Which policy.
+    """The table [policy] of a deployment file.
 
     Attributes:
         file: the ONNX file.
-        sha256: hash that it must have; summary.json has the one that ran.
-        markers: those that it sees, where it does not see all of the robot's.
+        sha256: hash that it must have; summary.json has the hash of the policy that ran.
+        markers: names of the markers that it sees; all of the robot's by default.
     """
 
     file: str
@@ -93,19 +94,20 @@ class PolicyTable(_Table):
 
 
 class SafetyTable(_Table):
-    """What is borne, and how the session starts and ends.
+    """Fault tolerances, and the start and end of a session.
 
     Attributes:
-        misses, misses_within_s: so many deadlines missed by more than a cycle within this time end the session.
-        stale_cycles: so many cycles may pass without a drive's status.
-        heartbeat_s: drives and master each stop where the other's heartbeat is missing for so long.
-        following_error_m, following_time_s: a drive faults where it lags so far behind for so long.
+        misses, misses_within_s: the session ends after this number of deadlines missed by more than a cycle within this
+            time.
+        stale_cycles: largest number of cycles without a drive's status.
+        heartbeat_s: drives and master stop if the other's heartbeat is missing for this long.
+        following_error_m, following_time_s: a drive faults if it lags behind by this length for this time.
         enable_s: within this time the drives must be enabled.
         start_rate_m_s: of the ramp to the start pose; a fifth of each motor's own limit by default.
         settle_s: rest in the start pose before the policy begins.
-        hold_s: the drives are watched for so long after a stop.
-        after: "hold" leaves the drives braked and holding; "release" switches them off where they stand, which lets the
-            cables go, where the session ended as planned.
+        hold_s: time for which the drives are watched after a stop.
+        after: "hold" leaves the drives braked and holding; "release" switches them off, which slackens the cables, if
+            the session ended as planned.
         button_file, button_pressed: a file that shows a button, and its content while it is pressed.
     """
 
@@ -149,13 +151,13 @@ class HomingTable(_Table):
     """How length zero is found.
 
     Attributes:
-        file: where the result is kept; none for motors whose offset stands in the robot file.
-        rate_m_s: of the search.
-        travel_m: greatest way of each cable.
-        time_s: for each cable.
-        torque_factor: the drive's torque is limited to so many times the homing tension.
-        rounds: how often all cables are gone through: one that is pulled changes the others.
-        valid_h: an older result is refused.
+        file: file of the result; none if the robot file has the motors' offsets.
+        rate_m_s: cable speed of the search.
+        travel_m: longest travel of each cable.
+        time_s: longest search for each cable.
+        torque_factor: the torque limit as a multiple of the homing tension.
+        rounds: number of passes over all cables: pulling a cable changes the others.
+        valid_h: age above which a result is refused.
     """
 
     file: str | None = None
@@ -168,11 +170,11 @@ class HomingTable(_Table):
 
 
 class SimulationSettings(_Table):
-    """What stands in for the hardware with `--mode dry-run` and `--simulated`.
+    """Simulation that replaces the hardware with `--mode dry-run` and `--simulated`.
 
     Attributes:
         plant: "springs", or MODULE:CALLABLE.
-        settings: of the plant; a name that ends in .toml is a file.
+        settings: settings of the plant, or a .toml file of settings.
         own_process: whether the plant runs in a process of its own.
     """
 

@@ -1,4 +1,4 @@
-"""Electronic data sheets (EDS) of drives; that of the simulated drive has as many axes as are asked for."""
+"""Electronic data sheets (EDS) of drives; the simulated drive's sheet has any requested number of axes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def data_sheet(eds: str, node: int, axes: int = 1) -> canopen.ObjectDictionary:
     """Read the object dictionary of a drive.
 
     Args:
-        eds: path of its data sheet. That of the simulated drive describes one axis; the others are copies of it.
+        eds: path of its data sheet. The simulated drive's sheet describes one axis; further axes are copies.
         node: number of the drive.
-        axes: of the drive.
+        axes: number of axes.
 
     Raises:
         InputError: if it cannot be read.

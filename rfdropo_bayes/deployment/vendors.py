@@ -1,4 +1,4 @@
-"""Where vendors of CiA 402 drives differ: the units of their objects, and the guards that they lack."""
+"""Differences between vendors of CiA 402 drives: units of objects, and missing guards."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Units(NamedTuple):
     """Units of a drive's objects, as its owner states them; None leaves them to the drive, then to the standard.
 
     Attributes:
-        torque: of 0x6076, the rated torque.
-        speed: of 0x6080, the greatest speed; rpm by the standard.
-        acceleration: of 0x6085, the deceleration of a quick stop; what 0x60AA says, else counts/s2.
+        torque: unit of 0x6076, the rated torque.
+        speed: unit of 0x6080, the greatest speed; rpm by the standard.
+        acceleration: unit of 0x6085, the deceleration of a quick stop; from 0x60AA by default, else counts/s2.
     """
 
     torque: TorqueUnit = "mN m"
@@ -62,13 +62,13 @@ def told_counts(word: int, counts_per_turn: float) -> float | None:
 
 
 def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, where: str) -> float:
-    """Counts per second in one of the unit of 0x6080.
+    """Counts per second in one unit of 0x6080.
 
     Args:
-        stated: by the owner of the drive.
-        word: what 0x60A9 tells; 0 where it tells nothing.
+        stated: unit stated by the owner of the drive.
+        word: content of 0x60A9; 0 if it is empty.
         counts_per_turn: of the motor.
-        where: for messages.
+        where: location for messages.
 
     Raises:
         InputError: if nothing is stated and the drive's velocities are not in rpm: the standard has 0x6080 in rpm all
@@ -88,13 +88,13 @@ def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, wh
 
 
 def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_turn: float, where: str) -> float:
-    """Counts per second squared in one of the unit of 0x6085.
+    """Counts per second squared in one unit of 0x6085.
 
     Args:
-        stated: by the owner of the drive.
-        word: what 0x60AA tells; 0 where it tells nothing.
+        stated: unit stated by the owner of the drive.
+        word: content of 0x60AA; 0 if it is empty.
         counts_per_turn: of the motor.
-        where: for messages.
+        where: location for messages.
 
     Raises:
         InputError: if the drive tells another unit than is stated, or one that is not known here and none is stated.
@@ -121,21 +121,22 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
 
 
 def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: str) -> None:
-    """Compare a drive's rated torque with that of the robot file: a unit is told from another motor.
+    """Compare a drive's rated torque with the rated torque of the robot file; a wrong unit is distinguished from a
+    wrong motor.
 
     Args:
-        found: what 0x6076 says.
-        torque_n_m: of the robot file [N m].
-        unit: of ``found``.
-        where: for messages.
+        found: content of 0x6076.
+        torque_n_m: rated torque in the robot file [N m].
+        unit: unit of ``found``.
+        where: location for messages.
 
     Raises:
-        InputError: if they are more than two per cent apart; says which unit would make them agree.
+        InputError: if they differ by more than two per cent; names the unit that would make them agree.
     """
     expected = torque_n_m / _TORQUE[unit]
     if _agree(found, expected):
         return
-    what = f"its rated torque is {found} {unit}, that of the robot file {expected:.9g} {unit}"
+    what = f"its rated torque is {found} {unit}, but {expected:.9g} {unit} in the robot file"
     if found == 0:
         raise InputError(what, where=where, remedy="tell the drive which motor it has, with the vendor's own program")
     power = 3 * round(math.log10(found / expected) / 3.0)
@@ -148,7 +149,7 @@ def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: s
     times = f"{10 ** abs(power):,} times {'too large' if power > 0 else 'too small'}"
     fitting = [name for name, size in _TORQUE.items() if _agree(found, torque_n_m / size)]
     remedy = (
-        f'state [drives] torque_unit = "{fitting[0]}" if rated_torque_n_m = {torque_n_m:.9g} N m is that of the motor'
+        f'state [drives] torque_unit = "{fitting[0]}" if rated_torque_n_m = {torque_n_m:.9g} N m is right for the motor'
         if fitting
         else f"write rated_torque_n_m in N m (it says {torque_n_m:.9g}), and the drive's unit in [drives] torque_unit"
     )
@@ -160,7 +161,7 @@ def _agree(found: float, expected: float) -> bool:
 
 
 POSITION_REVERSED = 1 << 7
-"""Of 0x607E."""
+"""Bit of object 0x607E."""
 COUNTER = -(2**31), 2**31 - 1
 """Least and greatest position of 32 bits."""
 
@@ -169,27 +170,28 @@ def check_polarity(word: int, where: str) -> None:
     """Refuse a drive that reverses positions: some reverse their targets alone, and none need reverse its torque.
 
     Args:
-        word: what 0x607E says.
-        where: for messages.
+        word: content of 0x607E.
+        where: location for messages.
 
     Raises:
-        InputError: if the bit of positions is set.
+        InputError: if the position bit is set.
     """
     if word & POSITION_REVERSED:
         raise InputError(
-            f"reverses positions (0x607E is 0x{word:02X}), and need not reverse measured positions and torques alike",
+            f"reverses positions (0x607E is 0x{word:02X}), and may not reverse measured positions and "
+            "torques with them",
             where=where,
             remedy="set 0x607E to 0 with the vendor's own program, and the other sign in the robot file's [[motors]]",
         )
 
 
 def check_home_offset(offset: int, unguarded: Collection[int], where: str) -> None:
-    """Refuse a drive that shifts the ends of the travel which it is given, unless its owner bears that.
+    """Refuse a drive that shifts its travel limits, unless its owner accepts that.
 
     Args:
-        offset: what 0x607C says [counts].
-        unguarded: objects that the owner has named.
-        where: for messages.
+        offset: content of 0x607C [counts].
+        unguarded: objects that the owner has accepted as missing.
+        where: location for messages.
 
     Raises:
         InputError: if there is an offset, which the standard takes off the limits of 0x607D.
@@ -208,11 +210,11 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 
     Args:
         ends: least and greatest position.
-        wrap: what 0x607B says; 0, 0 for nothing.
-        where: for messages.
+        wrap: content of 0x607B; 0, 0 if it is empty.
+        where: location for messages.
 
     Raises:
-        InputError: if an end is beyond the counter, or beyond where the drive wraps it.
+        InputError: if an end is beyond the counter, or beyond the position at which the drive wraps it.
     """
     low, high = COUNTER if wrap[0] >= wrap[1] else wrap
     if ends[0] <= low or ends[1] >= high:
@@ -220,7 +222,7 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
         raise InputError(
             f"its travel goes from {ends[0]} to {ends[1]} counts, and {whose} at {low} and {high}",
             where=where,
-            remedy="set its position to zero where it stands (homing method 37, or the vendor's own program), then home"
+            remedy="set its present position to zero (homing method 37, or the vendor's own program), then home"
             if (low, high) == COUNTER
             else "set both ends of 0x607B to 0 with the vendor's own program",
         )
@@ -228,7 +230,7 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 
 WITHOUT: dict[int, str] = {
     Object.CONSUMER_HEARTBEAT: "it does not notice that the computer has died",
-    Object.ABORT_CONNECTION: "it does not stop where it has noticed that the computer has died",
+    Object.ABORT_CONNECTION: "it does not stop when it notices that the computer has died",
     Object.QUICK_STOP_OPTION: "it may let the cables go after a quick stop",
     Object.QUICK_STOP_DECELERATION: "its quick stop brakes as it was set by somebody else",
     Object.POSITION_LIMIT: "it follows set-points beyond the ends of the travel",
@@ -238,29 +240,29 @@ WITHOUT: dict[int, str] = {
     Object.MAX_MOTOR_SPEED: "it does not limit its speed",
     Object.RATED_TORQUE: "nobody notices a torque in another unit, or another motor",
 }
-"""Guards that a drive may be without if its owner says so, and what that costs."""
+"""Guards that a drive may lack if its owner accepts the stated consequence."""
 
 LEFT_OUT: dict[int, str] = WITHOUT | {
     Object.PRODUCER_HEARTBEAT: "the computer does not notice that it has died",
     Object.INTERPOLATION_TIME: "it does not know how far apart set-points are",
     Object.MODE: "its mode cannot be set",
 }
-"""What is lost where an object that is set or asked is not there."""
+"""Consequence of each missing object that is set or read."""
 
 STRICTER_BELOW = {Object.FOLLOWING_WINDOW, Object.FOLLOWING_TIMEOUT, Object.MAX_TORQUE, Object.MAX_MOTOR_SPEED}
 """Guards that a smaller value makes stricter: a drive that does not take so large a value gets its largest."""
 
 
 def check_guards(lacking: Collection[int], unguarded: Collection[int], where: str) -> None:
-    """Refuse a drive without a guard, unless its owner bears that.
+    """Refuse a drive without a guard, unless its owner accepts that.
 
     Args:
-        lacking: objects that cannot be set or asked.
-        unguarded: objects that the owner has named.
-        where: for messages.
+        lacking: objects that cannot be set or read.
+        unguarded: objects that the owner has accepted as missing.
+        where: location for messages.
 
     Raises:
-        InputError: with every guard that is missed, and what happens without it.
+        InputError: with every missing guard and its consequence.
     """
     if Object.PRODUCER_HEARTBEAT in lacking:
         raise InputError(

@@ -1,4 +1,4 @@
-"""What ends a session while it runs: everything the drives, the bus and the clock can show."""
+"""Detection of faults that end a running session, in the drives, the bus and the clock."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rfdropo_bayes.deployment.objects import NmtState, Object
 
 
 class Patience(NamedTuple):
-    """How much is borne.
+    """Fault tolerances.
 
     Attributes:
-        misses: so many deadlines missed by more than a cycle within ``misses_within_s`` end the session.
+        misses: number of deadlines missed by more than a cycle within ``misses_within_s`` that ends the session.
         misses_within_s: see above [s].
-        stale_cycles: cycles without a TPDO of some drive.
+        stale_cycles: largest number of cycles without a TPDO of some drive.
         heartbeat_s: time without a drive's heartbeat [s].
         following_error_m, following_time_s: lag behind a set-point [m], and for how long [s].
     """
@@ -33,11 +33,11 @@ class Patience(NamedTuple):
 
 
 class Watch:
-    """Looks at every cycle and raises `Stop` where one must be the last.
+    """Checks every cycle and raises `Stop` on a fault.
 
     Args:
-        drives: to look at.
-        patience: see there.
+        drives: drives to check.
+        patience: fault tolerances.
     """
 
     def __init__(self, drives: Drives, patience: Patience) -> None:
@@ -47,22 +47,22 @@ class Watch:
         self.begin()
 
     def begin(self) -> None:
-        """Look on from now; what came before does not count."""
+        """Start the watch; earlier events do not count."""
         self._short = [drive.short_frames for drive in self._drives.all]
         self._drives.emergencies.clear()
         self._started = time.monotonic()
         self._lagging: dict[Drive, float] = {}  # since when
 
     def check(self, tick: Tick, expected: DriveState | None, tension: bool = True) -> None:
-        """Look at a cycle after its exchange.
+        """Check a cycle after its exchange.
 
         Args:
-            tick: of the cycle.
+            tick: the cycle.
             expected: state that every drive must be in; None while they are brought there.
             tension: whether a tension above the limit counts.
 
         Raises:
-            Stop: with the first cause found; those that name a culprit come first.
+            Stop: with the first cause found; causes that name a drive come first.
         """
         now = time.monotonic()
         self._check_emergencies()
@@ -81,7 +81,7 @@ class Watch:
     def _check_emergencies(self) -> None:
         while self._drives.emergencies:
             emergency = self._drives.emergencies.popleft()
-            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not say which axis it means
+            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not name the axis
             if emergency.code == 0x8611:
                 raise Stop(Cause.FOLLOWING_ERROR, f"{drive} does not follow its set-points")
             if emergency.code:
@@ -109,7 +109,7 @@ class Watch:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
 
     def _check_lag(self, drive: Drive, now: float) -> None:
-        """A drive may repeat an old "operation enabled" for ever; that it does not move is what betrays it."""
+        """A drive may repeat an old "operation enabled" for ever; only its lack of motion reveals it."""
         if drive.reading is None:
             return
         lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre
@@ -142,7 +142,7 @@ class AfterStop:
         self.found: list[str] = []
 
     def look(self) -> list[str]:
-        """What has been seen since the last look; each drive is told of once."""
+        """Events since the last call; each drive is reported once."""
         new = [line for drive in self._to_hold if (line := self._seen(drive))]
         self._to_hold = [drive for drive in self._to_hold if not any(line.startswith(drive.name) for line in new)]
         self.found += new

@@ -1,4 +1,4 @@
-"""What a simulator lacks, by name: show, name, extend, measure; see docs/audit.md."""
+"""The effects that a simulator lacks: detection, naming, extension, gain; see docs/audit.md."""
 
 from rfdropo_bayes.runtime import configure_jax
 

@@ -53,7 +53,9 @@ def record(
         "candidates": _candidates(answer),
         "between": _between(answer, findings),
         "base_fit_converged": answer.base.converged,
-        "out_of_time": answer.cost.stopped,
+        "out_of_time": bool(answer.cost.stopped),
+        "stopped": answer.cost.stopped,
+        "not_done": list(answer.cost.left),
         "left_out": dict(answer.problem.left_out),
         "adopted": [step.name for step in answer.adopted],
         "unsupported": list(answer.causes.unsupported),
@@ -341,7 +343,7 @@ def _where(answer: Answer) -> dict[str, Any]:
 def _candidates(answer: Answer) -> list[dict[str, Any]]:
     """Every candidate as the screen of the base model saw it, best first."""
     first = answer.causes.screens[0]
-    refits = answer.causes.steps[0].refits if answer.causes.steps else {}
+    refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
 
 

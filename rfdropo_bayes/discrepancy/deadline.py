@@ -1,17 +1,22 @@
-"""How long an audit may take, and where its time goes: when it is up, the audit stops between two batches of rollouts,
-and says what it knows."""
+"""Time limit and time profile of an audit: after the limit it stops between two batches of rollouts, and reports its
+present results.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import NoReturn
 
 from rfdropo_bayes.discrepancy.processor_wait import delay, thread_times
+from rfdropo_bayes.interrupts import interrupted
 from rfdropo_bayes.runtime import available_processors
 
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
+PATIENCE = 20.0  # seconds that the same may take after Ctrl-C
+TIME, INTERRUPT = "time", "interrupt"
 BETWEEN_STAGES = "preparation and report"
 
 
@@ -24,11 +29,12 @@ class Deadline:
     """A limit on the time of a whole run, by the clock on the wall: on a busy machine, less is done within it.
 
     Attributes:
-        minutes: from its making on; infinite for no limit.
-        where: the setting that holds them.
-        share: part of the time after which rollouts stop.
+        minutes: limit from its creation; infinite for no limit.
+        where: setting of the limit.
+        share: share of the time after which rollouts stop.
         reached: whether anything was left undone.
-        waited: seconds that the run has waited for processors which other programs held, see `delay`.
+        why: its reason, "time" or "interrupt".
+        waited: seconds of waiting for processors used by other programs, see `delay`.
     """
 
     minutes: float = float("inf")
@@ -36,6 +42,7 @@ class Deadline:
     share: float = 1.0 - KEPT
     began: float = field(default_factory=time.monotonic)
     reached: bool = False
+    why: str = ""
     waited: float = 0.0
     _spent: dict[str, float] = field(default_factory=dict)
     _stages: list[str] = field(default_factory=lambda: [BETWEEN_STAGES])
@@ -44,7 +51,7 @@ class Deadline:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the time within as that of a stage; of stages within one another, as that of the innermost."""
+        """Count the time within for a stage; nested stages count for the innermost."""
         self._charge()
         self._stages.append(name)
         try:
@@ -54,7 +61,7 @@ class Deadline:
             self._stages.pop()
 
     def recall(self, seconds: float) -> None:
-        """Count what an earlier part of the run has spent on what is now looked up."""
+        """Count the time that an earlier part of the run spent on a result that is now looked up."""
         self._spent[self._stages[-1]] = self._spent.get(self._stages[-1], 0.0) + seconds
 
     @property
@@ -75,15 +82,41 @@ class Deadline:
         return self.share * self.minutes - (time.monotonic() - self.began) / 60.0
 
     def check(self) -> None:
-        """Raise OutOfTime once the time is up."""
+        """Raise OutOfTime once the time is up, or after Ctrl-C."""
         self._charge()
+        if self.why != INTERRUPT and interrupted():
+            self._stop(INTERRUPT)
         if self.left <= 0.0:
-            self.reached = True
-            raise OutOfTime
+            self._stop(TIME)
+
+    def _stop(self, why: str) -> NoReturn:
+        self.reached, self.why = True, self.why or why
+        raise OutOfTime
+
+    @contextmanager
+    def stopping(self, report: Callable[[str], None]) -> Iterator[None]:
+        """Block that the time limit or Ctrl-C may end; execution continues after it."""
+        try:
+            yield
+        except (OutOfTime, KeyboardInterrupt):
+            self.reached, self.why = True, self.why or INTERRUPT
+            report("the time is up" if self.why == TIME else "stopping: the answer has the present results")
+
+    @contextmanager
+    def granted(self, seconds: float | None = None) -> Iterator[None]:
+        """Grant ``seconds`` from now; by default the reserve for the end, once the time is up."""
+        minutes, share = self.minutes, self.share
+        if seconds is None:
+            seconds = 60.0 * KEPT * minutes if self.why == TIME else PATIENCE
+        self.minutes, self.share = (time.monotonic() - self.began + seconds) / 60.0, 1.0
+        try:
+            yield
+        finally:
+            self.minutes, self.share = minutes, share
 
     @contextmanager
     def reserve(self) -> Iterator[None]:
-        """Use the time that is kept for the gain, too."""
+        """Also use the time reserved for the gain."""
         share, self.share = self.share, 1.0
         try:
             yield

@@ -1,14 +1,13 @@
-"""The audit's last word: what acts on the robot that the library does not have, described as a law at a port.
+"""Last part of an audit: an effect on the robot that the library lacks, described as a law at a port.
 
-It is asked where the library leaves something: beside the base model, and where that finds nothing better than what the
-library named, beside the model with what it named. A library candidate that a law beats clearly on unseen recordings
-stands in for the law, and is not adopted as a cause.
+It runs if the library leaves a misfit: beside the base model and, if that is no better than the named mechanisms,
+beside the model with them. A library candidate that a law beats clearly on unseen recordings stands in for the law, and
+is not adopted as a cause.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,27 +15,27 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
-from rfdropo_bayes.discrepancy.deadline import OutOfTime
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, Rules
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, Rules
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
 from rfdropo_bayes.discrepancy.gain import Gain
 from rfdropo_bayes.discrepancy.held_out import HeldOut, JudgedModel, predicted, stages_of
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.law_search import FoundLaw, Refit, law_search
+from rfdropo_bayes.discrepancy.naming import Named
+from rfdropo_bayes.discrepancy.repairs import without
 
 
 @dataclass(frozen=True)
 class Described:
-    """What a search for laws says of an audit.
+    """Result of a search for laws in an audit.
 
     Attributes:
         found: ports and law.
-        steps: of the library's mechanisms that the law stands beside, in the model.
-        stand_ins: mechanisms of the library that the law takes the place of.
-        gain: of the law on recordings that no fit has seen, against the model without it; None where there is no
-            law, or the time was up.
-        overall: the same against the base model.
-        held_out: predictions of these recordings: of the base model, and last of the model with the law.
+        steps: library mechanisms in the model beside the law.
+        stand_ins: library mechanisms that the law replaces.
+        gain: gain of the law on unseen recordings over the model without it; None without a law, or if the time was up.
+        overall: the same over the base model.
+        held_out: predictions of these recordings: by the base model, and last by the model with the law.
         holds: whether unseen recordings clearly support the law.
     """
 
@@ -65,92 +64,70 @@ class Described:
         return None if last is None else (widened(last.target, last.fit), last.target)
 
 
-@dataclass(frozen=True)
-class NamedModel:
-    """The base model with what the library named.
-
-    Attributes:
-        judge, base: the target under which the base model was fitted, and its fit under that.
-        steps: likewise.
-    """
-
-    judge: FitTarget
-    base: Fit
-    steps: tuple[Added, ...] = ()
-
-    @property
-    def last(self) -> tuple[FitTarget, Fit]:
-        """Target and fit with all steps."""
-        return (self.steps[-1].judge, self.steps[-1].fit) if self.steps else (self.judge, self.base)
-
-
 def describe(
-    problem: AuditProblem,
-    model: NamedModel,
-    held_out: HeldOut | None,
-    report: Callable[[str], None] = lambda line: None,
-) -> Described | None:
-    """Where something acts that the library does not have, and by what law; None where nobody asks, or no time is left.
+    problem: AuditProblem, model: Named, held_out: HeldOut | None, report: Callable[[str], None] = lambda line: None
+) -> Iterator[Described]:
+    """Port and law of an effect that the library lacks; nothing if not requested.
 
     Args:
-        problem: with the ports of its simulator.
-        model: the base model, and what the library named.
+        problem: problem with the ports of its simulator.
+        model: the base model with the named mechanisms.
         held_out: predictions of unseen recordings by the base model and after each step; None without steps.
         report: called with a line of words now and then.
     """
     if problem.ports is None or problem.compared is not None:
-        return None
-    answer: Described | None = None
-    clock = model.judge.forward.deadline
-    with clock.stage("ports and laws"), clock.reserve(), suppress(OutOfTime):
-        answer = _beside(problem, replace(model, steps=()), report)
+        return
+    clock = model.search.target.forward.deadline
+    with clock.stage("ports and laws"), clock.reserve():
+        alone = _beside(problem, model.extended(()), report)
         if not model.steps:
-            return answer
-        names = tuple(step.name for step in model.steps)
-        seen = answer.held_out if answer.holds else None
-        if held_out is not None and seen is not None and seen.beside(held_out.after(len(names))).clear:
-            report(f"the law takes the place of {' and '.join(names)}")
-            return replace(answer, stand_ins=names)
+            yield alone
+            return
+        yield replace(alone, holds=False)  # until it is compared with the named mechanisms
+        seen = alone.held_out if alone.holds else None
+        if held_out is not None and seen is not None and seen.beside(held_out.after(len(model.steps))).clear:
+            report(f"the law takes the place of {' and '.join(model.names)}")
+            yield replace(alone, stand_ins=tuple(model.names))
+            return
         further = _beside(problem, model, report)
-        if not further.holds:
-            return replace(answer, holds=False)
-        alone, answer = answer, further
-        answer = _without_stand_ins(problem, model, alone, further, report)
-    return answer
+        if further.holds:
+            yield further
+            yield _without_stand_ins(problem, model, alone, further, report)
 
 
 def _without_stand_ins(
-    problem: AuditProblem, model: NamedModel, alone: Described, described: Described, report: Callable[[str], None]
+    problem: AuditProblem, model: Named, alone: Described, described: Described, report: Callable[[str], None]
 ) -> Described:
-    """The law beside those mechanisms only that unseen recordings ask for once it is in the model.
+    """The law beside only the mechanisms that unseen recordings still support with it.
 
-    What acts beside a named cause has stand-ins among the later ones. The law is looked for anew without these, and
-    kept if unseen recordings are not clearly likelier with them.
+    Later mechanisms may be stand-ins for an effect beside a named cause. The law is searched again without them, and
+    kept unless unseen recordings are clearly likelier with them.
 
     Args:
         alone: the law beside the base model.
         described: the law beside all of the model's mechanisms.
     """
     needed = _needed(problem, described)
-    gone = tuple(step.name for step in model.steps if step.name not in needed)
+    gone = tuple(name for name in model.names if name not in needed)
     if not gone or described.held_out is None:
         return described
     report(f"with the law, unseen recordings do not ask for {' and '.join(gone)}: the law without them")
-    again = alone
-    if needed:
-        search, steps = ExtensionSearch(model.judge, problem.candidates, problem.rules, problem.seed), model.steps
-        for name in gone:
-            index = [step.name for step in steps].index(name)
-            steps = tuple(search.without(steps, index, model.base))
-        judge, fit = fit_with_noise(steps[-1].judge.measured, steps[-1].fit.x, steps[-1].fit.free)
-        again = _beside(problem, replace(model, steps=(*steps[:-1], replace(steps[-1], judge=judge, fit=fit))), report)
+    again = _beside(problem, _without(model, gone), report) if needed else alone
     if not again.holds or again.held_out is None or described.held_out.beside(again.held_out).clear:
         return described
     return replace(again, stand_ins=gone)
 
 
+def _without(model: Named, gone: Sequence[str]) -> Named:
+    """A model without some of its mechanisms, with a new noise model."""
+    for name in gone:
+        model = model.extended(without(model.asked, model.steps, model.names.index(name), model.base))
+    judge, fit = fit_with_noise(model.judge.measured, model.fit.x, model.fit.free)
+    return model.extended([*model.steps[:-1], replace(model.steps[-1], judge=judge, fit=fit)])
+
+
 def _needed(problem: AuditProblem, described: Described) -> list[str]:
-    """Mechanisms beside a law without which unseen recordings are clearly less likely; the last one is asked first."""
+    """Mechanisms beside a law without which unseen recordings are clearly less likely; the last is tested first."""
     assert described.last is not None
     judge, fit, coordinates = described.last.target, described.last.fit, described.last.target.forward.coordinates
     finer = DISCRETISATION in described.beside
@@ -172,26 +149,26 @@ def _needed(problem: AuditProblem, described: Described) -> list[str]:
     return needed
 
 
-def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], None]) -> Described:
-    """The law beside a model, and what it is worth on unseen recordings."""
+def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) -> Described:
+    """The law beside a model, and its gain on unseen recordings."""
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    target, fit = model.last
+    target, fit = model.judge, model.fit
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups)
     found = law_search(target, *options).find(target, fit)
     if not found.terms:
         return Described(found, model.steps)
-    stages = stages_of(model.judge, model.base, model.steps)
+    stages = stages_of(model.search.target, model.base, model.steps)
     named = len(stages) - 1
     stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
-    held_out = predicted(problem, model.judge.measured, stages)
+    held_out = predicted(problem, model.search.target.measured, stages)
     if held_out.count < len(stages):
         report(f"with {len(found.terms)} terms, an unseen recording cannot be simulated")
         found = found.cut(max(held_out.count - 1 - named, 0))
         if not found.terms:
             return Described(found, model.steps)
-    # As with what the library names, a law is cut to what unseen recordings support.
+    # Like named mechanisms, a law is cut to its supported terms.
     kept = held_out.supported_from(named) - named or len(found.terms)
     if kept < len(found.terms):
         report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")
@@ -209,7 +186,7 @@ def holds_on(rules: Rules, gain: Gain) -> bool:
 def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
     """Coefficients of a law: mean, deviation, quantiles and unit, by the model's normal approximation.
 
-    Shapes of features stand beside them; their deviation is None where they are not inferred.
+    Shapes of features stand beside them; their deviation is None if they are not inferred.
     """
     if described.sizes is None:
         return []

@@ -1,9 +1,8 @@
-"""Which commands would tell the leading explanations apart, and how surely.
+"""Which commands would distinguish the leading explanations, and with which probability.
 
-A hypothesis that is true makes another one misfit by ``lambda``, the squared whitened distance that is left when the
-other has moved all its parameters as well as it can, on the recordings at hand and the new one together (T-optimality;
-Atkinson and Fedorov 1975, Biometrika 62:57-70). Twice the expected log likelihood ratio is lambda, and the better
-hypothesis is found with probability ``Phi(sqrt(lambda) / 2)``.
+If one hypothesis is true, another has the misfit ``lambda``: the squared whitened distance after its best fit to the
+given and the new recordings together (T-optimality; Atkinson and Fedorov 1975, Biometrika 62:57-70). Twice the expected
+log likelihood ratio is lambda, and the better hypothesis is found with probability ``Phi(sqrt(lambda) / 2)``.
 """
 
 from __future__ import annotations
@@ -23,8 +22,9 @@ from rfdropo_bayes.simulators.commands import Commands, stack_commands
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An explanation and its fit to the recordings at hand; ``forward`` has its law at a port, and is None where it is
-    none."""
+    """An explanation and its fit to the given recordings; ``forward`` has its law at a port, and is None without a
+    law.
+    """
 
     name: str
     fit: Fit
@@ -33,11 +33,10 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class DesignOutlook:
-    """What a command sequence would decide.
+    """Expected information of a command sequence.
 
     Attributes:
-        separation: lambda of the pair of hypotheses that it separates least; pairs: of each pair, the lesser of both
-            directions.
+        separation: smallest lambda over pairs of hypotheses; pairs: lambda of each pair, the lesser of both directions.
         right: probability that the better hypothesis of the worst pair is found.
         information: gain of the base parameters' information, in nats (half the growth of the log determinant).
     """
@@ -51,12 +50,12 @@ class DesignOutlook:
 def outlooks(
     target: FitTarget, base: Fit, hypotheses: Sequence[Hypothesis], sequences: Sequence[Commands]
 ) -> list[DesignOutlook]:
-    """Outlook of each command sequence, recorded once with the noise and at the times of the first recording at hand.
+    """Outlook of each command sequence, recorded once with the noise and at the times of the first given recording.
 
     Args:
-        target: the recordings at hand; base: the base model's fit to them.
-        hypotheses: explanations to be told apart; with fewer than two, only the information counts.
-        sequences: on the simulator's clock, shaped like the recordings at hand.
+        target: the given recordings; base: the base model's fit to them.
+        hypotheses: explanations to distinguish; with fewer than two, only the information counts.
+        sequences: commands on the simulator's clock, shaped like the given recordings.
     """
     forward = target.forward
     stacked = stack_commands(sequences)
@@ -124,7 +123,7 @@ def _information(base: Fit, jacobian: Float[np.ndarray, "m free"]) -> float:
 
 
 def best(outlook: Sequence[DesignOutlook], separating: bool) -> int:
-    """The sequence that separates most, or that informs most where there is nothing to separate."""
+    """The sequence that separates most, or that informs most if there is nothing to separate."""
     return int(np.argmax([o.separation if separating else o.information for o in outlook]))
 
 

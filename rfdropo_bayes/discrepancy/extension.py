@@ -1,9 +1,8 @@
-"""Naming causes: the leading classes are refitted, the best joins the model, and the next screen follows."""
+"""One step of naming causes: a model is screened, the leading classes are refitted, and the best may join it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,24 +16,23 @@ from rfdropo_bayes.discrepancy.candidates import (
     lead,
     probe_all,
     screening_rollouts,
-    start_together,
 )
-from rfdropo_bayes.discrepancy.deadline import OutOfTime, about
+from rfdropo_bayes.discrepancy.deadline import about
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.gain import noise_distance
-from rfdropo_bayes.discrepancy.inadequacy import as_measured, far_off, fit_with_noise
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, far_off
 from rfdropo_bayes.discrepancy.omnibus import Omnibus
-from rfdropo_bayes.discrepancy.score import joint_statistic, likeness, project_out, span
-from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow, p_in_words, screen
+from rfdropo_bayes.discrepancy.score import likeness, project_out, span
+from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow, screen
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 SCANNED = tuple((k + 0.5) / 32 for k in range(32))
-"""Quantiles of the prior of a candidate's size among which a climb's start is looked for. Of a delay of 70 ms under
-a noise of 0.3 mm the summit is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms."""
+"""Quantiles of the prior of a candidate's size that are tried as starts of an optimisation. The optimum of a delay of
+70 ms under a noise of 0.3 mm is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms.
+"""
 TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
-PAIRS = 3  # that are refitted
 # Nats of evidence that a parameter which the data fix costs under a prior twice as wide. Widths are chosen by hand: a
 # family of many parameters must not owe its place to that choice.
 WIDER = float(np.log(2.0))
@@ -45,18 +43,18 @@ class Rules:
     """Numbers the verdict depends on, fixed in advance.
 
     Attributes:
-        family: probability that the screen names anything where nothing is wrong.
-        class_cosine: signatures more alike than this are one class.
-        classes: leading classes that are refitted; members: candidates refitted in all.
-        effects: most mechanisms that are added to a model that is not far off.
-        evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
-            the number of candidates more, since with so many to choose from a few together imitate most things. One
-            that brings so much less than the best is no longer its equal.
-        bootstraps: simulated data sets behind every p-value.
-        minutes: for the whole audit; when they are up it finishes with what it knows.
-        base_passes, extended_passes: p-values of the joint test from which a model is let pass.
+        family: probability that the score tests name a candidate although the model is right.
+        class_cosine: cosine above which signatures are one class.
+        classes: number of leading classes to refit; members: total number of candidates to refit.
+        effects: most mechanisms added to a model that is not misspecified.
+        evidence: log Bayes factor required to add a mechanism. Later mechanisms need the logarithm of the number of
+            candidates in addition, since a few of many candidates together imitate most effects. Candidates within this
+            difference of the best are equivalent.
+        bootstraps: number of simulated data sets per p-value.
+        minutes: limit of the whole audit; it then finishes with its present results.
+        base_passes, extended_passes: p-values of the joint test above which a model passes.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
-        matters: distance of a marker [m] below which a discrepancy does not; None where nobody says.
+        matters: distance of a marker [m] below which a discrepancy does not matter; None if not stated.
     """
 
     family: float = 0.02
@@ -76,18 +74,18 @@ class Rules:
 
 @dataclass(frozen=True)
 class Added:
-    """One mechanism that joined the model.
+    """One mechanism added to the model.
 
     Attributes:
-        name: of the mechanism.
-        members: its equivalence class, itself first: what looks the same and explains as much, and what has as much
-            evidence once it is refitted, but for `Rules.evidence`.
-        before: the screen of the model without it.
-        fit: of the model with it.
-        log_bayes_factor: of the model with against that without it, by Laplace.
-        refits: log Bayes factors of all candidates that were refitted at this step.
-        judge: the target under which the fit was found, see `inadequacy`. From the step `DISCRETISATION` on it has the
-            finer simulator.
+        name: name of the mechanism.
+        members: its equivalence class, itself first: candidates with the same signature and explained share, and
+            refitted candidates within `Rules.evidence`.
+        before: score tests of the model without it.
+        fit: fit of the model with it.
+        log_bayes_factor: of the models with and without it, by Laplace.
+        refits: log Bayes factors of all refitted candidates of this step.
+        judge: the target under which the fit was found, see `inadequacy`. It has the finer simulator from the step
+            `DISCRETISATION` on.
     """
 
     name: str
@@ -99,16 +97,42 @@ class Added:
     judge: FitTarget
 
 
-@dataclass
-class ExtensionSearch:
-    """The search over extensions of the base model: which of the candidates does it lack?
+@dataclass(frozen=True)
+class Refits:
+    """The candidates refitted beside a model so far.
 
     Attributes:
-        target: data, noise and simulator; every candidate is in the simulator, at its null value. Its noise
-            is that under which the present model is judged, see `inadequacy`; its simulator that of the present model.
-        candidates: that may be named.
+        rows: significant rows of the score tests.
+        drops: possible drop of the sum of squares for each of them.
+        fits: fit of the model with each refitted candidate.
+        waiting: leading candidates without a refit.
+    """
+
+    rows: tuple[ScreenRow, ...]
+    drops: Mapping[str, float]
+    fits: Mapping[str, Fit]
+    waiting: tuple[str, ...]
+
+    def with_fit(self, name: str, fit: Fit) -> Refits:
+        """The same with one more fit, or with a better fit."""
+        waiting = tuple(each for each in self.waiting if each != name)
+        return replace(self, fits={**self.fits, name: fit}, waiting=waiting)
+
+    def gains(self, before: Fit) -> dict[str, float]:
+        """Log Bayes factor of each candidate against the model before."""
+        return {name: fit.log_evidence - before.log_evidence for name, fit in self.fits.items()}
+
+
+@dataclass(frozen=True)
+class ExtensionSearch:
+    """The search for candidates that a model lacks.
+
+    Attributes:
+        target: data, noise and simulator; every candidate is in the simulator, at its null value. Noise and simulator
+            are the present model's, see `inadequacy`.
+        candidates: mechanisms that may be named.
         rules: see `Rules`.
-        seed: of all bootstraps.
+        seed: seed of all bootstraps.
         finer: the simulator on a finer mesh and time step, for the candidate `DISCRETISATION`; None without it.
         report: called with a line of words as the search goes on.
     """
@@ -120,14 +144,28 @@ class ExtensionSearch:
     finer: Forward | None = None
     report: Callable[[str], None] = lambda line: None
 
-    def screened(self, fit: Fit, without: Sequence[str] = ()) -> tuple[Screen, list[Probe]]:
-        """Test a fit and screen the candidates that are not in it.
+    def under(self, target: FitTarget) -> ExtensionSearch:
+        """The same search with another noise or simulator."""
+        return self if target is self.target else replace(self, target=target)
 
-        An error of the mesh or time step that is too small to be named is no discrepancy either: where the residuals
-        of the finer simulator pass more easily, it is they that count. Too small is one that the screen does not see,
-        or that moves the markers by no more than the noise: see `_below_the_noise`.
+    def candidate(self, name: str) -> Candidate | None:
+        """A candidate by its name; None for `DISCRETISATION`."""
+        return next((each for each in self.candidates if each.name == name), None)
+
+    def room(self, steps: int) -> int:
+        """Number of mechanisms that may still be added. A misspecified model may lack many, and down-weighted rows keep
+        out imitations.
         """
-        # Of a family of parameters, some may be in the model by themselves.
+        return len(self.candidates) if self.target.known is not None else self.rules.effects - steps
+
+    def screened(self, fit: Fit, without: Sequence[str] = ()) -> Screen:
+        """Test a fit and its missing candidates.
+
+        An error of mesh or time step that is too small to be named is not counted as a discrepancy: the residuals of
+        the finer simulator are used if they pass more easily. An error is too small if the score test does not see it,
+        or if it moves the markers by less than the noise, see `_below_the_noise`.
+        """
+        # Some members of a family of parameters may be in the model already.
         left = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
         free = [
             c
@@ -150,9 +188,9 @@ class ExtensionSearch:
         with clock.stage("joint test"):
             found = screen(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
             if self.target.known is not None:  # whether anything is wrong, the noise of the measurement says
-                return replace(found, omnibus=self._tested(fit, len(without)), finer=None), probes
+                return replace(found, omnibus=self._tested(fit, len(without)), finer=None)
             if found.finer is None:
-                return found, probes
+                return found
             seen = found.row(DISCRETISATION).adjusted_p <= self.rules.family
             if seen and self._below_the_noise(fit):
                 exact = _without_numerical_error(fit, probes[-1])
@@ -160,7 +198,7 @@ class ExtensionSearch:
                 found, seen = replace(found, finer=again.finer), False
         if not seen and found.finer is not None:
             found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
-        return found, probes
+        return found
 
     def _below_the_noise(self, fit: Fit) -> bool:
         """Whether a finer mesh and time step move the markers by no more than the noise of one measurement.
@@ -183,177 +221,52 @@ class ExtensionSearch:
         measured = as_measured(self.target, fit)
         return screen(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
 
-    def name_causes(self, base: Fit) -> tuple[Fit, list[Added], Screen]:
-        """Forward-stepwise extension: the base model, the steps taken, and the screen of the final model.
-
-        The base model is another one where a candidate has led to a better optimum of it. When the time is up: the
-        steps so far, and a joint test without candidates.
-        """
-        bases, steps = [base], list[Added]()
-        try:
-            found = self._name_causes(bases, steps)
-        except OutOfTime:
-            found = self.tested(steps[-1].fit if steps else bases[-1], len(steps))
-        return bases[-1], without_each_other(steps), found
-
-    def _name_causes(self, bases: list[Fit], steps: list[Added]) -> Screen:
-        """Append steps until no more are called for, and better base models; the screen of the final model."""
-        fit = bases[-1]
-        renewed: set[int] = set()  # numbers of steps at which the model was climbed again: once at each
-        while True:
-            named = [step.name for step in steps]
-            if steps:
-                self.target, fit = fit_with_noise(self.target.measured, fit.x, fit.free)
-                steps[-1] = replace(steps[-1], fit=fit, judge=self.target)
-            found, _ = self.screened(fit, named)
-            if not steps and found.omnibus.p > self.rules.base_passes:
-                return found
-            p = p_in_words(found.omnibus.p, self.rules.bootstraps)
-            self.report(f"joint test p {p}; first: {found.rows[0].name if found.rows else 'none'}")
-            if self._room(steps) < 1 or found.omnibus.p > self.rules.extended_passes:
-                return found
-            with self.target.forward.deadline.stage("refits"):
-                step = self._extend(found, named)
-                pair = list[Added]()
-                with suppress(OutOfTime):
-                    pair = self._pair(found, named, step) if self._room(steps) > 1 else []
-            if pair:
-                steps += pair
-                with self.target.forward.deadline.stage("refits"):
-                    steps[:] = self._without_needless(bases[-1], steps)
-                fit = steps[-1].fit
-                continue
-            if step is None:
-                return found
-            better = None
-            if len(steps) not in renewed:
-                with self.target.forward.deadline.stage("refits"), suppress(OutOfTime):
-                    better = self._climbed_again(step)
-            if better is not None:
-                renewed.add(len(steps))
-                self.report(f"without {step.name}, a better optimum than before: the question once more")
-                if steps:
-                    gained = better.log_evidence - fit.log_evidence
-                    steps[-1] = replace(steps[-1], fit=better, log_bayes_factor=steps[-1].log_bayes_factor + gained)
-                else:
-                    bases.append(better)
-                fit = better
-                continue
-            steps.append(step)
-            self.target, fit = step.judge, step.fit
-            if len(steps) > 1:
-                with self.target.forward.deadline.stage("refits"):
-                    steps[:] = self._without_needless(bases[-1], self._reconsider(bases[-1], steps))
-                fit = steps[-1].fit
-
-    def _room(self, steps: Sequence[Added]) -> int:
-        """How many mechanisms may still be added: a model that is far off lacks more than a few, and rows that count
-        as few keep out what only imitates them."""
-        return len(self.candidates) if self.target.known is not None else self.rules.effects - len(steps)
-
-    def _extend(self, found: Screen, named: Sequence[str]) -> Added | None:
-        """Refit the leading classes and add the best of them, if it is worth it."""
+    def refits(self, found: Screen) -> Iterator[Refits]:
+        """The leading classes, one candidate refitted after the other; then the best of them from afar, see
+        `_from_afar`."""
         significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
         if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(found.fit):
             significant = [row for row in significant if row.name != DISCRETISATION]
-        refits: dict[str, float] = {}
-        fits: dict[str, Fit] = {}
         leads = {row.name: self._lead(found.fit, row) for row in significant}
-        # When the time is up, the refits that are done decide.
-        with suppress(OutOfTime):
-            leading = self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit)
-            if leading:
-                count = len(leading) * climb_rollouts(self.target, len(found.fit.free) + 1)
-                seconds = count * self.target.forward.pace
-                self.report(f"refitting {len(leading)} leading candidates: up to {count} rollouts, {about(seconds)}")
-            for row in leading:
-                fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
-                refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
-                self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
-            for name in sorted(refits, key=lambda name: -refits[name])[: self.rules.classes]:
-                fits[name] = self._from_afar(name, fits[name])
-                refits[name] = fits[name].log_evidence - found.fit.log_evidence
-        further = np.log(len(self.candidates)) if named else 0.0
-        worth = [name for name, gained in refits.items() if gained >= self.rules.evidence + further]
+        drops = {name: drop for name, (drop, _) in leads.items()}
+        leading = self._leading(significant, drops, found.fit)
+        if leading:
+            count = len(leading) * climb_rollouts(self.target, len(found.fit.free) + 1)
+            seconds = count * self.target.forward.pace
+            self.report(f"refitting {len(leading)} leading candidates: up to {count} rollouts, {about(seconds)}")
+        tried = Refits(tuple(significant), drops, {}, tuple(row.name for row in leading))
+        yield tried
+        for row in leading:
+            tried = tried.with_fit(row.name, self._refit(found.fit, row, leads[row.name][1]))
+            self.report(f"refit with {row.name}: log Bayes factor {tried.gains(found.fit)[row.name]:.1f}")
+            yield tried
+        for name in sorted(tried.fits, key=lambda name: -tried.fits[name].log_evidence)[: self.rules.classes]:
+            tried = tried.with_fit(name, self._from_afar(name, tried.fits[name]))
+            yield tried
+
+    def best(self, found: Screen, tried: Refits, further: bool) -> Added | None:
+        """The best of the refitted candidates with its class; None if no candidate is worth it.
+
+        Args:
+            found: score tests of the model without it.
+            tried: the refits so far.
+            further: whether the model has mechanisms already, so that another needs more evidence.
+        """
+        gains = tried.gains(found.fit)
+        price = np.log(len(self.candidates)) if further else 0.0
+        worth = [name for name, gained in gains.items() if gained >= self.rules.evidence + price]
         if not worth:
             return None
-        best = max(worth, key=lambda name: refits[name] - WIDER * len(fits[name].free))
-        enough = self.rules.class_cosine**2 * leads[best][0]
-        able = [row for row in significant if leads[row.name][0] > enough]
-        # What looks the same near null may be another thing at the size that it has.
-        able = [row for row in able if refits.get(row.name, np.inf) > refits[best] - TOLD_APART]
+        best = max(worth, key=lambda name: gains[name] - WIDER * len(tried.fits[name].free))
+        enough = self.rules.class_cosine**2 * tried.drops[best]
+        able = [row for row in tried.rows if tried.drops[row.name] > enough]
+        # Candidates with equal signatures near null may differ at their fitted size.
+        able = [row for row in able if gains.get(row.name, np.inf) > gains[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
-        # What brings nearly as much, whatever it looks like, is no less likely a cause.
-        members += tuple(n for n in worth if n not in members and refits[n] > refits[best] - self.rules.evidence)
+        # A candidate of nearly equal gain is as likely a cause, for any signature.
+        members += tuple(n for n in worth if n not in members and gains[n] > gains[best] - self.rules.evidence)
         judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
-        return Added(best, members, found, fits[best], refits[best], refits, judge)
-
-    def _pair(self, found: Screen, named: Sequence[str], single: Added | None) -> list[Added]:
-        """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
-
-        Of compliance and pretension of cables neither does much without the other. Pairs are ranked by what the linear
-        model says of them, and the leading ones are refitted.
-        """
-        fit, last = found.fit, single.fit if single else found.fit
-        taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
-        if not far_off(single.judge if single else self.target, last.x):
-            return []
-        rows = {row.name: row for row in found.rows if row.probe is not None and row.name != DISCRETISATION}
-        heads = sorted(rows.values(), key=lambda row: -row.lm)[: self.rules.members]
-        drops = {
-            tuple(sorted((a.name, b.name))): joint_statistic(a.probe.mark, b.probe.mark, fit.residual)
-            for a in heads
-            for b in rows.values()
-            if a.name != b.name and a.probe and b.probe
-        }
-        worth = self.rules.evidence + np.log(len(self.candidates))
-        leading = sorted((p for p in drops if drops[p] > taken + 2.0 * worth), key=lambda p: -drops[p])[:PAIRS]
-        fits = {}
-        with suppress(OutOfTime):
-            for names in leading:
-                fits[names] = self._refit_pair(fit, [rows[name] for name in names])
-                gained = fits[names].log_evidence - fit.log_evidence
-                self.report(f"refit with {' and '.join(names)}: log Bayes factor {gained:.1f}")
-        if not fits:
-            return []
-        best = max(fits, key=lambda names: fits[names].log_evidence - WIDER * len(fits[names].free))
-        enough = self._surpasses(fits[best], single.fit, worth) if single else True
-        if not enough or fits[best].log_evidence < fit.log_evidence + worth:
-            return []
-        alone = {name: self.refit(fit, rows[name]) for name in best}
-        first, second = sorted(best, key=lambda name: -alone[name].log_evidence)
-        between, _ = self.screened(alone[first], [*named, first])
-        gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
-        return [
-            Added(first, (first,), found, alone[first], gains[0], single.refits if single else {}, self.target),
-            Added(second, (second,), between, fits[best], gains[1], {}, self.target),
-        ]
-
-    def _refit_pair(self, fit: Fit, rows: Sequence[ScreenRow]) -> Fit:
-        """The model of a fit with two candidates in it."""
-        probes = [row.probe for row in rows if row.probe is not None]
-        chosen = [c.indices for c in self.candidates if c.name in [row.name for row in rows]]
-        held = [index for probe in probes for index in probe.point]
-        start = best_between(self.target, fit.x, start_together(fit, probes), held, SHARES)
-        return climb(self.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
-
-    def _climbed_again(self, step: Added) -> Fit | None:
-        """The model before a step, climbed from where the step led: a candidate must not be named for having moved a
-        climb on that had stopped early. None where that is no better."""
-        before = step.before.fit
-        free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
-        emptied = step.fit.x.copy()
-        emptied[added] = before.x[added]
-        # What base parameters can do, too, is theirs: a gain of all cables, beside the radius of their drums. Else it
-        # would be credited to the candidate.
-        place = {index: k for k, index in enumerate(free)}
-        own, others = ([place[index] for index in chosen] for chosen in (before.free, added))
-        done = step.fit.jacobian[:, others] @ (step.fit.x[added] - before.x[added])
-        imitated = emptied.copy()
-        imitated[before.free] += np.linalg.lstsq(step.fit.jacobian[:, own], done, rcond=1e-6)[0]
-        starts = np.clip(np.stack([emptied, imitated]), *self.target.forward.coordinates.bounds)
-        again = climb(self.target, starts[int(np.argmax(heights(self.target, starts, "without")))], before.free)
-        return again if again.log_evidence > before.log_evidence + 1.0 else None
+        return Added(best, members, found, tried.fits[best], gains[best], gains, judge)
 
     def _lead(self, fit: Fit, row: ScreenRow) -> tuple[float, np.ndarray]:
         """See `lead`; a finer mesh has no parameter, and its effect only one size."""
@@ -363,8 +276,9 @@ class ExtensionSearch:
         return lead(self.target, fit, row.probe, row.lm)
 
     def _leading(self, significant: Sequence[ScreenRow], drops: Mapping[str, float], fit: Fit) -> list[ScreenRow]:
-        """The best candidates of the leading classes, and further members of these while there is room; those that
-        cannot bring what a mechanism must are left out."""
+        """The best candidates of the leading classes, and further members of these while there is room; candidates that
+        cannot reach the required evidence are skipped, and candidates with slow rollouts come last.
+        """
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
         able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
         heads: list[ScreenRow] = []
@@ -377,11 +291,20 @@ class ExtensionSearch:
             elif alike:
                 rest.append(row)
         chosen = [*heads, *rest][: self.rules.members]
-        # A refit on a finer mesh costs as much as all others: only where it could win.
-        return [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
+        # A refit on a finer mesh costs as much as all others: only if it could win.
+        chosen = [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
+        return sorted(chosen, key=lambda row: self._costly(row.name))
+
+    def _costly(self, name: str) -> bool:
+        """Whether rollouts with a candidate take longer than others."""
+        candidate = self.candidate(name)
+        if candidate is None:
+            return True
+        costly, parameters = self.target.forward.lanes.costly, self.target.forward.coordinates.space.parameters
+        return any(parameters[index].physical in costly for index in candidate.indices)
 
     def _class_of(self, best: ScreenRow, able: Sequence[ScreenRow]) -> tuple[str, ...]:
-        """The best, and of those that explain as much of these data the ones that look the same."""
+        """The best candidate, and candidates of the same signature that explain the data equally well."""
         assert best.probe is not None
         alike = [
             row.name
@@ -400,15 +323,16 @@ class ExtensionSearch:
         if row.name == DISCRETISATION:
             assert self.finer is not None
             return climb(self.target.on(self.finer), start, fit.free)
+        candidate = self.candidate(row.name)
         assert row.probe is not None
-        candidate = next(c for c in self.candidates if c.name == row.name)
+        assert candidate is not None
         free = np.array([*fit.free, *np.setdiff1d(candidate.indices, fit.free)], dtype=int)
         start = best_between(self.target, fit.x, start, list(row.probe.point), SHARES)
         if len(candidate.indices) == 1:
             found = self._climbed_from_all_sizes(candidate.indices[0], fit.x, start, free)
         else:
             found = climb(self.target, start, free)
-        # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
+        # The model without the candidate is a special case: a worse result is a failed optimisation.
         if found.residual @ found.residual > fit.residual @ fit.residual:
             found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
         return found
@@ -416,10 +340,10 @@ class ExtensionSearch:
     def _climbed_from_all_sizes(
         self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
     ) -> Fit:
-        """A fit with a candidate of one parameter, climbed from the best of its sizes until no other one is better.
+        """A fit with a candidate of one parameter, optimised from the best of its sizes until no other size is better.
 
-        Of a shift in time the likelihood has a summit wherever jumps of commands meet the steps of the simulation or
-        the rows of a recording; on one of them a climb from no shift ends.
+        The likelihood of a time shift has an optimum wherever jumps of commands meet the steps of the simulation or the
+        rows of a recording; an optimisation from zero shift stops at one of them.
         """
         found = climb(self.target, self._best_size(index, base, start), free)
         while True:
@@ -440,10 +364,11 @@ class ExtensionSearch:
         return points[int(np.argmax(heights(self.target, points, "sizes")))]
 
     def _from_afar(self, name: str, fit: Fit) -> Fit:
-        """A fit with one amplitude that leaves most of a large misfit, or a better one from the middle of the base
-        parameters' priors: the base model's optimum, where it has made up for the effect, may be in another valley than
-        that of both together."""
-        candidate = next((c for c in self.candidates if c.name == name), None)
+        """A fit with one amplitude that leaves most of a large misfit, or a better fit from the centre of the base
+        parameters' priors. The base model's optimum, which compensates for the effect, may be in another basin than the
+        joint optimum.
+        """
+        candidate = self.candidate(name)
         if candidate is None or len(candidate.indices) != 1 or not far_off(self.target, fit.x):
             return fit
         coordinates = self.target.forward.coordinates
@@ -455,80 +380,18 @@ class ExtensionSearch:
         self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
         return best
 
-    def _surpasses(self, new: Fit, old: Fit, worth: float) -> bool:
-        """Whether a model may take the place of one that was chosen before: it must bring so many nats, and that also
-        under priors of its further parameters that are twice as wide."""
+    def surpasses(self, new: Fit, old: Fit, worth: float) -> bool:
+        """Whether a model may replace an earlier choice: it must bring ``worth`` nats, also under priors of its further
+        parameters that are twice as wide.
+        """
         further = max(len(new.free) - len(old.free), 0)
         return new.log_evidence > old.log_evidence + worth + WIDER * further
 
-    def without(self, steps: Sequence[Added], index: int, base: Fit) -> list[Added]:
-        """Steps less one of them that has parameters, the later ones refitted without it."""
-        candidate = next(c for c in self.candidates if c.name == steps[index].name)
-        gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
-        found, judges = list(steps[:index]), [step.judge for step in steps[: index + 1]]
-        for step in steps[index + 1 :]:
-            before, start = found[-1].fit if found else base, step.fit.x.copy()
-            start[gone] = self.target.forward.coordinates.null[gone]
-            fit = climb(step.judge, start, np.setdiff1d(step.fit.free, gone))
-            under = climb(step.judge.on(judges[-1].forward), before.x, before.free)
-            judges.append(step.judge)
-            found.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
-        return found
-
-    def _without_needless(self, base: Fit, steps: list[Added]) -> list[Added]:
-        """Steps less those that later ones have made needless: without its parameters the last model has as much
-        evidence. Of a lag found first, and a delay and another lag found later, the first may come down to nothing."""
-        last = steps[-1]
-        for index in range(len(steps) - 1):
-            if steps[index].name == DISCRETISATION:
-                continue
-            before = steps[index - 1].fit if index else base
-            gone = np.setdiff1d(steps[index].fit.free, before.free)
-            emptied = last.fit.x.copy()
-            emptied[gone] = self.target.forward.coordinates.null[gone]
-            if _nats_to(last.fit, emptied, gone) > TOLD_APART:
-                continue
-            if climb(last.judge, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
-                self.report(f"{steps[index].name} is no longer needed")
-                return self._without_needless(base, self.without(steps, index, base))
-        return steps
-
-    def _reconsider(self, base: Fit, steps: list[Added]) -> list[Added]:
-        """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""
-        first, last = steps[0], steps[-1]
-        if DISCRETISATION in (first.name, last.name) or len(steps) > 2:
-            return steps
-        candidate = next(c for c in self.candidates if c.name == last.name)
-        indices = np.array([*base.free, *candidate.indices], dtype=int)
-        # With the first one gone, its place in the fit may be far from the best: the base model's is another start.
-        emptied, bare = last.fit.x.copy(), base.x.copy()
-        others = np.setdiff1d(last.fit.free, indices)
-        emptied[others] = self.target.forward.coordinates.null[others]
-        bare[list(candidate.indices)] = last.fit.x[list(candidate.indices)]
-        alone = max((climb(self.target, start, indices) for start in (emptied, bare)), key=lambda fit: fit.log_evidence)
-        found, _ = self.screened(alone, [last.name])
-        again = self._extend(found, [last.name])
-        if again is None or again.name in (first.name, *first.members) or again.name == DISCRETISATION:
-            return steps
-        if not self._surpasses(again.fit, last.fit, self.rules.evidence):
-            return steps
-        self.report(f"with {last.name} in the model, {again.name} takes the place of {first.name}")
-        plain = climb(self.target, base.x, base.free)
-        gained = alone.log_evidence - plain.log_evidence
-        renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=gained)
-        return [renewed, again]
-
-
-def without_each_other(steps: Sequence[Added]) -> list[Added]:
-    """Steps whose classes do not have mechanisms that are steps themselves: both are in the model, which tells them
-    apart."""
-    named = {step.name for step in steps}
-    return [replace(s, members=tuple(n for n in s.members if n == s.name or n not in named)) for s in steps]
-
 
 def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None:
-    """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
-    where the finer rollouts do not end well."""
+    """Root mean square distance [m] by which a finer mesh and time step move the measured markers; None after a failed
+    finer rollout.
+    """
     seen, fine = finer.observe(fit.x[None])
     if not fine[0]:
         return None
@@ -538,19 +401,12 @@ def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None
 
 
 def _without_numerical_error(fit: Fit, probe: Probe) -> Float[np.ndarray, " n"]:
-    """Residuals of the simulation without its error in space and time, as two resolutions tell it.
+    """Residuals of the simulation without its error in space and time, estimated from two resolutions.
 
-    What halving the steps changes is a part of the error: half of it at the first order of the time steps, three
-    quarters at the second order of the mesh. So the whole is once to twice the change; the data say how much.
+    The change by halving the steps is a part of the error: half at first order of the time steps, three quarters at
+    second order of the mesh. The error is therefore one to two times the change; the data determine the factor.
     """
     base = span(fit.jacobian)
     change, left = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
     share = np.clip(float(change @ left) / max(float(change @ change), 1e-300), 1.0, 2.0)
     return fit.residual - share * probe.columns[:, 0]
-
-
-def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:
-    """What a fit's normal approximation says that a model loses at best where some coordinates are held at a point."""
-    place = [int(np.flatnonzero(fit.free == index)[0]) for index in moved]
-    apart = fit.x[moved] - point[moved]
-    return 0.5 * float(apart @ np.linalg.solve(fit.covariance[np.ix_(place, place)], apart))

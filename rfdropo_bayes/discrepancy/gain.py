@@ -1,4 +1,4 @@
-"""What an extension is worth on trajectories that no fit has seen."""
+"""Gain of an extension on trajectories that no fit has seen."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEVELS = (0.5, 0.9)
 
 
 class UnseenErrors(NamedTuple):
-    """What draws of one model leave of unseen trajectories: measured less simulated, in the unit of the noise."""
+    """Residuals of unseen trajectories under draws of one model: measured less simulated, in the unit of the noise."""
 
     errors: Float[np.ndarray, "draw trajectory time column"]
 
@@ -43,10 +43,10 @@ class Unseen(NamedTuple):
     """Measured trajectories that no fit has seen.
 
     Attributes:
-        position: coordinates of the markers [m], which are the first columns.
-        valid: where a value may be used, in all columns.
-        names: of the trajectories.
-        steps: time between their rows [s]; all of one rate by default.
+        position: coordinates of the markers [m], the first columns.
+        valid: mask of usable values, in all columns.
+        names: names of the trajectories.
+        steps: time between their rows [s]; equal rates by default.
     """
 
     position: Float[np.ndarray, "trajectory time coordinate"]
@@ -64,7 +64,7 @@ class Unseen(NamedTuple):
         return noise if self.steps is None else noise.at(self.steps)
 
     def predicted(self, prediction: UnseenErrors) -> Float[np.ndarray, "trajectory time coordinate"]:
-        """Where a model has the markers, in the mean over its draws [m]."""
+        """Marker positions of a model, averaged over its draws [m]."""
         return self.position - prediction.mean[..., : self.markers]
 
 
@@ -73,7 +73,7 @@ class Difference(NamedTuple):
 
     Attributes:
         rmse_base, rmse_extended: root mean square distance of a marker [m].
-        elpd: log predictive density of the extended model less that of the base.
+        elpd: log predictive density of the extended model less the base model's.
     """
 
     rmse_base: float
@@ -87,14 +87,14 @@ class Gain:
 
     Attributes:
         rmse_base, rmse_extended: root mean square distance of a marker [m].
-        elpd_difference: log predictive density of the extended model less that of the base, summed over trajectories;
-            its standard error, and the probability of so large a sum were each difference's sign a matter of chance,
-            only from `DIFFERENCE_FROM` trajectories up.
+        elpd_difference: log predictive density of the extended model less the base model's, summed over trajectories;
+            its standard error, and the probability of a sum this large if each difference's sign were random, only from
+            `DIFFERENCE_FROM` trajectories up.
         coverage: share of measurements in the extended model's central intervals.
         explained: share of the base model's discrepancy that the extension takes away; interval: its 90 % interval,
             for recordings like these.
         floor: the noise's root mean square distance of a marker [m].
-        differences: the same of each trajectory, by name.
+        differences: the same for each trajectory, by name.
     """
 
     rmse_base: float
@@ -169,13 +169,12 @@ def measure_gain(
     Args:
         unseen: measurements.
         base, extended: predictions.
-        noise: of the measurements.
-        pattern: what the base model leaves where it was fitted, whitened: it says where to look for the discrepancy,
-            in frequency and over the columns.
-        rng: of the interval.
-        judge: noise under which the base model is judged, and densities are compared; that of the measurements by
-            default.
-        spread: deviation of the extended model's errors, for its bands; that of the measurements' noise by default.
+        noise: noise of the measurements.
+        pattern: whitened residuals of the base model on its fitted data: the discrepancy's distribution over
+            frequencies and columns.
+        rng: random generator of the interval.
+        judge: noise model for the fit and the densities of the base model; the measurements' noise by default.
+        spread: deviation of the extended model's errors, for its bands; the noise's by default.
     """
     first, second = (np.where(unseen.valid, p.mean, 0.0) for p in (base, extended))
     distances = np.array([_distances(unseen, left) for left in (first, second)])
@@ -207,11 +206,11 @@ def _distances(unseen: Unseen, left: Float[np.ndarray, "trajectory time column"]
 
 
 def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -> float:
-    """Probability of a sum as large as that of these differences, were the sign of each a matter of chance.
+    """Probability of a sum as large as these differences' if each sign were random.
 
     Fisher's randomisation test (1935, The Design of Experiments, section 21), exact for differences symmetric about
-    zero. A standard error does not decide: one recording that shows an effect ten times as well as the others makes
-    the differences spread by more than their mean, though all of them favour one model.
+    zero. A standard error does not decide: if one recording shows an effect ten times as well as the others, the
+    differences spread by more than their mean although all favour the same model.
     """
     count = len(difference)
     if 2**count <= FLIPS + 1:
@@ -251,13 +250,12 @@ def explained_fraction(
     """``1 - (ext^2 - noise^2) / (base^2 - noise^2)`` with its 90 % interval, of all channels together.
 
     The mean squares are taken frequency by frequency and pattern by pattern (cosine transform in time, principal
-    components over the columns of a channel), each weighted by the squared share of discrepancy in what the base model
-    leaves on the FITTED data there (a Wiener filter of both factors): where there is nothing but noise, noise is not
-    counted, and where there is little else, little of it.
+    components over the columns of a channel), each weighted by the squared share of discrepancy in the base model's
+    residuals on the FITTED data (a Wiener filter of both factors): bands of pure noise are not counted, and noisy bands
+    count little.
 
-    The interval holds the noise in both mean squares, which is the same noise, the uncertainty of its power at these
-    frequencies and, from `SPREAD_FROM` trajectories up, how the fraction differs between trajectories
-    (`_spread_between`).
+    The interval includes the common noise in both mean squares, the uncertainty of its power at these frequencies and,
+    from `SPREAD_FROM` trajectories up, the variation of the fraction between trajectories (`_spread_between`).
     """
     count = len(unseen.valid)
     sums, floors, drawn, expected = np.zeros((2, count)), np.zeros(count), np.zeros((RESAMPLES, 2)), np.zeros(RESAMPLES)
@@ -285,11 +283,11 @@ def explained_fraction(
 
 
 def _spread_between(sums: Float[np.ndarray, "2 trajectory"], floors: Float[np.ndarray, " trajectory"]) -> float:
-    """Half the 90 % interval of the fraction of all recordings like these: 0 of fewer than `SPREAD_FROM`.
+    """Half the 90 % interval of the fraction of all recordings like these: 0 for fewer than `SPREAD_FROM`.
 
     Student's t about the jackknife's standard error (Miller 1974, Biometrika 61:1-15): each trajectory is left out in
-    turn. A bootstrap of three trajectories holds 60 %, and the fractions of single ones are ill-defined where one of
-    them has hardly any discrepancy.
+    turn. A bootstrap of three trajectories has 60 % coverage, and fractions of single trajectories are ill-defined if
+    one has hardly any discrepancy.
     """
     count = len(floors)
     if count < SPREAD_FROM:
@@ -364,8 +362,9 @@ def _spectrum(coefficients: Float[np.ndarray, " lag"], deviation: float, rows: i
 
 
 def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Float[np.ndarray, "row component"]:
-    """Share of discrepancy in each band of frequencies and component, from residuals of unit noise; none where their
-    power is within three standard errors of the noise's."""
+    """Share of discrepancy in each band of frequencies and component, from residuals of unit noise; zero if their power
+    is within three standard errors of the noise's.
+    """
     power = np.mean(dct(pattern, axis=1, norm="ortho") ** 2, axis=0)
     place = np.arange(len(power)) / len(power)
     edges = np.concatenate([[0.0], np.geomspace(1.5 / len(power), 1.0, BANDS)])
@@ -376,7 +375,7 @@ def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Fl
         if own.any():
             mean[own], error[own] = power[own].mean(axis=0), np.sqrt(2.0 / (len(pattern) * own.sum()))
     surprise = (mean - 1.0) / error
-    # Where nothing is sure, the surest is all there is to go by.
+    # If nothing is significant, the most significant bands are used.
     excess = np.where(surprise >= min(SURE, surprise.max()), np.maximum(mean - 1.0, 0.0), 0.0)
     share = excess / (excess + 1.0) if excess.any() else np.ones_like(excess)
     at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)

@@ -1,9 +1,9 @@
-"""Recordings that no fit has seen, as a model and its extensions predict them, and what they support."""
+"""Recordings that no fit has seen, predicted by a model and its extensions, and the supported steps."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,14 +12,14 @@ from jaxtyping import Bool
 
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
-from rfdropo_bayes.discrepancy.deadline import OutOfTime
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, spread
 from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.naming import Named
 from rfdropo_bayes.discrepancy.port_rollouts import with_laws_of
-from rfdropo_bayes.discrepancy.screen import Screen
+from rfdropo_bayes.discrepancy.repairs import without
 from rfdropo_bayes.errors import NoLikelihoodError
 
 DRAWS = 60
@@ -28,7 +28,8 @@ HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it 
 
 def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
     """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
-    as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
+    as the common scale of stiffness and mass, a draw would lie outside the range of the approximation.
+    """
     centre = target.errors(fit.x)
     points = np.repeat(fit.x[None], len(fit.free), axis=0)
     slopes, _ = target.error_slopes(points, np.eye(len(fit.x))[fit.free])
@@ -39,17 +40,17 @@ def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Recordings that no fit has seen, as the base model and the model after each step predict them.
+    """Recordings that no fit has seen, predicted by the base model and the model after each step.
 
     Attributes:
-        which: in words.
+        which: description of the recordings.
         unseen: the measurements.
-        predictions: of the base model, then after each step.
-        patterns: what each of these models leaves where it was fitted, see `measure_gain`.
-        noise: of the measurements.
-        judges: the noise under which each of the models is judged, see `inadequacy`.
-        spreads: deviation of what each of them leaves, by column.
-        seed: of the gain's interval.
+        predictions: predictions of the base model, then after each step.
+        patterns: residuals of each model on its fitted data, see `measure_gain`.
+        noise: noise of the measurements.
+        judges: noise model of each model, see `inadequacy`.
+        spreads: deviation of each model's residuals, by column.
+        seed: seed of the gain's interval.
     """
 
     which: str
@@ -63,30 +64,30 @@ class HeldOut:
 
     @property
     def count(self) -> int:
-        """Models that predict; fewer than were asked where the motion of one of them ended."""
+        """Number of predicting models; fewer than requested if a rollout failed."""
         return len(self.predictions)
 
     def gain(self, before: int, after: int) -> Gain:
-        """What the model after some steps is worth beside that after fewer."""
+        """Gain of the model after ``after`` steps over the model after ``before`` steps."""
         return self.after(after).beside(self.after(before))
 
     def beside(self, other: HeldOut) -> Gain:
-        """What the last model is worth beside the last one of another sequence of steps."""
+        """Gain of the last model over the last model of another sequence of steps."""
         rng, judge, pattern = np.random.default_rng([self.seed, 4]), other.judges[-1], other.patterns[-1]
         first, second, spread = other.predictions[-1], self.predictions[-1], self.spreads[-1]
         return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
 
     def after(self, steps: int) -> HeldOut:
-        """The same of no more than so many steps."""
+        """The same with at most ``steps`` steps."""
         parts = ("predictions", "patterns", "judges", "spreads")
         return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
 
     def supported(self) -> int:
-        """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
+        """Number of steps that the unseen recordings clearly support, each compared with the last supported step."""
         return self.supported_from(0)
 
     def supported_from(self, first: int) -> int:
-        """The same of the steps after the first so many, which are taken as they are."""
+        """The same for the steps after the first ``first``, which are accepted."""
         last = first
         for after in range(first + 1, len(self.predictions)):
             if self.gain(last, after).clear:
@@ -94,63 +95,18 @@ class HeldOut:
         return last
 
 
-def _without_carried(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], held_out: HeldOut
-) -> tuple[list[Added], HeldOut]:
-    """Steps less those that were supported beside a later one only, and without which that one does as well.
-
-    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
-    it were the last step, must clearly predict unseen recordings better than the model without it. Where the time is
-    up, the steps stay that were supported together.
-    """
-    index, clock = 0, search.target.forward.deadline
-    with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
-        while index < len(steps) - 1:
-            if held_out.gain(index, index + 1).clear or steps[index].name == DISCRETISATION:
-                index += 1
-                continue
-            search.report(f"is {steps[index].name} needed? The model without it")
-            fewer = search.without(steps, index, base)
-            other = _predicted(problem, judge, search, base, fewer)
-            if other.count <= len(fewer) or held_out.beside(other).clear:
-                index += 1
-            else:
-                steps, held_out, index = fewer, other, 0
-    return steps, held_out
-
-
-def _held_out(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
-) -> HeldOut | None:
-    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
-    was up."""
-    if not steps:
-        return None
-    search.report("measuring the gain on recordings that no fit has seen")
-    with search.target.forward.deadline.stage("gain"), suppress(OutOfTime):
-        return _predicted(problem, judge, search, base, steps)
-    return None
-
-
 class JudgedModel(NamedTuple):
-    """A model that predicts recordings which it has not seen.
+    """A model that predicts unseen recordings.
 
     Attributes:
-        judge: target under which it was fitted.
-        fit: the model.
+        judge: target of its fit.
+        fit: its fit.
         finer: whether it runs on the finer simulator.
     """
 
     judge: FitTarget
     fit: Fit
     finer: bool
-
-
-def _predicted(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
-) -> HeldOut:
-    """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
-    return predicted(problem, search.target.measured, stages_of(judge, base, steps))
 
 
 def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[JudgedModel]:
@@ -190,7 +146,7 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
 
 @contextmanager
 def _up_to_the_last(predicted: Sequence[Any]) -> Iterator[None]:
-    """End where a model's rollout does not end well, with the models before it; an error where there are none."""
+    """Stop at the first model with a failed rollout, with the models before it; an error if there are none."""
     try:
         yield
     except NoLikelihoodError:
@@ -207,8 +163,9 @@ def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) 
 def _left_out(
     problem: AuditProblem, judges: Sequence[FitTarget], target: FitTarget, fits: Sequence[Fit]
 ) -> tuple[str, Unseen, list[UnseenErrors]]:
-    """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
-    the later rows of all from the earlier ones."""
+    """Predict each group of repeats from the others; if a group has parameters that no other determines (as a single
+    group has), predict the later rows of all from the earlier rows.
+    """
     measured = target.measurements
     groups = len(measured.members)
     kinds = problem.kinds(target.forward.recordings)
@@ -240,26 +197,83 @@ def _left_out(
 
 
 def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray, "group time"]:
-    """Rows of every recording that come after the share of its measured ones that is fitted, wherever its gaps are."""
+    """Rows of every recording after the fitted share of its measured rows, with gaps anywhere."""
     seen = np.asarray(valid.any(axis=2))
     before: np.ndarray = np.cumsum(seen, axis=1) - seen
     return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
 
 
-def supported_steps(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], last: Screen
-) -> tuple[list[Added], Screen, HeldOut | None]:
-    """The steps that recordings which no fit has seen support, all of them where these support none; the screen
-    of the model with them; and the predictions of these recordings."""
-    held_out = _held_out(problem, judge, search, base, steps)
-    if held_out is not None and held_out.count <= len(steps):
-        name = steps[held_out.count - 1].name
-        search.report(f"with {name}, an unseen recording cannot be simulated: it is not supported")
-        steps, last = steps[: held_out.count - 1], steps[held_out.count - 1].before
-        if not steps:
-            return steps, last, None
-    if held_out is None or not (kept := held_out.supported()):
-        return steps, last, held_out
-    last = steps[kept].before if kept < len(steps) else last
-    steps, held_out = _without_carried(problem, judge, search, base, steps[:kept], held_out.after(kept))
-    return steps, last if len(steps) == kept else search.tested(steps[-1].fit, len(steps)), held_out
+@dataclass(frozen=True)
+class Kept:
+    """Named causes after the test on unseen recordings.
+
+    Attributes:
+        named: supported steps (all steps if none is supported), with score tests of the model.
+        held_out: predictions of these recordings by the base model and after each step; None without a step that can be
+            simulated.
+        unsupported: mechanisms supported by fitted but not by unseen recordings.
+    """
+
+    named: Named
+    held_out: HeldOut | None
+    unsupported: tuple[str, ...] = ()
+
+
+def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
+    """The steps supported by unseen recordings: first from predictions of all steps, then without steps that depend on
+    a later step.
+    """
+    report, clock = named.search.report, named.search.target.forward.deadline
+    if not named.steps:
+        yield Kept(named, None)
+        return
+    report("measuring the gain on recordings that no fit has seen")
+    with clock.stage("gain"), clock.reserve():
+        held_out = _predicted(problem, named)
+        if held_out.count <= len(named.steps):
+            last = named.steps[held_out.count - 1]
+            report(f"with {last.name}, an unseen recording cannot be simulated: it is not supported")
+            fewer = replace(named, steps=named.steps[: held_out.count - 1], screen=last.before, tried=None)
+        else:
+            fewer = named
+        supported = held_out.supported()
+        if not fewer.steps or not supported:
+            yield _kept(named, fewer, held_out if fewer.steps else None)
+            return
+        if supported < len(fewer.steps):
+            before = fewer.steps[supported].before
+            fewer = replace(fewer, steps=fewer.steps[:supported], screen=before, tried=None)
+        yield _kept(named, fewer, held_out.after(supported))
+        left, measured = _without_carried(problem, fewer, held_out.after(supported))
+        if len(left.steps) < len(fewer.steps):
+            left = replace(left, screen=left.asked.tested(left.fit, len(left.steps)))
+        yield _kept(named, left, measured)
+
+
+def _kept(asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
+    unsupported = tuple(name for name in asked.names if name not in named.names)
+    if unsupported:
+        asked.search.report(f"unseen recordings do not support {' and '.join(unsupported)}")
+    return Kept(named, held_out, unsupported)
+
+
+def _without_carried(problem: AuditProblem, named: Named, held_out: HeldOut) -> tuple[Named, HeldOut]:
+    """Steps without any step supported only together with a later step that does equally well alone.
+
+    Two mechanisms may pay only together. To test this, the first is removed: the model with it must predict unseen
+    recordings clearly better than the model without it.
+    """
+    for index in range(len(named.steps) - 1):
+        if held_out.gain(index, index + 1).clear or named.steps[index].name == DISCRETISATION:
+            continue
+        named.search.report(f"is {named.steps[index].name} needed? The model without it")
+        fewer = named.extended(without(named.asked, named.steps, index, named.base))
+        other = _predicted(problem, fewer)
+        if other.count > len(fewer.steps) and not held_out.beside(other).clear:
+            return _without_carried(problem, fewer, other)
+    return named, held_out
+
+
+def _predicted(problem: AuditProblem, named: Named) -> HeldOut:
+    """Predictions of the base model and of the model after each step."""
+    return predicted(problem, named.judge.measured, stages_of(named.search.target, named.base, named.steps))

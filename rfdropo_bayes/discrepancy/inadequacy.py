@@ -1,9 +1,9 @@
-"""How a model is judged that is far off: as `calibrate` judges it, by white noise of the size of its residuals.
+"""Noise model of a misspecified model: as in `calibrate`, white noise of the size of its residuals.
 
-Under the noise of the measurement, whatever moves the markers brings thousands of nats to a model that is far off: no
-prior has a say, and noise with memory weighs a wrong increment above a wrong pose. While a model leaves more than
-`POOR` times the noise's variance, it is fitted and extended under noise of the size of what it leaves, and a row
-counts by how long that lasts. Repeats do not make the error of a model smaller: a mean of five counts once.
+Under the measurement noise, any effect on the markers brings thousands of nats to a misspecified model: priors have no
+influence, and correlated noise weights wrong increments above wrong poses. While the residuals exceed `POOR` times the
+noise's variance, the model is fitted and extended under white noise of the size of its residuals. Rows are
+down-weighted by the residual correlation time. Repeats do not reduce a model's error: a mean of five counts once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
 from rfdropo_bayes.inference import lasting_series
 
-POOR = 2.0  # squared residual per value, in the noise's variance, from which on a model is far off
+POOR = 2.0  # squared residual per value, in the noise's variance, above which a model is misspecified
 ROUNDS = 6  # of noise and fit in turn
 SETTLED = 0.1  # relative change of the noise between rounds
 
@@ -37,7 +37,7 @@ def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
 def fit_with_noise(
     known: FitTarget, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
 ) -> tuple[FitTarget, Fit]:
-    """The target under which a model is judged, and its fit, climbed from a point."""
+    """The target with a model's noise, and its fit, optimised from a point."""
     if not far_off(known, x):
         return known, climb(known, x, free)
     judge = _under(known, known.errors(x))
@@ -58,8 +58,9 @@ def as_measured(judge: FitTarget, fit: Fit) -> Fit:
 
 
 def seen_under(judge: FitTarget, other: FitTarget, fit: Fit) -> Fit:
-    """A fit with residuals and slopes in deviations of the noise of another target; its covariance stays. One that is
-    judged by the noise of the measurement is no model that is far off, and stays as it is."""
+    """A fit with residuals and slopes in deviations of the noise of another target; its covariance stays. A fit under
+    the measurement noise is unchanged.
+    """
     if judge.known is None or judge.noise is other.noise:
         return fit
 
@@ -74,18 +75,19 @@ def seen_under(judge: FitTarget, other: FitTarget, fit: Fit) -> Fit:
 def rewhitened(
     judge: FitTarget, other: FitTarget, white: Float[np.ndarray, "*batch n"]
 ) -> Float[np.ndarray, "*batch m"]:
-    """Residuals of the channels under the white noise of a judge, in deviations of the noise of another target."""
+    """Residuals of the channels under the white noise of ``judge``, in deviations of the noise of another target."""
     return other.measurements.whiten(_errors(judge, white), other.noise)
 
 
 def judged_anew(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
-    """Target and fit of a model that has got better: where its judge took it for far off, under the noise of what it
-    leaves now."""
+    """Target and fit of an improved model: if it was misspecified, refitted under noise of its present residuals."""
     return (target, fit) if target.known is None else fit_with_noise(target.known, fit.x, fit.free)
 
 
 def noise_share(judge: FitTarget) -> float:
-    """Mean square of the measurement's noise in deviations of a judge's noise; 1 where the model is not far off."""
+    """Mean square of the measurement's noise in deviations of the noise of ``judge``; 1 if the model is not
+    misspecified.
+    """
     if judge.known is None:
         return 1.0
     known = judge.known.measurements
@@ -94,12 +96,12 @@ def noise_share(judge: FitTarget) -> float:
 
 
 def spread(judge: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:
-    """Deviation of what a fit leaves of each column: that of the measurement's noise, unless the model is far off."""
+    """Deviation of a fit's residuals for each column: the measurement noise, unless the model is misspecified."""
     return judge.noise.scale if judge.known is None else _sizes(judge, _errors(judge, fit.residual))
 
 
 def _errors(judge: FitTarget, white: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch group time column"]:
-    """Errors of which the white noise of a judge makes these residuals."""
+    """Errors whose residuals under the white noise of ``judge`` are ``white``."""
     return judge.measurements.series(white) * judge.noise.scale
 
 
@@ -112,7 +114,7 @@ def _sizes(target: FitTarget, errors: Float[np.ndarray, "group time column"]) ->
 
 
 def _shares(judge: FitTarget, fit: Fit) -> list[float]:
-    """What a row of each channel counts, see `lasting_series`."""
+    """Weight of a row of each channel, see `lasting_series`."""
     measured = judge.measurements
     errors = _errors(judge, fit.residual)
     series = np.where(measured.valid, errors / _sizes(judge, errors), 0.0)
@@ -127,7 +129,7 @@ def _shares(judge: FitTarget, fit: Fit) -> list[float]:
 def _under(
     known: FitTarget, errors: Float[np.ndarray, "group time column"], shares: Sequence[float] | None = None
 ) -> FitTarget:
-    """The target under white noise of the size of errors, over the root of what a row counts."""
+    """The target under white noise of the size of errors, over the root of the weight of a row."""
     measured, parts, sizes = known.measurements, [], _sizes(known, errors)
     for own, share in zip(measured.columns, shares or [1.0] * len(measured.columns), strict=True):
         parts.append(Autoregression(sizes[own] / np.sqrt(share), np.ones(1), MISFIT, np.inf))

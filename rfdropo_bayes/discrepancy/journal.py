@@ -1,4 +1,4 @@
-"""What an audit has computed so far, on disk: one that was killed looks up what it has and goes on from there.
+"""Intermediate results of an audit on disk, from which a killed audit continues.
 
 An audit is a fixed sequence of long computations, each a function of its inputs. Results are kept under a digest of
 these inputs, so that a change of data, model or seed finds nothing and computes anew.
@@ -34,11 +34,11 @@ def digest(*parts: Any) -> str:
 
 
 class Journal:
-    """Results on disk by the digest of what they depend on.
+    """Results on disk by the digest of their inputs.
 
     Args:
-        folder: to keep them in; None keeps nothing.
-        resume: look up what an earlier run has left there; else it is removed.
+        folder: folder of the results; None stores nothing.
+        resume: use the results of an earlier run; otherwise they are removed.
     """
 
     def __init__(self, folder: Path | None = None, *, resume: bool = False) -> None:
@@ -49,7 +49,7 @@ class Journal:
             folder.mkdir(parents=True, exist_ok=True)
 
     def recall(self, key: str, compute: Callable[[], Arrays]) -> Arrays:
-        """The arrays kept under a key, or else those that are computed now, and kept."""
+        """The arrays stored under a key; computed and stored if missing."""
         if self.folder is None:
             return compute()
         path = self.folder / f"{key[:32]}.npz"
@@ -61,7 +61,7 @@ class Journal:
 
 
 def _read(path: Path) -> Arrays | None:
-    """Arrays of a file; None where there is none, or a damaged one."""
+    """Arrays of a file; None for a missing or damaged file."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}

@@ -1,11 +1,11 @@
-"""By what law something acts at a port: terms are chosen by recordings that they are not fitted to, and refitted.
+"""Law of an effect at a port: terms are chosen by cross-validation between recordings, and refitted.
 
 One term at a time: every feature at every port is fitted together with the base parameters, linearly, to all recordings
-but one, and predicts that one. The best are refitted without linearisation. Then the next term is looked for in what is
-left. Choosing several terms before the first refit lets false ones in.
+but one, and predicts the recording left out. The best are refitted without linearisation. The next term is then
+searched in the residuals. Choosing several terms before the first refit admits false terms.
 
-Ports and terms are judged under the noise that candidates of the library are judged under: where the model is far off,
-that of what it leaves (see `inadequacy`), taken anew after each term.
+Ports and terms use the same noise model as candidates of the library: for a misspecified model, noise of the size of
+its residuals (see `inadequacy`), updated after each term.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from rfdropo_bayes.mechanisms.features import Feature, dictionary, own_dictionar
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 LEAST = 0.01
-"""Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
+"""Share of the residuals beyond the noise that a term must explain in left-out recordings."""
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
-EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
+EXCHANGES = 2  # rounds in which another term may replace the chosen term
 FRESH = 3  # terms that are refitted in each round
 GLANCE = 4  # steps of a refit that only ranks
-TIED = 10.0  # nats by which a refit must be worse to be told apart from the best
+TIED = 10.0  # nats by which a refit must be worse to be distinguished from the best
 PIECES = 3  # parts of a single recording, which are left out in turn
 NULLS = 199  # simulated data sets behind the p-values of ports
 COLLINEAR = 1e-6  # share of a column that the base parameters must leave
@@ -62,10 +62,10 @@ class TermGain:
     """One feature at one port, fitted linearly together with the base parameters.
 
     Attributes:
-        port, feature, scope: which, and in which recordings.
-        gain: of log density of left-out recordings [nat].
-        share: of what is left beyond the noise there.
-        size: of the coefficient; sd: its deviation.
+        port, feature, scope: port and feature, and the recordings of the term.
+        gain: gain of the log density of left-out recordings [nat].
+        share: explained share of their residuals beyond the noise.
+        size: value of the coefficient; sd: its deviation.
         typical: root mean square of the feature.
     """
 
@@ -89,12 +89,12 @@ class Refit:
     """A model with one more term, refitted.
 
     Attributes:
-        term: the last one.
-        target, fit: the model.
+        term: the last term.
+        target, fit: target and fit of the model.
         gain: see `TermGain`.
-        score: nats that the term brings, less what a parameter and the choice among many cost. It says whether the term
-            is needed; its coefficient over its deviation does not: cables leave the common scale of stiffness and
-            forces free, so that every force is as uncertain as Young's modulus, however large its effect.
+        score: gain of the term [nat], less the cost of a parameter and of the choice among many. It decides on the
+            term. The coefficient over its deviation does not: cables leave the common scale of stiffness and forces
+            free, so that every force is as uncertain as Young's modulus.
     """
 
     term: PlacedTerm
@@ -105,7 +105,7 @@ class Refit:
 
     @property
     def shape(self) -> float | None:
-        """Shape of the term's feature; None where it is not inferred."""
+        """Shape of the term's feature; None if it is not inferred."""
         if self.term.shape is None:
             return None
         coordinates = self.target.forward.coordinates
@@ -124,18 +124,18 @@ class Refit:
 
 @dataclass(frozen=True)
 class FoundLaw:
-    """What the search for laws found around one model.
+    """Result of the search for laws around one model.
 
     Attributes:
         map: all ports.
         ports: evidence of every port before the first term.
-        terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
-        ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
-        afterwards: largest log evidence of any port with each term and those before it in the model.
-        centre: times of the ports' signals [s] from the recordings' first rows on; of recordings whose commands begin
-            before these by different times, from their median on.
-        gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
-        offered: largest gain [nat] of any feature at any port before the first term; 0 where none brings anything.
+        terms: one refit per added term, cumulative; empty without a law.
+        ties: refits of alternatives to the first term with equal residuals, within `TIED`; the best first.
+        afterwards: largest log evidence of any port after each term.
+        centre: times of the ports' signals [s] from the recordings' first rows on; for recordings with different
+            lead-in times, from their median.
+        gate: null quantile of the first term's gain on left-out recordings [nat]; None if no port is significant.
+        offered: largest gain [nat] of any feature at any port before the first term; 0 without any gain.
     """
 
     map: PortMap
@@ -158,23 +158,24 @@ class FoundLaw:
         return self.afterwards[-1] if self.terms else None
 
     def cut(self, terms: int) -> FoundLaw:
-        """The law of the first so many terms."""
+        """The law of the first ``terms`` terms."""
         return replace(self, terms=self.terms[:terms], afterwards=self.afterwards[:terms])
 
     @property
     def rivals(self) -> list[Refit]:
-        """The first term, and what is tied with it; empty without a law."""
+        """The first term and its ties; empty without a law."""
         return [*self.terms[:1], *self.ties]
 
     def significant(self, family: float) -> list[PortEvidence]:
-        """Ports where something acts."""
+        """Ports with a significant effect."""
         return [row for row in self.ports if row.adjusted_p <= family and row.log_evidence > 0.0]
 
 
 @dataclass(frozen=True)
 class _Sums:
     """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data; the
-    pull of the priors is that of the first data set."""
+    priors' pull is of the first data set.
+    """
 
     jj: Float[np.ndarray, "piece d d"]
     jx: Float[np.ndarray, "piece d feature"]
@@ -199,7 +200,7 @@ def _sums(
     columns: Float[np.ndarray, "group value feature"],
     null: Float[np.ndarray, "group value draw"] | None = None,
 ) -> _Sums:
-    """Of the residual, and after it of simulated ones."""
+    """Sums of the residual, followed by simulated residuals."""
     j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)[..., None]
     count = found.noise * np.count_nonzero(y[..., 0], axis=1)
     if null is not None:
@@ -222,13 +223,12 @@ def left_out_gains(
     """Gain [nat] of every feature in every data set, each alone beside the base parameters; of the first data set also
     share, size and deviation.
 
-    A piece that is left out is predicted by base parameters of which the other pieces leave some unknown: r ~ N(0, S),
-    S = 1 + J A^-1 J' with A the precision that the others give. A gain is half of what a feature takes from r' S^-1 r.
-    Counted as r'r, it would mostly be what a feature happens to take from the error of base parameters that this piece
-    alone determines, and no refit brings it.
+    A piece left out is predicted with uncertain base parameters: r ~ N(0, S), S = 1 + J A^-1 J' with A the precision
+    from the other pieces. A gain is half the decrease of r' S^-1 r. The decrease of r'r would mostly be the error of
+    base parameters that only this piece determines, which no refit brings.
 
-    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, and it
-    pulls at the parameters where they are not at its centre, unless more is known of them.
+    The prior of the base parameters fixes undetermined directions. Its ``precision`` is 1 in these columns by default,
+    and it pulls parameters towards its centre.
     """
     before, gain = 0.0, np.zeros(sums.xy.shape[1:])
     held = np.eye(sums.jj.shape[1]) if precision is None else precision
@@ -251,7 +251,7 @@ def left_out_gains(
 
 
 def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Base parameters alone, what they take of every feature, and each feature's coefficients and deviation."""
+    """Base parameters alone, their projection of every feature, and each feature's coefficients and deviation."""
     jj, jx, xx, jy, xy = sums
     prior = jj + precision
     b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
@@ -285,16 +285,16 @@ class LawSearch:
     """The search for a law beside a fitted model.
 
     Attributes:
-        ports: of the simulator.
-        table: features of the commands, and of the motion for ports of the body.
+        ports: ports of the simulator.
+        table: features of commands, and of motion for ports of the body.
         own: features of a cable's own command, for ports of several cables.
-        units: names of the commands, and their unit.
-        seed: of simulated data sets.
-        family: probability that a port is named where nothing is hidden.
+        units: names and unit of the commands.
+        seed: seed of simulated data sets.
+        family: probability that a port is named although nothing is missing.
         report: called with a line of words.
-        most: terms that a law may have; None leaves their number to the recordings.
-        taken: names of coefficients that the model has, of laws that an earlier audit found.
-        scopes: recordings in which a law may act: all, and those of each group.
+        most: largest number of terms; None leaves it to the recordings.
+        taken: names of coefficients in the model, from laws of an earlier audit.
+        scopes: recordings in which a law may act: all, and each group's.
     """
 
     ports: PortMap
@@ -309,12 +309,12 @@ class LawSearch:
     scopes: tuple[Scope, ...] = (EVERYWHERE,)
 
     def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
-        """Where something acts that the model lacks, and by what law.
+        """Port and law of an effect that the model lacks.
 
         Args:
-            target: under which the model was fitted.
-            fit: the model.
-            forced: whether a first term is looked for though no port is significant.
+            target: target of the model's fit.
+            fit: fit of the model.
+            forced: whether to search a first term although no port is significant.
         """
         known = target
         found = responses(known, fit, self.ports, self.table, self.report)
@@ -355,7 +355,7 @@ class LawSearch:
                     ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
         except OutOfTime:
             self.report("the time was up before the law was found")
-        # The time may be up between a term and what is left beside it.
+        # The time limit may fall between a term and the evidence after it.
         terms, gate = terms[: len(afterwards)], next(iter(gates), None)
         centre = found.basis.centre - found.begun
         return FoundLaw(self.ports, first, terms, ties, afterwards, centre, gate, offered)
@@ -370,7 +370,7 @@ class LawSearch:
         return with_exact_columns(known, fit, found, {port: self._offered(port, values)[1] for port in chosen})
 
     def _values(self, found: Responses) -> Float[np.ndarray, "group feature row"]:
-        """All features of the commands, then those of the motion."""
+        """All features of the commands, then of the motion."""
         values = self.table.over(found.levels)
         return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
 
@@ -379,7 +379,7 @@ class LawSearch:
         return bool(self.taken) and coefficient_name(port, feature, self.units[0], group) in self.taken
 
     def _features(self, port: Port) -> Sequence[Feature]:
-        """What a law at a port may be made of: on a body of the motion, too."""
+        """Features of a law at a port, which on a body include the motion."""
         if self.ports.members(port) != (port,):
             return self.own
         return (*self.table.features, *self.table.of_motion) if port.stage == "body" else self.table.features
@@ -417,10 +417,11 @@ class LawSearch:
         self, found: Responses, values: np.ndarray, gate: float, precision: Float[np.ndarray, "d d"] | None = None,
         terms: Sequence[Refit] = (),
     ) -> list[TermGain]:  # fmt: skip
-        """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`.
+        """All features at all ports whose gain exceeds the null quantile ``gate``, the largest gain first; see
+        `left_out_gains`.
 
-        Terms that the law has are none of them, nor those of a law that is in the model already: where a port is far
-        from linear, they would bring something again. A term whose shape is inferred has every shape.
+        Terms already in the law or the model are excluded: at a strongly nonlinear port they would gain again. A term
+        whose shape is inferred has every shape.
         """
         rows = []
         had = {refit.term.place for refit in terms}
@@ -439,7 +440,7 @@ class LawSearch:
     def _scoped(
         self, found: Responses, columns: Float[np.ndarray, "group value feature"]
     ) -> Iterator[tuple[Scope, Float[np.ndarray, "group value feature"]]]:
-        """What features do where they act in the recordings of each scope alone."""
+        """Effects of features that act in the recordings of one scope only."""
         for scope in self.scopes:
             yield scope, columns * scope.has(found.recordings)[:, None, None] if scope.group else columns
 
@@ -447,12 +448,13 @@ class LawSearch:
         self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
         gate: float, where: Sequence[PortEvidence],
     ) -> tuple[Refit, list[Refit]]:  # fmt: skip
-        """The best term climbed to its end, or another one in its place; and all others that were refitted.
+        """The best term after full optimisation, or a replacement; and all other refits.
 
-        The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
-        with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
-        anew, with base parameters held to what is then known of them. The term's feature is also tried at the ports
-        that lead by evidence, where the linear model may have preferred another one: a delay is far from linear.
+        The base model has compensated for a part of the missing effect, and the linear model does not predict its
+        correction. With a law in the model the base parameters are nearer to the truth. The terms are then ranked
+        again, with base parameters constrained by their posterior. The term's feature is also tried at the ports with
+        the largest evidence, at which the linear model may have preferred another feature: a delay is strongly
+        nonlinear.
         """
         chosen, every = refits[0], list(refits)
         best, tried = self._climbed(chosen), {chosen.term.place}
@@ -490,11 +492,11 @@ class LawSearch:
         self, model: LinearModel, ranked: Sequence[TermGain], gate: float,
         chosen: Callable[[Sequence[TermGain]], list[TermGain]],
     ) -> list[TermGain]:  # fmt: skip
-        """The terms to refit, each with the gain that it has beside the model as it is now.
+        """The terms to refit, each with its gain beside the present model.
 
-        Responses are those of the first model, and splines miss what is fast. A law and the base parameters beside it
-        move the model far enough that gains are found which no refit brings. So what a chosen term does is found anew
-        by rollouts, and terms are chosen again until all of them have been seen so.
+        Responses belong to the first model, and splines miss fast effects. A law and refitted base parameters change
+        the model enough to produce false gains. The effect of a chosen term is therefore recomputed by rollouts, and
+        terms are chosen again until all have been recomputed.
         """
         rows, seen = list(ranked), dict[tuple[Port, Feature, str], TermGain]()
         while fresh := [row for row in chosen(rows) if row.place not in seen]:
@@ -504,7 +506,7 @@ class LawSearch:
         return chosen(rows)
 
     def _beside(self, model: LinearModel, rows: Sequence[TermGain]) -> list[TermGain]:
-        """Terms with their gains beside a model, by what rollouts of it say that each does."""
+        """Terms with their gains beside a model, with effects from rollouts."""
         placed_terms = [self._placed(row) for row in rows]
         target = model.known.on(self._with(model.known, model.terms, placed_terms))
         x = np.append(model.fit.x, np.zeros(len(rows)))
@@ -524,7 +526,7 @@ class LawSearch:
         return placed(row.port, row.feature, row.typical, *self.units, row.scope)
 
     def _with(self, known: FitTarget, terms: Sequence[Refit], added: Sequence[PlacedTerm]) -> PortedForward:
-        """Rollouts with terms after those that the law has."""
+        """Rollouts with further terms after the law's."""
         return PortedForward(known.forward, self.ports, self.table, [*(refit.term for refit in terms), *added])
 
     def _refits(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, chosen: Sequence[TermGain]) -> list[Refit]:
@@ -538,7 +540,7 @@ class LawSearch:
         return sorted(refits, key=lambda refit: -refit.score)
 
     def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
-        """The model with one more term, climbed a few steps from where the linear model has it."""
+        """The model with one more term, optimised a few steps from the linear model's estimate."""
         term = self._placed(row)
         scale = float(term.spec.prior["scale"])
         start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
@@ -553,9 +555,9 @@ class LawSearch:
         return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
 
     def _shaped(self, known: FitTarget, terms: Sequence[Refit], best: Refit) -> Refit:
-        """The same with the shape of the last term's feature inferred, if the data say that it is another one.
+        """The same with the shape of the last term's feature inferred, if the data prefer another shape.
 
-        The dictionary has few shapes. What is left of one between them would ask for further terms, which are false.
+        The dictionary has few shapes. Residuals of an intermediate shape would lead to further, false terms.
         """
         if best.term.feature.shape is None:
             return best
@@ -582,8 +584,9 @@ def leading_terms(ranked: Sequence[TermGain], where: Sequence[PortEvidence]) -> 
 
 
 def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:
-    """Terms that may take the place of the best one: those of most gain, its feature at the leading ports, and the term
-    itself in other recordings."""
+    """Possible replacements of the best term: terms of largest gain, its feature at the leading ports, and the term
+    itself in other recordings.
+    """
     leading = [row.port for row in where[:BY_EVIDENCE]]
     same = [row for row in ranked if row.feature == best.feature]
     alike = [row for row in same if row.port == best.port or (row.port in leading and row.scope == best.scope)]
@@ -597,7 +600,7 @@ def _of_any_shape(place: tuple[Port, Feature, str]) -> tuple[Port, Feature, str]
 
 
 def in_words(scope: Scope) -> str:
-    """Where a law acts in one group of recordings alone, the group."""
+    """Phrase with the group of recordings if a law acts in one group only."""
     return f" in {scope.group} alone" if scope.group else ""
 
 
@@ -605,7 +608,7 @@ FARTHEST = 100.0  # prior deviations within which a refit starts
 
 
 def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
-    """Refits of other terms that leave as little as the best one, within `TIED`; each term once, the best first."""
+    """Refits of other terms with residuals as small as the best, within `TIED`; each term once, the best first."""
     found: dict[tuple[Port, Feature, str], Refit] = {}
     for refit in sorted(others, key=lambda refit: -refit.score):
         found.setdefault(refit.term.place, refit)
@@ -614,7 +617,9 @@ def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
 
 
 def _under_noise_of(best: Refit, tie: Refit) -> Refit:
-    """A refit of another term under the noise that the best one leaves: that of a model far off tells less apart."""
+    """A refit of another term under the noise of the best term's residuals, since the noise of a misspecified model
+    discriminates less.
+    """
     target = best.target.on(tie.target.forward)
     fit = climb(target, tie.fit.x, tie.fit.free, evaluations=GLANCE)
     found = replace(tie, target=target, fit=fit)
@@ -628,7 +633,7 @@ def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
 
 
 def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
-    """What is known of a fit's parameters, in deviations of their priors."""
+    """Posterior precision of a fit's parameters, in deviations of their priors."""
     scale = _scale(known, fit)
     return np.linalg.inv(fit.covariance / np.outer(scale, scale))
 

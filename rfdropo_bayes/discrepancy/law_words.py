@@ -1,4 +1,4 @@
-"""Ports and laws in words and as plain values: what an audit's sentence and audit.json say of an unknown cause."""
+"""Ports and laws in words and as plain values: text of an unknown cause in an audit's sentence and audit.json."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def channels_of(answer: Answer) -> tuple[str, ...]:
 
 
 def unknown_record(answer: Answer) -> dict[str, Any]:
-    """What audit.json says of unknown causes."""
+    """Unknown causes in audit.json."""
     return {"ports": ports_record(answer), "law": law_record(answer)}
 
 
@@ -54,7 +54,7 @@ def law_record(answer: Answer) -> dict[str, Any] | None:
 
 
 def ports_record(answer: Answer) -> dict[str, Any] | None:
-    """Every port with what the data say of it; None where nobody asked."""
+    """Every port with its evidence; None if not requested."""
     described = answer.causes.described
     if described is None:
         return None
@@ -94,7 +94,7 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
 
 
 def law_sentence(answer: Answer) -> str:
-    """Where, when, by what law, what it is worth, and what to look for at the robot."""
+    """Port, time, law, gain, and check at the robot."""
     described = answer.law
     assert described is not None
     assert described.gain is not None
@@ -163,7 +163,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
 
 
 def ports_sentence(answer: Answer) -> str:
-    """Where something acts, in an audit that found no law which holds."""
+    """Ports with an effect, in an audit without a supported law."""
     described = answer.causes.described
     if described is None or described.holds:
         return ""
@@ -171,7 +171,7 @@ def ports_sentence(answer: Answer) -> str:
     if not rows:
         return ""
     left = answer.extended.residual
-    if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as what is left, and shrinks the signal
+    if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as the residuals, and shrinks the signal
         return f" Of all ports, a signal at {rows[0].port.words} explains most of it; {_no_law(answer)}."
     size = f"{rows[0].amplitude:.2g}" + ("" if rows[0].port.unit == "-" else f" {rows[0].port.unit}")
     others = ", ".join(row.port.words for row in rows[1 : 1 + MOST_TIES])
@@ -180,7 +180,7 @@ def ports_sentence(answer: Answer) -> str:
 
 
 def _no_law(answer: Answer) -> str:
-    """That no law holds; of a law of the fitted recordings, how unseen ones are predicted with it."""
+    """Statement that no law is supported; for a law of the fitted recordings, its errors on unseen recordings."""
     described = answer.causes.described
     assert described is not None
     if described.last is None or described.gain is None:
@@ -190,7 +190,10 @@ def _no_law(answer: Answer) -> str:
     laws = " and ".join(_one(refit, row, channels_of(answer)) for refit, row in terms)
     gain = described.gain
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
-    return f"no law of it holds. The fitted recordings ask for a law that unseen ones do not support ({errors}): {laws}"
+    return (
+        "no law of it is supported. The fitted recordings ask for a law that unseen recordings do not "
+        f"support ({errors}): {laws}"
+    )
 
 
 def law_tables(answer: Answer) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""What was measured, with repeats of one command sequence joined: their mean is fitted, their spread is noise."""
+"""Measurements with repeats of a command sequence joined: their mean is fitted, their spread is noise."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from rfdropo_bayes.data import Trajectory
 
 @dataclass(frozen=True)
 class Measurements:
-    """Recordings as groups of repeats; columns are those of all channels side by side, the markers' first.
+    """Recordings as groups of repeats; columns are of all channels side by side, the markers' first.
 
     Attributes:
-        names: of the first recording of each group.
+        names: name of the first recording of each group.
         members: indices of the recordings in each group.
-        time: of each row [s].
-        channels: with the means over the repeats.
-        single: the same with every recording on its own.
-        weighed: parts that were weighed; None without.
-        count: valid repeats behind each value.
+        time: time of each row [s].
+        channels: channels with means over the repeats.
+        single: channels with every recording separate.
+        weighed: weighed parts; None without.
+        count: number of valid repeats of each value.
         spread: every recording less the mean of its group, in the unit of the noise.
-        apart: recordings that repeat the commands of another one and are not joined with it, as their rows or clocks
+        apart: recordings that repeat commands of another recording but are not joined with it, as their rows or clocks
             differ.
     """
 
@@ -57,7 +57,7 @@ class Measurements:
 
     @property
     def valid(self) -> Bool[np.ndarray, "group time column"]:
-        """Where there is a value."""
+        """Mask of existing values."""
         return self.count > 0
 
     @property
@@ -75,7 +75,7 @@ class Measurements:
 
     @property
     def single_valid(self) -> Bool[np.ndarray, "recording time column"]:
-        """What may be used of each recording."""
+        """Mask of usable values of each recording."""
         return np.concatenate([channel.valid for channel in self.single], axis=-1)
 
     @property
@@ -95,7 +95,7 @@ class Measurements:
 
     @property
     def names_of_channels(self) -> tuple[str, ...]:
-        """What was data."""
+        """Names of the data channels."""
         further: tuple[Channel, ...] = () if self.weighed is None else (self.weighed,)
         return tuple(channel.name for channel in (*self.channels, *further))
 
@@ -112,7 +112,7 @@ class Measurements:
     def mean_of(
         self, single: Float[np.ndarray, "*batch recording time column"]
     ) -> Float[np.ndarray, "*batch group time column"]:
-        """Mean over the repeats of errors like those of the recordings."""
+        """Mean over repeats of errors of single recordings."""
         return mean_error(single, self.single_valid, self.members)
 
     def deviations(self, errors: Float[np.ndarray, "recording time column"]) -> tuple[np.ndarray, np.ndarray, float]:
@@ -131,12 +131,12 @@ class Measurements:
     def noise(
         self, errors: Float[np.ndarray, "recording time column"], parameters: int, like: Stacked | None = None
     ) -> Stacked:
-        """Noise from repeats where there are any, else from what a model leaves, of whose correlation between columns
-        nothing says how much is noise: a discrepancy moves them together, too.
+        """Noise from repeats if there are any, else from a model's residuals. Their correlation between columns is not
+        used, since a discrepancy also correlates them.
 
         Args:
-            errors: recordings less what a model predicts for each.
-            parameters: fitted by that model.
+            errors: recordings less a model's predictions.
+            parameters: number of fitted parameters of that model.
             like: an earlier estimate, whose order, pooling and sharing are kept.
         """
         left, valid, steps = errors, self.single_valid, self.single_steps
@@ -158,7 +158,7 @@ class Measurements:
 
 
 def _like(like: Autoregression | None, source: str) -> dict[str, Any]:
-    """Order, pooling and sharing of an estimate: as those of an earlier one where there is any."""
+    """Order, pooling and sharing of an estimate: from an earlier estimate if there is one."""
     shared = False if source == RESIDUALS else (None if like is None else like.correlation is not None)
     order, pooled = (None, None) if like is None else (like.order, bool(np.ptp(like.scale) == 0.0))
     return {"order": order, "pooled": pooled, "shared": shared}
@@ -173,10 +173,11 @@ def gather_measurements(
     """Group recordings with identical commands.
 
     Args:
-        recordings: on the simulator's clock.
-        channels: measured in them.
-        repeats: the same recordings as they were recorded; empty where none is to be joined.
-        kinds: of the recordings, by their parameters: those that have others are no repeats; all alike by default.
+        recordings: recordings on the simulator's clock.
+        channels: their channels.
+        repeats: the same recordings as recorded; empty to join none.
+        kinds: kind of each recording by its parameters; recordings of different kinds are not repeats; equal by
+            default.
     """
     groups: Groups = tuple((index,) for index in range(len(recordings.names)))
     apart: tuple[str, ...] = ()
@@ -204,7 +205,7 @@ def gather_measurements(
 
 
 def _of_one_kind(groups: Groups, kinds: Sequence[Hashable]) -> Groups:
-    """Groups of repeats, divided where their recordings have parameters of their own."""
+    """Groups of repeats, split if their recordings have different parameters."""
     found: dict[tuple[int, Hashable], tuple[int, ...]] = {}
     for number, group in enumerate(groups):
         for index in group:

@@ -17,9 +17,9 @@ class Omnibus:
     """Result of the joint test.
 
     Attributes:
-        p: of the joint test: the smallest of the single p-values, calibrated as such.
+        p: p-value of the joint test: the smallest of the single p-values, calibrated as such.
         single: p-value of each test on its own.
-        blocks: mean square of each block of rows, over channels and groups; 1 where the model is right.
+        blocks: mean square of each block of rows, over channels and groups; 1 if the model is right.
     """
 
     p: float
@@ -28,11 +28,11 @@ class Omnibus:
 
 
 def statistics(white: Float[np.ndarray, "*batch group time channel"]) -> dict[str, Float[np.ndarray, "*batch"]]:
-    """Large where something is wrong.
+    """Statistics that are large for a wrong model.
 
     - variance: mean square (lack of fit against pure error);
     - blocks: squares of the means of `BLOCK` rows, per channel;
-    - modes: the largest share of these that one pattern over the channels takes;
+    - modes: the largest share of these in a single pattern over the channels;
     - memory: Ljung-Box over `LAGS` lags, pooled over channels;
     - distribution: Kolmogorov-Smirnov distance of the PIT.
     """
@@ -68,8 +68,9 @@ def block_means(white: Float[np.ndarray, "*batch group time channel"]) -> Float[
 def block_squares(
     white: Float[np.ndarray, "group time channel"], valid: Bool[np.ndarray, "group time channel"]
 ) -> Float[np.ndarray, " block"]:
-    """Mean square of the means of blocks of rows, over groups and channels, 1 where the model is right; rows that were
-    not measured count as none, and a block without any is not a number."""
+    """Mean square of the means of blocks of rows, over groups and channels, 1 if the model is right; unmeasured rows
+    are skipped, and an empty block is NaN.
+    """
     size = min(BLOCK, white.shape[-2])
     measured = np.round(np.sqrt(size) * block_means(valid.astype(float)))
     sums = np.sqrt(size) * block_means(np.where(valid, white, 0.0))
@@ -80,11 +81,11 @@ def block_squares(
 def joint_test(
     observed: dict[str, float], simulated: dict[str, Float[np.ndarray, " count"]], blocks: Float[np.ndarray, " block"]
 ) -> Omnibus:
-    """Calibrate each statistic, and the smallest p-value of all, against the simulated ones.
+    """Calibrate each statistic, and the smallest p-value of all, against the simulated statistics.
 
-    The observed data set is ranked as one among the simulated ones, in both: it is one of them where the model is
-    right, and the joint p-value is then at most any level in that share of data sets. Of data sets with the same
-    smallest p-value, as the largest values of all the statistics have it, the one that lies farther out is the rarer.
+    The observed data set is ranked among the simulated data sets in both steps: under a right model it is one of them,
+    and the joint p-value is then valid at any level. Ties in the smallest p-value are broken by the distance from the
+    median.
     """
     pooled = {name: np.append(simulated[name], observed[name]) for name in observed}
     ranks = {name: _upper_ranks(values) for name, values in pooled.items()}
@@ -96,7 +97,7 @@ def joint_test(
 
 
 def _far_out(values: np.ndarray) -> np.ndarray:
-    """Distances from the median, in those of the 95 % quantile."""
+    """Distances from the median, in units of the 95 % quantile's distance."""
     middle, high = np.quantile(values, [0.5, 0.95])
     return (values - middle) / max(high - middle, 1e-300)
 

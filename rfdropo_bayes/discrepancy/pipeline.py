@@ -1,13 +1,15 @@
-"""The audit from data to verdict: show, name, extend, measure."""
+"""The audit from data to verdict: show, name, extend, measure.
+
+`findings` is a generator: each `Found` that it gives holds all that is known by then, and `conclude` makes an answer of
+any of them. So an audit that is stopped, by its time limit or by Ctrl-C, answers with what it has.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -15,38 +17,69 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.cautions import Caution
-from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
-from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime, about
-from rfdropo_bayes.discrepancy.described import Described, NamedModel, describe
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
-from rfdropo_bayes.discrepancy.fit import (
-    WITHIN,
-    Fit,
-    FitTarget,
-    base_optimum,
-    better_nearby,
-    climb,
-    climb_rollouts,
-    optimum_rollouts,
-    poll_rollouts,
-    widened,
-    with_usable_differences,
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, simulated
+from rfdropo_bayes.discrepancy.base_fit import (
+    Reached,
+    base_fits,
+    beginning,
+    first_target,
+    residual_noise,
+    under_residual_noise,
 )
-from rfdropo_bayes.discrepancy.forward import Forward
+from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime
+from rfdropo_bayes.discrepancy.described import Described, describe
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, noise_distance
-from rfdropo_bayes.discrepancy.held_out import HeldOut, supported_steps
-from rfdropo_bayes.discrepancy.inadequacy import as_measured, fit_with_noise, spread
+from rfdropo_bayes.discrepancy.held_out import HeldOut, Kept, keep_supported
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, spread
 from rfdropo_bayes.discrepancy.journal import Journal
-from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.naming import Named, name_causes, without_each_other
 from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
 from rfdropo_bayes.discrepancy.remainder import Remainder, describe_remainder
 from rfdropo_bayes.discrepancy.screen import Screen, p_in_words
 from rfdropo_bayes.discrepancy.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible
-from rfdropo_bayes.errors import InputError
 
-AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
-# White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
-GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3, "orientation": 0.01}
+BASE, CAUSES = "the fit of the base model", "naming causes"
+GAIN, LAWS = "the gain on unseen recordings", "laws at ports"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is known at some time of an audit.
+
+    Attributes:
+        problem: what is audited.
+        reached: the base model.
+        named: causes; None before the base model was screened.
+        kept: of these, what unseen recordings support; None before they were asked.
+        suspected: a noise under which the base model would pass, where a stated one leaves a discrepancy.
+        described: what acts that the library does not have; None before it was asked, or where it is not.
+        ended: of the parts of an audit, those that are done.
+    """
+
+    problem: AuditProblem
+    reached: Reached
+    named: Named | None = None
+    kept: Kept | None = None
+    suspected: Stacked | None = None
+    described: Described | None = None
+    ended: tuple[str, ...] = ()
+
+    def after(self, part: str) -> Found:
+        """The same with a part that is done."""
+        return replace(self, ended=(*self.ended, part))
+
+    @property
+    def left(self) -> tuple[str, ...]:
+        """What was not done, in words."""
+        waiting = () if self.named is None else self.named.waiting
+        parts = [BASE, CAUSES, *([GAIN] if self.named is None or self.named.steps else [])]
+        found = [part for part in parts if part not in self.ended]
+        if waiting:
+            found[found.index(CAUSES)] = f"refits with {', '.join(waiting)}, and further causes"
+        asks = self.problem.ports is not None and self.problem.compared is None
+        return (*found, *([LAWS] if asks and LAWS not in self.ended else []))
 
 
 @dataclass(frozen=True)
@@ -57,12 +90,14 @@ class Causes:
         steps: that unseen recordings support, all of them where these support none.
         unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
         screens: of the base model, and after each step.
+        refits: log Bayes factors of the candidates that were refitted beside the last model and did not join it.
         described: what acts that the library does not have; None where nothing was left to describe.
     """
 
     steps: list[Added]
     unsupported: list[str]
     screens: list[Screen]
+    refits: dict[str, float] = field(default_factory=dict)
     described: Described | None = None
 
 
@@ -83,6 +118,26 @@ class Validation:
     recordings: str = ""
     predictions: tuple[UnseenErrors, UnseenErrors] | None = None
     unseen: Unseen | None = None
+
+    @classmethod
+    def of_steps(cls, held_out: HeldOut | None, steps: int) -> Validation:
+        """What unseen recordings say of the model after so many steps, and after each of them."""
+        if held_out is None:
+            return cls()
+        gains = [held_out.gain(0, k) for k in range(1, steps + 1)]
+        explained, predictions = [gain.explained for gain in gains], held_out.predictions
+        last = gains[-1] if gains else None
+        return cls(last, explained, held_out.which, (predictions[0], predictions[steps]), held_out.unseen)
+
+    @classmethod
+    def of_law(cls, described: Described) -> Validation:
+        """What unseen recordings say of the base model with a law, alone or beside mechanisms."""
+        held = described.held_out
+        if held is None:
+            return cls()
+        if described.steps:
+            return cls.of_steps(held, len(described.steps))
+        return cls(described.overall, [], held.which, (held.predictions[0], held.predictions[-1]), held.unseen)
 
 
 @dataclass(frozen=True)
@@ -109,13 +164,15 @@ class Cost:
     """What an audit took.
 
     Attributes:
-        stopped: whether the time was up before all was done.
+        stopped: why it ended before all was done, "time" or "interrupt"; empty where it did not.
+        left: what was not done.
         rollouts: of the whole run.
         profile: seconds of each stage, of all parts of an audit that was resumed.
         waited: seconds for which its last part waited for processors that other programs held.
     """
 
-    stopped: bool
+    stopped: str
+    left: tuple[str, ...]
     rollouts: int
     profile: dict[str, float]
     waited: float
@@ -155,7 +212,7 @@ class Answer:
     @property
     def fitted(self) -> bool:
         """Whether the base fit came to an end; where it did not, its parameters are where the search had come to."""
-        return self.base.converged or not self.cost.stopped
+        return BASE not in self.cost.left
 
     @property
     def converged(self) -> bool:
@@ -183,45 +240,6 @@ class Answer:
         return self.causes.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
 
 
-def _sizes(steps: Sequence[Added], extended: Fit, deadline: Deadline) -> Fit:
-    """The extended model's fit under priors no narrower than its sizes; as it is where the time is up."""
-    with suppress(OutOfTime), deadline.stage("sizes"):
-        return widened(steps[-1].judge, extended) if steps else extended
-    return extended
-
-
-def _leaves_something(verdict: str, base: Fit) -> bool:
-    """Whether there is something to describe: a discrepancy that the library does not explain, or a base model that
-    could not be fitted for it."""
-    return verdict in (PARTLY, UNEXPLAINED) or (verdict == NO_VERDICT and not base.converged)
-
-
-def _remainder(target: FitTarget, extended: Fit, described: Described | None) -> Remainder:
-    """What the last model leaves, a law that holds being in it."""
-    left = extended.residual
-    if described is not None and described.holds and described.last is not None:
-        left = as_measured(described.last.target, described.last.fit).residual
-    return describe_remainder(target.measurements, left, target.noise.first)
-
-
-def _weighed_up(
-    problem: AuditProblem, verdict: str, target: FitTarget, remainder: Remainder, shown: float | None
-) -> str:
-    """The verdict, or `NEGLIGIBLE` where what is left is too small to matter."""
-    size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
-    return NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
-
-
-def _described_validation(described: Described) -> Validation:
-    """What unseen recordings say of the base model with a law, alone or beside mechanisms."""
-    held = described.held_out
-    if held is None:
-        return Validation()
-    if described.steps:
-        return _validation(held, len(described.steps))
-    return Validation(described.overall, [], held.which, (held.predictions[0], held.predictions[-1]), held.unseen)
-
-
 def audit(
     problem: AuditProblem,
     report: Callable[[str], None] = lambda line: None,
@@ -239,70 +257,171 @@ def audit(
     Raises:
         InputError: rollouts at the optimum do not end well.
     """
-    deadline = deadline or Deadline(problem.rules.minutes)
-    with deadline.stage("base model"):
-        target, base = _fitted_or_not(problem, journal, report, deadline)
-    fitted = not deadline.reached
-    problem = _with_differences_of(problem, target)
-    if fitted:
-        report(f"base model fitted; {_noise(target.measured.noise.first)}{_far_off(target, base)}")
-    finer = _forward(problem, True, target.measurements, deadline) if fitted and problem.finer else None
-    judge, search = target, ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
-    search, base, steps, last = _searched(search, base)
-    judge = judge if judge.known is not None else search.target.on(judge.forward)
-    asked = [step.name for step in steps]
-    steps, last, held_out = supported_steps(problem, judge, search, base, steps, last)
-    under = NamedModel(judge, base, tuple(steps))
-    base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
-    unsupported = [name for name in asked if name not in [step.name for step in steps]]
-    if unsupported:
-        report(f"unseen recordings do not support {' and '.join(unsupported)}")
-    extended, target = steps[-1].fit if steps else base, judge.measured
-    if steps and target.noise.source == RESIDUALS:
-        with suppress(OutOfTime):
-            last = _final_screen(replace(search, target=steps[-1].judge), extended, steps)
-    screens = [*(step.before for step in steps), last]
-    validation = _validation(held_out, len(steps))
-    verdict, suspected = _verdict(replace(search, target=judge), base, steps, screens, validation.gain, deadline)
-    asks = fitted and not deadline.reached and _leaves_something(verdict, base)
-    described = describe(problem, under, held_out, report) if asks else None
+    clock = deadline or Deadline(problem.rules.minutes)
+    found = Found(problem, beginning(problem, first_target(problem, journal or Journal(), clock)))
+    with clock.stopping(report):
+        for known in findings(found, report):
+            found = known
+    return conclude(found, report)
+
+
+def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
+    """What is known after each part of an audit.
+
+    Raises:
+        OutOfTime: the time is up.
+    """
+    clock = begun.reached.target.forward.deadline
+    found = begun
+    with clock.stage("base model"):
+        for reached in base_fits(begun.problem, begun.reached, begun.problem.seed, report):
+            found = replace(found, reached=reached)
+            yield found
+    target, base = found.reached.settled()
+    problem = _with_differences_of(begun.problem, target)
+    found = replace(found, problem=problem).after(BASE)
+    report(f"base model fitted; {_noise(target.measured.noise.first)}{_far_off(target, base)}")
+    firsts = [group[0] for group in target.measurements.members]
+    finer = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None
+    search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
+    named = Named(search, base)
+    for each in _named(named):
+        named, found = each, replace(found, named=each)
+        yield found
+    found = found.after(CAUSES)
+    kept = Kept(named, None)
+    for each_kept in keep_supported(problem, replace(named, steps=without_each_other(named.steps))):
+        kept, found = each_kept, replace(found, kept=each_kept)
+        yield found
+    last = kept.named
+    if last.steps and last.judge.noise.source == RESIDUALS:
+        kept = replace(kept, named=replace(last, screen=_final_screen(last)))
+    found = replace(found, kept=kept).after(GAIN)
+    yield found
+    verdict = _verdict(kept, problem, ended=True)
+    if verdict in (PARTLY, UNEXPLAINED) and kept.named.screens[-1].omnibus.p <= problem.rules.extended_passes:
+        found = replace(found, suspected=_suspected(search, as_measured(last.search.target, last.base)))
+        yield found
+    # A discrepancy that the library does not explain, or a base model that could not be fitted for it.
+    if verdict in (PARTLY, UNEXPLAINED) or (verdict == NO_VERDICT and not base.converged):
+        for described in describe(problem, last, kept.held_out, report):
+            found = replace(found, described=described)
+            yield found
+    yield found.after(LAWS)
+
+
+def conclude(found: Found, report: Callable[[str], None] = lambda line: None) -> Answer:
+    """The answer that is known by now. An audit that was stopped measures the gain of what it has, if the time that is
+    kept for this suffices; all else that it does here takes no more than a few rollouts."""
+    problem, clock = found.problem, found.reached.target.forward.deadline
+    stopped = clock.reached
+    kept = found.kept or _kept_in_time(found, clock)
+    judge, fitted = kept.named.search.target, kept.named
+    base = as_measured(judge, fitted.base)
+    steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in fitted.steps]
+    screens, validation = fitted.screens, Validation.of_steps(kept.held_out, len(steps))
+    verdict, described = _verdict(kept, problem, ended=CAUSES in found.ended), found.described
     if described is not None and described.holds:
-        verdict, suspected = DESCRIBED, None
+        verdict = DESCRIBED
         if len(described.steps) < len(steps):
             steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in described.steps]
-            screens = [*(step.before for step in steps), last] if steps else screens[:1]
-            extended, validation = steps[-1].fit if steps else base, _described_validation(described)
-    sizes = _sizes(steps, extended, deadline)
-    stopped = deadline.reached
-    deadline.lift()  # what is left are single rollouts, for the report, and the climb for the sizes of a law
-    shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
-    remainder = _remainder(target, extended, described)
+            screens = [*(step.before for step in steps), screens[-1]] if steps else screens[:1]
+            validation = Validation.of_law(described)
+    target, extended = judge.measured, steps[-1].fit if steps else base
+    sizes = extended
+    with suppress(OutOfTime), clock.stage("sizes"):
+        sizes = widened(steps[-1].judge, extended) if steps else extended
+    clock.lift()  # the rest are single rollouts for the report, and the optimisation for the sizes of a law
+    finer, refined = fitted.search.finer, DISCRETISATION in [*fitted.names, *kept.unsupported]
+    shown = None if refined or finer is None else numerical_shift(target, finer, extended)
+    left = extended.residual
+    if described is not None and described.holds and described.last is not None:
+        left = as_measured(described.last.target, described.last.fit).residual
+    remainder = describe_remainder(target.measurements, left, target.noise.first)
     if verdict in (PARTLY, UNEXPLAINED) and not steps:
-        verdict = _weighed_up(problem, verdict, target, remainder, shown)
+        size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
+        verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
     draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
+    suspected = None if verdict == DESCRIBED else found.suspected
+    rollouts = judge.forward.rollouts + (finer.rollouts if finer else 0)
     return Answer(
         verdict,
         problem,
         target,
         base,
-        Causes(steps, unsupported, screens, described),
+        Causes(steps, list(kept.unsupported), screens, fitted.gains, described),
         validation,
         remainder,
         sizes,
         draws,
         Doubts(suspected, target.measurements.shift, shown, decided_by_priors(target, draws)),
-        Cost(stopped, judge.forward.rollouts + (finer.rollouts if finer else 0), deadline.profile, deadline.waited),
+        Cost(clock.why if stopped else "", found.left if stopped else (), rollouts, clock.profile, clock.waited),
     )
 
 
-def _validation(held_out: HeldOut | None, steps: int) -> Validation:
-    """What unseen recordings say of the model after so many steps, and after each of them."""
-    if held_out is None:
-        return Validation()
-    gains = [held_out.gain(0, k) for k in range(1, steps + 1)]
-    explained, predictions = [gain.explained for gain in gains], held_out.predictions
-    last = gains[-1] if gains else None
-    return Validation(last, explained, held_out.which, (predictions[0], predictions[steps]), held_out.unseen)
+def _kept_in_time(found: Found, clock: Deadline) -> Kept:
+    """Of an audit that was stopped: the base model with the best that was named so far, its joint test, and the gain
+    on unseen recordings where the time that is kept for it suffices."""
+    named = found.named
+    if named is None:
+        target, base = _settled(found.reached, clock)
+        named = Named(ExtensionSearch(target, found.problem.candidates, found.problem.rules, found.problem.seed), base)
+    named = named.with_best()
+    named = replace(named, steps=without_each_other(named.steps))
+    if named.screen is None:
+        named = replace(named, screen=named.asked.tested(named.fit, len(named.steps)))
+    kept = Kept(named, None)
+    with suppress(OutOfTime), clock.granted():
+        kept = next(iter(keep_supported(found.problem, named)))
+    return kept
+
+
+def _settled(reached: Reached, clock: Deadline) -> tuple[FitTarget, Fit]:
+    """Target and fit of a base model that was not fitted to the end."""
+    with clock.granted(float("inf")):
+        return reached.settled()
+
+
+def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
+    """The verdict on what was named, whatever has no name; ``ended`` is whether all candidates had their say."""
+    named, rules = kept.named, problem.rules
+    noise, members = named.judge.measured.noise, [len(step.members) for step in named.steps]
+    gain = Validation.of_steps(kept.held_out, len(named.steps)).gain
+    last = named.screens[-1].omnibus.p if named.steps else None
+    verdict = decide(rules, named.screens[0].omnibus.p, last, members, gain, noise.doubtful)
+    if not named.fit.converged:  # clearly supported effects are found nevertheless
+        return PARTLY if gain is not None and gain.clear else NO_VERDICT
+    return verdict if ended or named.steps or verdict != UNEXPLAINED else NO_VERDICT
+
+
+def _named(begun: Named) -> Iterator[Named]:
+    """Named causes; asked once more where the noise is that of residuals.
+
+    What the base model lacks may drive its fit to a corner of the priors where motion is rough, and no climb ends.
+    Causes are asked for all the same. The noise of a base model's residuals holds the discrepancy itself, and whitens
+    away what would tell its causes apart: so the whole question is asked again under the noise that the first
+    extension leaves.
+    """
+    first = begun
+    for named in name_causes(begun.search, begun.base):
+        first = named
+        yield first
+    target = first.search.target
+    if not first.steps or target.noise.source != RESIDUALS:
+        return
+    target = replace(target, noise=residual_noise(first.judge, first.fit))
+    begun.search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
+    *_, again = name_causes(begun.search.under(target), climb(target, first.base.x, first.base.free))
+    yield again
+
+
+def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProblem:
+    """The problem with derivatives over the steps that the base fit has found usable."""
+    step = target.forward.lanes.difference
+    if step is None or step == problem.lanes.difference:
+        return problem
+    finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
+    return replace(problem, lanes=target.forward.lanes, finer=finer)
 
 
 def _noise(noise: Autoregression) -> str:
@@ -321,209 +440,13 @@ def _far_off(target: FitTarget, fit: Fit) -> str:
     return f"; it is far off: judged under white noise of the {size:.2g} mm that it leaves; a row counts {share:.2g}"
 
 
-def _verdict(
-    search: ExtensionSearch,
-    base: Fit,
-    steps: Sequence[Added],
-    screens: Sequence[Screen],
-    gain: Gain | None,
-    deadline: Deadline,
-) -> tuple[str, Stacked | None]:
-    """The verdict, and the noise under which the base model would pass where something is left unexplained."""
-    rules, last = search.rules, screens[-1].omnibus.p
-    members, noise = [len(step.members) for step in steps], search.target.measured.noise
-    verdict = decide(rules, screens[0].omnibus.p, last if steps else None, members, gain, noise.doubtful)
-    if not (base.converged or steps) or (verdict == UNEXPLAINED and deadline.reached):
-        verdict = NO_VERDICT
-    suspected = None
-    if verdict in (PARTLY, UNEXPLAINED) and last <= rules.extended_passes:
-        with suppress(OutOfTime):
-            suspected = _suspected(search, base)
-    return verdict, suspected
-
-
-def _searched(search: ExtensionSearch, base: Fit) -> tuple[ExtensionSearch, Fit, list[Added], Screen]:
-    """Named causes, and the screen of the model with them; asked once more where the noise is that of residuals.
-
-    What the base model lacks may drive its fit to a corner of the priors where motion is rough, and no climb ends.
-    Causes are asked for all the same; they count if the fit of the model with them has converged.
-
-    Returns:
-        the search and the base fit that they are of, the steps, and the screen.
-    """
-    unnamed = search, base, list[Added]()
-    if not base.converged and search.target.forward.deadline.reached:
-        return *unnamed, search.tested(base, 0)
-    own = search.target.forward
-    base, steps, last = search.name_causes(base)
-    if steps and not steps[-1].fit.converged:
-        return *unnamed, search.tested(unnamed[1], 0)
-    if steps and search.target.noise.source == RESIDUALS:
-        with suppress(OutOfTime):
-            again, renewed = _asked_again(search, own, base, steps[-1].fit)
-            found = again.name_causes(renewed)
-            if not search.target.forward.deadline.reached:
-                return again, *found
-    return search, base, steps, last
-
-
-def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProblem:
-    """The problem with derivatives over the steps that the base fit has found usable."""
-    step = target.forward.lanes.difference
-    if step is None or step == problem.lanes.difference:
-        return problem
-    finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
-    return replace(problem, lanes=target.forward.lanes, finer=finer)
-
-
-def _forward(problem: AuditProblem, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
-    return simulated(problem, finer, measurements, [group[0] for group in measurements.members], deadline)
-
-
-def base_model(
-    problem: AuditProblem,
-    seed: int,
-    journal: Journal | None = None,
-    report: Callable[[str], None] = lambda line: None,
-    deadline: Deadline | None = None,
-) -> tuple[FitTarget, Fit]:
-    """Noise and base fit; where the noise is estimated from residuals, the two in turn.
-
-    Raises:
-        InputError: the time was up before the base model was fitted.
-    """
-    target = first_target(problem, journal or Journal(), deadline)
-    try:
-        return _base_fit(target, problem.start, seed, report, [])
-    except OutOfTime:
-        raise InputError(
-            "the time was up before the base model was fitted",
-            where=(deadline or Deadline()).where,
-            remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--from)",
-        ) from None
-
-
-def _fitted_or_not(
-    problem: AuditProblem, journal: Journal | None, report: Callable[[str], None], deadline: Deadline
-) -> tuple[FitTarget, Fit]:
-    """The base model's noise and fit; where the time is up before, the last point that the search has come to, which
-    counts as not converged. The deadline is lifted then: what is left is a rollout of each recording."""
-    target = first_target(problem, journal or Journal(), deadline)
-    coordinates = target.forward.coordinates
-    reached = [(target, coordinates.null if problem.start is None else coordinates.encode(problem.start))]
-    try:
-        return _base_fit(target, problem.start, problem.seed, report, reached)
-    except OutOfTime:
-        report("the time was up before the base model was fitted")
-        deadline.lift()
-        target, fit = _unfitted(*reached[-1])
-    if target.noise.source == RESIDUALS:  # a first guess
-        target, fit = _unfitted(replace(target, noise=residual_noise(target, fit)), fit.x)
-    return target, fit
-
-
-def _unfitted(target: FitTarget, x: Float[np.ndarray, " d"]) -> tuple[FitTarget, Fit]:
-    """A point that no fit has ended at: of the base parameters no more is known than their prior."""
-    free = np.arange(target.forward.coordinates.base)
-    residual = target.residual(x[None])[0]
-    covariance = np.diag(target.forward.coordinates.prior_sd[free] ** 2)
-    return target, Fit(x, free, residual, np.zeros((len(residual), len(free))), covariance, -np.inf, np.inf)
-
-
-def _announce(target: FitTarget, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
-    """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
-    derivatives, which take as long to compile as rollouts did."""
-    forward, own = target.forward, target.forward.coordinates
-    counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
-    points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)
-    points[:, : own.base] += np.linspace(-0.5, 0.5, len(points))[:, None] * own.prior_sd[: own.base]
-    took = []
-    for _ in range(2):  # the first one compiles
-        began = time.monotonic()
-        forward.observe(np.clip(points, *own.bounds))
-        took.append(time.monotonic() - began)
-    rollouts = climb_rollouts(target, own.base) + poll_rollouts(target)
-    rollouts += optimum_rollouts(target) if start is None else 0
-    words = about(rollouts * forward.pace + max(took[0] - took[1], 0.0))
-    report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")
-
-
-def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | None = None) -> FitTarget:
-    """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
-    measurements = measurements_of(problem, range(len(problem.trajectories)), problem.trajectories)
-    noise = problem.stated_noise
-    if measurements.has_repeats:
-        noise = measurements.noise(measurements.spread, 0)
-    if noise is None:
-        scales = [np.full(c.valid.shape[-1], GUESSES[c.name]) for c in measurements.channels]
-        noise = Stacked(tuple(Autoregression(scale, np.ones(1), RESIDUALS, np.inf) for scale in scales))
-    return FitTarget(_forward(problem, False, measurements, deadline), measurements, noise, journal)
-
-
-def _base_fit(
-    target: FitTarget,
-    start: dict[str, float] | None,
-    seed: int,
-    report: Callable[[str], None],
-    reached: list[tuple[FitTarget, Float[np.ndarray, " d"]]],
-) -> tuple[FitTarget, Fit]:
-    """The base model's noise and posterior mode, from a given start or from where `calibrate`'s search leads; climbed
-    on while rollouts beside it are better. ``reached`` gets the points that the search has come to."""
-    _announce(target, start, report)
-    coordinates, known = target.forward.coordinates, target.noise.source != RESIDUALS
-    free = np.arange(coordinates.base)
-    first = base_optimum(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
-    reached.append((target, first))
-    usual, target = target.forward.lanes.difference, with_usable_differences(target, first)
-    if target.forward.lanes.difference != usual:
-        report(f"motion is rough: derivatives over relative steps of {target.forward.lanes.difference:g}")
-    target, fit = fit_with_noise(target, first, free)
-    for _ in range(AGAIN):
-        reached.append((target, fit.x))
-        better = better_nearby(target, fit)
-        if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
-            fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
-            break
-        report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
-        fit = climb(target, better, free)
-    else:
-        fit = fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
-    return (target, fit) if known else _under_residual_noise(target, fit)
-
-
-def _under_residual_noise(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
-    """Noise and fit in turn."""
-    converged = fit.converged
-    for _ in range(2):
-        target = replace(target, noise=residual_noise(target, fit))
-        fit = climb(target, fit.x, fit.free)
-    return target, fit if converged else replace(fit, promise=np.inf)
-
-
-def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
-    """Autoregressions fitted to what a model leaves of every recording."""
-    measured = target.measurements
-    left = np.array(measured.spread)
-    for group, error in zip(measured.members, target.errors(fit.x), strict=True):
-        left[list(group)] += error
-    return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
-
-
-def _asked_again(search: ExtensionSearch, own: Forward, base: Fit, extended: Fit) -> tuple[ExtensionSearch, Fit]:
-    """The search, on the base model's own simulator, with the noise of what a first extension leaves: that of the base
-    model holds the discrepancy itself, and whitens away what would tell its causes apart."""
-    target = replace(search.target, noise=residual_noise(search.target, extended)).on(own)
-    search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
-    return replace(search, target=target), climb(target, base.x, base.free)
-
-
-def _final_screen(search: ExtensionSearch, extended: Fit, steps: Sequence[Added]) -> Screen:
+def _final_screen(last: Named) -> Screen:
     """The screen of the extended model under the noise that it leaves itself."""
-    renewed = replace(search.target, noise=residual_noise(search.target, extended))
-    fit = climb(renewed, extended.x, extended.free)
-    found, _ = replace(search, target=renewed).screened(fit, [step.name for step in steps])
-    p = p_in_words(found.omnibus.p, search.rules.bootstraps)
-    search.report(f"joint test under the noise that it leaves: p {p}")
+    renewed = replace(last.judge, noise=residual_noise(last.judge, last.fit))
+    fit = climb(renewed, last.fit.x, last.fit.free)
+    found = last.asked.under(renewed).screened(fit, last.names)
+    p = p_in_words(found.omnibus.p, last.search.rules.bootstraps)
+    last.search.report(f"joint test under the noise that it leaves: p {p}")
     return found
 
 
@@ -532,7 +455,7 @@ def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
     known = search.target.measured
     if known.noise.source != STATED:
         return None
-    target, fit = _under_residual_noise(known, base)
-    found, _ = replace(search, target=target).screened(fit)
+    target, fit = under_residual_noise(known, base)
+    found = search.under(target).screened(fit)
     passes = found.omnibus.p > search.rules.base_passes and not target.noise.doubtful
     return target.noise if passes else None

@@ -1,12 +1,12 @@
-"""Where something acts: the log evidence of a signal at each port, the base parameters projected out.
+"""Evidence of ports: the log evidence of a signal at each port, with base parameters projected out.
 
-    residual  y = H b + Phi w + e        H: slopes of the base parameters, of flat prior: projected out; e: unit noise
-    w = L v, v ~ N(0, s^2),  L L' = K = exp(-|ti - tj| / l), one K for each recording
+    residual y = H b + Phi w + e H: slopes of the base parameters, of flat prior: projected out; e: unit noise w = L v,
+    v ~ N(0, s^2), L L' = K = exp(-|ti - tj| / l), one K for each recording
 
-With A = (I - Q Q') Phi, Q = orth(H), and L'A'A L = V lam V', c = V'L'A'y, the evidence against no signal is
--1/2 sum log(1 + s^2 lam) + 1/2 sum s^2 c^2 / (1 + s^2 lam); size s and memory l are those of its maximum on a grid
-(empirical Bayes; Rasmussen and Williams 2006, section 2.2 and 5.4). All ports are judged as a family: by the largest
-log evidence of any port in simulated data sets where nothing is hidden.
+With A = (I - Q Q') Phi, Q = orth(H), and L'A'A L = V lam V', c = V'L'A'y, the evidence against no signal is -1/2 sum
+log(1 + s^2 lam) + 1/2 sum s^2 c^2 / (1 + s^2 lam); size s and memory l maximise it on a grid (empirical Bayes;
+Rasmussen and Williams 2006, section 2.2 and 5.4). All ports are tested as a family: against the largest log evidence of
+any port in simulated data sets without a discrepancy.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ SIZES = np.geomspace(0.01, 30.0, 15)  # of a signal, in sizes of its port
 
 @dataclass(frozen=True)
 class PortEvidence:
-    """What the data say of a signal at one port.
+    """Evidence of a signal at one port.
 
     Attributes:
-        port: where.
-        log_evidence: of a signal against none [nat]; 0 where none is likelier.
-        adjusted_p: probability that, were the model right, any port had as much.
+        port: the port.
+        log_evidence: log evidence of a signal over no signal [nat]; 0 if no signal is likelier.
+        adjusted_p: probability of evidence this large at any port under a right model.
         amplitude: root mean square of the signal's mean [unit of the port].
-        memory: over which it keeps its value [s].
-        share: of what the model leaves beyond the noise that the signal explains.
-        mean, sd: of the signal at the splines' centres, one row a group of recordings.
+        memory: correlation time of the signal [s].
+        share: explained share of the residuals beyond the noise.
+        mean, sd: mean and deviation of the signal at the splines' centres, one row a group of recordings.
     """
 
     port: Port
@@ -73,7 +73,7 @@ def evidences(
     Args:
         found: responses of the model.
         null: whitened residuals of simulated data sets without discrepancy.
-        chosen: ports to judge; all by default.
+        chosen: ports to test; all by default.
     """
     base, ports = found.base, list(found.whitened) if chosen is None else list(chosen)
     residual = project_out(base, found.residual.reshape(-1)[:, None])[:, 0]

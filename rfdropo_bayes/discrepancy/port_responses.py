@@ -1,9 +1,9 @@
-"""What a signal at each port does to the data of a fitted model, to first order.
+"""First-order effect of a signal at each port on the data of a fitted model.
 
-A signal is a sum of cubic B-splines in time, one set for each recording. What each of them does to the whitened data is
-its response: by rollouts, all recordings at once and one lane a spline, at ports of actuation and of the body; by a map
-of the simulated markers at ports of sensing. A model far from the data has responses like those of the truth: of an arm
-with half the layers and twice the step the same laws come out.
+A signal is a sum of cubic B-splines in time, one set for each recording. The effect of each spline on the whitened data
+is its response: by rollouts, all recordings at once and one lane a spline, at ports of actuation and of the body; by a
+map of the simulated markers at ports of sensing. A misspecified model has responses similar to the truth: an arm with
+half the layers and twice the step yields the same laws.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from rfdropo_bayes.discrepancy.score import span
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 KNOTS = 0.15
-"""Time between knots [s]: what is faster is not seen of a body whose lowest mode takes as long."""
+"""Time between knots [s]: faster signals do not move a body whose lowest mode has this period."""
 MOST_SPLINES = 40
 """Splines in a recording, of which each takes a rollout at every port; longer recordings get wider knots."""
 DEGREE = 3
 SHARE = 1e-3
-"""Of a port's size by which a signal is changed for a difference; in single precision a hundred times as much."""
+"""Share of a port's size by which a signal is perturbed; a hundred times as much in single precision."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Splines:
     """B-splines over the steps of a simulator.
 
     Attributes:
-        value: of every spline at every step; row 0 is the initial state.
-        centre: where each is largest [s].
+        value: value of every spline at every step; row 0 is the initial state.
+        centre: time of each spline's maximum [s].
         inverse: coefficients of the least-squares fit to a series.
     """
 
@@ -49,7 +49,7 @@ class Splines:
 
 
 def splines(rows: int, time_step: float) -> Splines:
-    """Cubic B-splines over so many rows, `KNOTS` apart or wider."""
+    """Cubic B-splines over ``rows`` rows, `KNOTS` apart or wider."""
     time = time_step * np.arange(rows)
     pieces = int(np.clip(round(time[-1] / KNOTS), 1, MOST_SPLINES - DEGREE))
     inner = np.linspace(0.0, time[-1], pieces + 1)
@@ -64,20 +64,18 @@ class Responses:
     """Responses of a fitted model at all ports, and the fit itself as a linear model.
 
     Attributes:
-        ports: of the simulator.
+        ports: ports of the simulator.
         basis: the splines.
-        whitened: by port, but for those of several members: what each spline in a group of recordings does to its
-            whitened data.
-        residual: whitened, by group.
-        jacobian: of the fit's free coordinates, by group; columns in deviations of their priors.
+        whitened: effect of each spline on a group's whitened data, by port, except ports with several members.
+        residual: whitened residuals, by group.
+        jacobian: derivatives by the fit's free coordinates, by group; columns in deviations of their priors.
         levels: commands that reach the ports, by group.
-        begun: when the recordings' first rows are [s] on the simulator's clock, which begins with their commands.
-        noise: mean square of the measurement's noise in these deviations; less than 1 where the model is far off.
-        recordings: the first one of each group.
-        pull: what the data hold at the mode against the priors of the free coordinates, minus the slope of the log
-            prior, in these deviations; None for none.
-        of_motion: features of the motion, by group, where the body carries signals that follow it.
-        exact: by port: what each feature does, where it was asked for; see `with_exact_columns`.
+        begun: time of the recordings' first rows [s] on the simulator's clock, which begins with their commands.
+        noise: mean square of the measurement's noise in these deviations; less than 1 if the model is misspecified.
+        recordings: first recording of each group.
+        pull: minus the gradient of the log prior at the mode, in these deviations; None for zero.
+        of_motion: features of the motion, by group, if the body supports signals that depend on it.
+        exact: exact effect of requested features, by port; see `with_exact_columns`.
     """
 
     ports: PortMap
@@ -95,7 +93,7 @@ class Responses:
 
     @property
     def base(self) -> Float[np.ndarray, "n rank"]:
-        """Orthonormal basis of what the fit's parameters do to all data."""
+        """Orthonormal basis of the effects of the fit's parameters on all data."""
         return span(self.jacobian.reshape(-1, self.jacobian.shape[-1]))
 
 
@@ -105,10 +103,10 @@ def responses(
     """Responses at every port around a fit.
 
     Args:
-        target: data under the noise by which the model is judged.
-        fit: of the model, with residuals and slopes under that noise.
-        ports: of the simulator.
-        table: that tells which commands reach the ports.
+        target: data under the model's noise.
+        fit: fit of the model, with residuals and slopes under that noise.
+        ports: ports of the simulator.
+        table: table of features, with the commands at the ports.
         report: called with a line of words.
 
     Raises:
@@ -182,10 +180,10 @@ def with_exact_columns(
     found: Responses,
     features: Mapping[Port, Float[np.ndarray, "group feature member row"]],
 ) -> Responses:
-    """The same with what features do at their ports found as such, and not by the splines that come nearest to them.
+    """The same with exact effects of features at their ports, instead of their nearest splines.
 
-    What is faster than the knots counts: of a crosstalk of two cables under noise with a memory of .6 a row, whose
-    whitening brings the fast parts out, splines show half.
+    Effects faster than the knots matter: for a crosstalk of two cables under noise of autocorrelation .6 per row, whose
+    whitening amplifies fast parts, splines show half.
     """
     shown = target.forward.observe_one(fit.x)
     exact = {
@@ -198,7 +196,7 @@ def with_exact_columns(
 
 def under(found: Responses, judge: FitTarget, other: FitTarget) -> Responses:
     """The same responses in deviations of the noise of another target; residual and slopes stay as they are."""
-    if judge.known is None:  # whose noise is that of the measurement, and stays
+    if judge.known is None:  # it has the measurement noise, which is kept
         return found
 
     def each(part: Float[np.ndarray, "group value k"]) -> Float[np.ndarray, "group value k"]:
@@ -222,7 +220,7 @@ def on_splines(basis: Splines, values: Float[np.ndarray, "*batch row"]) -> Float
 def feature_columns(
     found: Responses, port: Port, features: Float[np.ndarray, "group feature member row"]
 ) -> Float[np.ndarray, "group value feature"]:
-    """What features do to the whitened data at all members of a port, each as a signal of its own size."""
+    """Effects of features on the whitened data at all members of a port, each as a signal of its own size."""
     if port in found.exact:
         return found.exact[port]
     near = np.moveaxis(on_splines(found.basis, features), 1, 3)  # group, member, spline, feature

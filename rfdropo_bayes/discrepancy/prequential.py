@@ -1,4 +1,4 @@
-"""When and where a model fails: how surprising each stretch of rows is, given those before it.
+"""Time and place of a model's misfit: the surprise of each block of rows, given the earlier rows.
 
 With the model linear around its mode, the predictive density of every block of rows, given all rows before it, is a
 normal one (Dawid 1984, "The prequential approach"); the sum of their logarithms is the log evidence. Parameters are
@@ -17,8 +17,9 @@ from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.omnibus import BLOCK
 
 BEGINNING = (
-    "Only the first block fails: was another command in force before the first row than these recordings have, or was "
-    "the robot not at rest? rfdropo check says which command it is; initial_command sets it."
+    "Only the first block fails: was another command in force before the first row than these recordings "
+    "have, or was the robot not at rest? rfdropo check names the assumed command; initial_command sets "
+    "it."
 )
 
 
@@ -27,11 +28,11 @@ class Prequential:
     """Scores of successive blocks of rows, over all recordings.
 
     Attributes:
-        edges: times at which blocks begin, and the last one ends [s].
+        edges: start times of blocks, and the end of the last block [s].
         score: log predictive density of each block, whitened data.
-        p: probability that a block of a model that is right is as surprising.
-        surprise: mean square of a block's prediction errors in their own deviations, 1 where the model is right.
-        misfit: mean square of what each marker coordinate leaves at the mode, 1 where the model is right.
+        p: probability of a surprise this large under a right model.
+        surprise: mean square of a block's prediction errors in their own deviations, 1 if the model is right.
+        misfit: mean square of each marker coordinate's residuals at the mode, 1 if the model is right.
     """
 
     edges: Float[np.ndarray, " edge"]
@@ -52,7 +53,7 @@ def prequential(target: FitTarget, fit: Fit) -> Prequential:
     known, design = fit.residual[measured.count.size :], fit.jacobian[measured.count.size :]  # weighed before all rows
     before, precision = precision @ mean, precision + design.T @ design
     mean = np.linalg.solve(precision, before + design.T @ known)
-    starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block has what is left over, too
+    starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block also has the remaining rows
     scores, p, surprise = [], [], []
     for start, end in zip(starts, [*starts[1:], shape[1]], strict=True):
         rows = slice(start, end)
@@ -84,7 +85,7 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
     """
     failing = np.flatnonzero(found.p <= level / len(found.p))
     if len(failing) == 0:
-        return "No stretch of rows is surprising by itself, given those before it."
+        return "No stretch of rows is surprising by itself, given the earlier rows."
     first, worst = failing[0], int(np.argmax(found.surprise))
     at = int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))
     share = "in every block" if len(failing) == len(found.p) else f"in {len(failing)} of {len(found.p)} blocks"

@@ -19,11 +19,11 @@ OUTER = 0.1  # of a prior at each end: that arm's median lay in 0.05, and withou
 
 
 def decided_by_priors(target: FitTarget, draws: Float[np.ndarray, "draw d"]) -> list[Caution]:
-    """Cautions about base parameters at an end of their prior, or where it hardly is.
+    """Cautions about base parameters at an end of their prior, or in a region of little prior mass.
 
     Args:
-        target: what is fitted.
-        draws: of all coordinates, from the last model.
+        target: target of the fit.
+        draws: draws of all coordinates from the last model.
     """
     own = target.forward.coordinates
     base = np.arange(own.base)
@@ -36,7 +36,7 @@ def decided_by_priors(target: FitTarget, draws: Float[np.ndarray, "draw d"]) -> 
 
 
 def in_words(cautions: Sequence[Caution]) -> str:
-    """What the sentence of an audit with findings says of them."""
+    """Clause about them in the sentence of an audit with findings."""
     if not cautions:
         return ""
     return f" But {'; '.join(caution.sentence for caution in cautions)}: sizes may make up for it; widen that prior."

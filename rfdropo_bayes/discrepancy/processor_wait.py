@@ -13,9 +13,9 @@ Times = Mapping[str, tuple[float, float]]
 
 
 def thread_times() -> dict[str, tuple[float, float]]:
-    """For each thread of this process, the seconds that it has run, and those that it was ready to run and did not.
+    """Seconds that each thread of this process has run, and seconds that it was ready but waiting.
 
-    Empty where the system does not count them; Linux does.
+    Empty if the system does not count them, as only Linux does.
     """
     found = {}
     with suppress(OSError):
@@ -29,13 +29,13 @@ def thread_times() -> dict[str, tuple[float, float]]:
 def delay(elapsed: float, before: Times, after: Times, processors: int) -> float:
     """Seconds by which the work of all threads took longer than with the processors for itself alone.
 
-    Threads that are ready side by side would share the processors. Time in which no thread is ready, as where another
-    process simulates, is no delay.
+    Simultaneously ready threads share the processors. Time without a ready thread, as while another process simulates,
+    is no delay.
 
     Args:
-        elapsed: seconds between the two looks.
-        before, after: times of the threads, see `thread_times`; of a thread that has ended nothing is known.
-        processors: of the machine.
+        elapsed: seconds between the two measurements.
+        before, after: times of the threads, see `thread_times`; ended threads are unknown.
+        processors: number of processors.
     """
     ran, ready = 0.0, 0.0
     for name, (running, waiting) in after.items():

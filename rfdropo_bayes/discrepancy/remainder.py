@@ -1,5 +1,6 @@
-"""What no candidate explains of the positions, as a Gaussian process in time on every coordinate: how large, how slow,
-where."""
+"""Unexplained residual of the positions, as a Gaussian process in time on every coordinate: size, time scale and
+place.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +21,11 @@ class Remainder(NamedTuple):
     """Posterior of a Matern-3/2 process plus the measurement's noise, hyperparameters at their likelihood's maximum.
 
     Attributes:
-        amplitude: standard deviation of the process [m]; 0 where noise alone is likelier.
+        amplitude: standard deviation of the process [m]; 0 if noise alone is likelier.
         memory: its length scale [s].
-        time: rows it is given at [s].
-        mean, sd: of the process [m]; of every group, row and channel.
-        log_likelihood_ratio: of the process with against without it.
+        time: times of its rows [s].
+        mean, sd: mean and deviation of the process [m], for every group, row and channel.
+        log_likelihood_ratio: log likelihood ratio with and without the process.
     """
 
     amplitude: float
@@ -39,8 +40,8 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     """Fit the process to the whitened residuals of a model.
 
     The whitening is a linear map, so that the process is fitted to the residual itself under correlated noise: its
-    covariance is whitened, too. Each coordinate is taken for itself. Rows of a recording in which nothing was measured,
-    and those after its end, have no part in it.
+    covariance is also whitened. Coordinates are fitted separately. Unmeasured rows of a recording, and rows after its
+    end, are ignored.
     """
     own = slice(0, measurements.markers)
     shape = measurements.count.shape
@@ -51,7 +52,7 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     unit = Autoregression(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
     parts = _parts(np.asarray(measurements.valid[:, rows, own].any(axis=2)), unit)
     seen = np.concatenate([data[part.groups][:, part.seen].reshape(-1) for part in parts])
-    most = max(LARGEST, 3.0 * float(np.sqrt(np.mean(seen**2))))  # a stated noise may be a thousandth of what is left
+    most = max(LARGEST, 3.0 * float(np.sqrt(np.mean(seen**2))))  # a stated noise may be a thousandth of the residuals
     amplitudes = np.concatenate([[0.0], np.geomspace(SMALLEST, most, AMPLITUDES)])
     best = (0.0, 0.0, LENGTHS[0])
     for length in LENGTHS:
@@ -120,7 +121,7 @@ def _gains(
 def _posterior(
     data: np.ndarray, part: _Part, kernel: np.ndarray, amplitude: float, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and deviation of the process in all rows, given the data of those that were measured."""
+    """Mean and deviation of the process in all rows, given the data of measured rows."""
     means, deviations, whitener = [], [], part.whitener
     for series, scale in zip(data, weight, strict=True):
         across = amplitude**2 * scale * kernel[:, part.seen] @ whitener.T

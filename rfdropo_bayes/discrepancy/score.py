@@ -1,8 +1,8 @@
-"""Efficient score statistics: what a direction explains of the residual that the base parameters cannot.
+"""Efficient score statistics: the residual explained by a direction but not by base parameters.
 
-With whitened residual r and base Jacobian J at the optimum, a candidate's directions J_m leave
-S = (I - J (J'J)^-1 J') J_m, and LM = r'S (S'S)^-1 S'r is chi-squared with the rank of S as its degrees of freedom where
-the base model is right (Rao's score test). A single direction with a known sign counts on that side only.
+With whitened residual r and base Jacobian J at the optimum, a candidate's directions J_m leave S = (I - J (J'J)^-1 J')
+J_m, and LM = r'S (S'S)^-1 S'r is chi-squared with the rank of S as its degrees of freedom if the base model is right
+(Rao's score test). A single direction with a known sign counts on that side only.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
-RANK_TOLERANCE = 1e-5  # of the largest singular value: what base parameters are taken to span
+RANK_TOLERANCE = 1e-5  # of the largest singular value: limit of the base parameters' span
 VISIBLE = 1.0  # a candidate of the size its prior expects must move the whitened data by so much in all
 
 
 @dataclass(frozen=True)
 class Signature:
-    """What a candidate does to the whitened data, less what the base model can do.
+    """Effect of a candidate on the whitened data, orthogonal to the base parameters' effects.
 
     Attributes:
-        basis: orthonormal columns of S; empty where no effect is visible.
+        basis: orthonormal columns of S; empty if no effect is visible.
         sign: +1 if only the positive side of its single direction has a meaning; else 0.
     """
 
@@ -36,7 +36,7 @@ class Signature:
 
 
 def span(jacobian: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n rank"]:
-    """Orthonormal basis of what the columns span, each column counted in its own unit."""
+    """Orthonormal basis of the span of the columns, each scaled to unit length."""
     size = np.linalg.norm(jacobian, axis=0)
     columns = jacobian[:, size > 0] / size[size > 0]
     if columns.shape[1] == 0:
@@ -52,7 +52,7 @@ def project_out(base: Float[np.ndarray, "n rank"], columns: Float[np.ndarray, "n
 
 
 def signature(base: Float[np.ndarray, "n rank"], columns: Float[np.ndarray, "n k"], sign: int = 0) -> Signature:
-    """The visible part of a candidate's directions, each column being what a prior-sized effect does."""
+    """The visible part of a candidate's directions, each column is the effect of a prior-sized change."""
     left = project_out(base, columns)
     if left.shape[1] == 1:
         size = float(np.linalg.norm(left))
@@ -75,7 +75,7 @@ def statistic(mark: Signature, residual: Float[np.ndarray, "*batch n"]) -> tuple
 
 
 def joint_statistic(first: Signature, second: Signature, residual: Float[np.ndarray, " n"]) -> float:
-    """LM of two candidates together; 0 where the linear model gives one of them the sign that it cannot have."""
+    """LM of two candidates together; 0 if the linear model gives one of them a forbidden sign."""
     basis = np.concatenate([first.basis, second.basis], axis=1)
     size, *_ = np.linalg.lstsq(basis, residual, rcond=1e-3)
     own = size[: first.rank], size[first.rank :]
@@ -85,7 +85,7 @@ def joint_statistic(first: Signature, second: Signature, residual: Float[np.ndar
 
 
 def likeness(first: Signature, second: Signature) -> float:
-    """Smallest cosine of the principal angles: 1 where the smaller signature lies within the larger one."""
+    """Smallest cosine of the principal angles: 1 if the smaller signature lies within the larger."""
     if first.rank == 0 or second.rank == 0:
         return 0.0
     if first.sign and second.sign:
@@ -94,7 +94,7 @@ def likeness(first: Signature, second: Signature) -> float:
 
 
 def classes(marks: list[Signature], limit: float) -> list[list[int]]:
-    """For each signature those that cannot be told from it: likeness above ``limit``, itself first."""
+    """For each signature the indistinguishable signatures: likeness above ``limit``, itself first."""
     found = []
     for i, mark in enumerate(marks):
         others = [j for j, other in enumerate(marks) if j != i and likeness(mark, other) > limit]

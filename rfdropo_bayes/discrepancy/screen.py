@@ -1,4 +1,4 @@
-"""The screen of a model: is anything wrong with it, and which candidates say what.
+"""Score tests of a model: a joint test of its residuals, and a test of each candidate.
 
 All p-values are taken from residuals as they would be if the model were right (a parametric bootstrap): noise is drawn
 for every recording, its model is estimated from it as it was from the data, and the base model is refitted linearly. No
@@ -28,15 +28,15 @@ DIRECTED = "candidates"
 
 @dataclass(frozen=True)
 class ScreenRow:
-    """What the screen says of one candidate.
+    """Score test of one candidate.
 
     Attributes:
         name: registry name.
-        probe: its best probe; None where no effect of it is visible.
+        probe: its best probe; None if its effect is not visible.
         lm: score statistic of that probe; rank: its degrees of freedom.
-        p: of that probe alone.
-        adjusted_p: probability that, were the model right, any probe of any candidate surprised as much.
-        score: LM - rank log n, n being the values that count, by which candidates are ranked.
+        p: p-value of that probe alone.
+        adjusted_p: probability of a statistic this large at any probe of any candidate under a right model.
+        score: LM - rank log n, with n the effective number of values; candidates are ranked by it.
     """
 
     name: str
@@ -50,10 +50,10 @@ class ScreenRow:
 
 @dataclass(frozen=True)
 class Screen:
-    """A model, the joint test of its residuals, and the screen of what it might lack (best first).
+    """A model, the joint test of its residuals, and the score tests of candidates (best first).
 
-    ``finer`` is the joint test of the residuals on a finer mesh and time step, None where there is none; ``omnibus``
-    is the same where the model is let pass by it.
+    ``finer`` is the joint test of the residuals on a finer mesh and time step, None without it; ``omnibus`` is the same
+    if the model passes by it.
     """
 
     fit: Fit
@@ -67,7 +67,7 @@ class Screen:
         return self.omnibus is self.finer
 
     def row(self, name: str) -> ScreenRow:
-        """That of one candidate."""
+        """Row of one candidate."""
         return next(row for row in self.rows if row.name == name)
 
 
@@ -80,25 +80,25 @@ def screen(
     bootstraps: int,
     finer: Float[np.ndarray, " n"] | None = None,
 ) -> Screen:
-    """Test a fitted model and screen candidates against it, calibrated by parametric bootstrap.
+    """Test a fitted model and candidates against it, calibrated by parametric bootstrap.
 
     Args:
         target: data and noise.
-        fit: of the model.
-        probes: of all candidates.
-        names: of all candidates, those without a probe among them.
-        seed: of the bootstrap.
-        bootstraps: simulated data sets.
+        fit: fit of the model.
+        probes: probes of all candidates.
+        names: names of all candidates, including candidates without a probe.
+        seed: seed of the bootstrap.
+        bootstraps: number of simulated data sets.
         finer: residuals of the finer simulator with the same parameters.
     """
     seen = [probe for probe in probes if probe.mark.rank > 0]
-    # As in the simulated data sets, what the parameters could still take is no discrepancy: a prior holds a size of
-    # many of its deviations back from where the data have it.
+    # As in the simulated data sets, a further step of the parameters is no discrepancy: a prior holds back a size of
+    # many of its deviations.
     left = np.stack([fit.residual] if finer is None else [fit.residual, finer])
     residuals = project_out(span(fit.jacobian), left.T).T
     observed, surprises = _statistics(target, residuals, seen)
     simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
-    if target.noise.source == RESIDUALS:  # whose mean square is that of the residuals by construction
+    if target.noise.source == RESIDUALS:  # their mean square equals the residuals' by construction
         del observed["variance"], simulated["variance"]
     most = reference.max(axis=1) if seen else np.zeros(bootstraps)
     if seen:  # without candidates there is no test by them, and no p-value of one that says nothing
@@ -162,11 +162,11 @@ def null_residuals(
 
     Args:
         measurements: the data, for their times, gaps and repeats.
-        noise: that is drawn.
-        base: orthonormal basis of what the base parameters do to whitened data.
-        parameters: how many of them were fitted.
-        rng: of the noise.
-        count: data sets.
+        noise: noise to draw.
+        base: orthonormal basis of the base parameters' effects on whitened data.
+        parameters: number of fitted base parameters.
+        rng: random generator of the noise.
+        count: number of data sets.
     """
     found = np.empty((count, len(base)))
     drawn = noise.at(measurements.single_steps).draw(rng, (count, *measurements.spread.shape))
@@ -183,8 +183,9 @@ def null_residuals(
 
 
 def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """What the base model leaves of data sets without repeats: where the noise is estimated from that, it is estimated
-    from that here, too; the noise before a fit would be a little larger in most of them, and give itself away."""
+    """Residuals of the base model for data sets without repeats. If the noise is estimated from residuals, it is also
+    estimated from residuals here, because noise before a fit is slightly larger.
+    """
     order = [group[0] for group in measurements.members]
     white = measurements.whiten(drawn[:, order], noise)
     rows = base[: measurements.count.size]
@@ -200,6 +201,6 @@ def tail(observed: float, simulated: Float[np.ndarray, " count"]) -> float:
 
 
 def p_in_words(p: float, simulated: int) -> str:
-    """A bootstrap's p-value, "= 0.02"; "< 0.001" where none of the simulated statistics was as large."""
+    """A bootstrap's p-value, "= 0.02"; "< 0.001" if no simulated statistic was as large."""
     least = 1.0 / (1 + simulated)
     return f"= {p:.2g}" if p > 1.5 * least else f"< {least:.2g}"

@@ -9,8 +9,9 @@ import numpy as np
 
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 from rfdropo_bayes.discrepancy.candidates import spoken
+from rfdropo_bayes.discrepancy.deadline import INTERRUPT
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, TOLD_APART
-from rfdropo_bayes.discrepancy.gain import noise_distance
+from rfdropo_bayes.discrepancy.gain import Gain, noise_distance
 from rfdropo_bayes.discrepancy.law_words import law_sentence, ports_sentence
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.prequential import BEGINNING, begins_wrong, prequential
@@ -61,13 +62,18 @@ def _left_out(answer: Answer) -> str:
 
 
 def _stopped(answer: Answer) -> str:
-    if not answer.cost.stopped:
+    """What is said of an audit that was stopped: why, and what was not done."""
+    cost = answer.cost
+    if not cost.stopped:
         return ""
-    minutes, waited = answer.problem.rules.minutes, round(answer.cost.waited / 60.0)
+    left = f" Not done: {'; '.join(map(spoken, cost.left))}." if cost.left else ""
+    if cost.stopped == INTERRUPT:
+        return f" The audit was stopped after {cost.seconds:.0f} s: this is what is known by then.{left}"
+    minutes, waited = answer.problem.rules.minutes, round(cost.waited / 60.0)
     busy = f" For {waited} of them the audit waited for processors that other programs held." if waited else ""
     return (
         f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
-        f"go on with --resume.{busy}"
+        f"go on with --resume.{left}{busy}"
     )
 
 
@@ -128,18 +134,13 @@ def _beginning(answer: Answer) -> str:
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if not answer.fitted:
-        return "No verdict: the fit of the base model is not done."
+        return f"No verdict: the fit of the base model is not done; so far it leaves {_base_error(answer)}."
     if answer.law is not None:
         return law_sentence(answer)
     if answer.verdict == NEGLIGIBLE:
         return _small(answer)
     if not answer.converged:
-        left = answer.base.residual
-        return (
-            f"No verdict: the fit of the base model has not converged (sum of squares {left @ left:.3g} for "
-            f"{np.count_nonzero(left)} values, and better points beside it). Start from a calibration with --from, "
-            "narrow the priors, or shorten [simulator] time_step."
-        )
+        return _unconverged(answer, findings)
     if answer.verdict == NO_DISCREPANCY:
         return (
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
@@ -153,7 +154,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"(joint test p {_p(answer)})."
         )
     if not findings and answer.verdict == NO_VERDICT:
-        return f"Something is wrong with the base model (joint test p {_p(answer)}); no candidate was tried to the end."
+        wrong = f"Something is wrong with the base model (joint test p {_p(answer)})"
+        return f"{wrong}; {_leading(answer)}."
     if not findings:
         tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
         asked = "no candidate of the library says what" if answer.problem.candidates else "no candidate was asked"
@@ -171,8 +173,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"([{low:.0f}, {high:.0f}] %); they are {likelier}likelier with it"
         )
     elif gain.worse:
-        errors = f"{1e3 * gain.rmse_base:.3g} mm without, {1e3 * gain.rmse_extended:.3g} mm with it"
-        head = f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse ({errors})"
+        worse = "unseen recordings are predicted worse"
+        head = f"Unexplained: with the best of the library, {named}, {worse} ({_errors(gain)})"
     elif answer.verdict == UNEXPLAINED:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
@@ -182,6 +184,45 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     else:
         head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
+
+
+def _base_error(answer: Answer) -> str:
+    """Root mean square distance between markers and the base model."""
+    target, own = answer.target, answer.target.measurements.columns[0]
+    errors = target.errors(answer.base.x)[..., own][target.measurements.valid[..., own]]
+    return f"{1e3 * float(np.sqrt(3.0 * np.mean(errors**2))):.3g} mm"
+
+
+def _leading(answer: Answer) -> str:
+    """The candidates that stand out so far: refitted ones with what they bring, or else those of the screen."""
+    refits = sorted(answer.causes.refits.items(), key=lambda entry: -entry[1])[:MOST_EXCLUDED]
+    if refits:
+        brings = ", ".join(f"{spoken(name)} {gained:.0f} nats" for name, gained in refits)
+        return f"of the candidates that were refitted, none is worth it ({brings})"
+    seen = [row for row in answer.causes.screens[0].rows if row.adjusted_p <= answer.problem.rules.family]
+    if not answer.causes.screens[0].rows:
+        return "no candidate was screened"
+    if not seen:
+        return "no candidate stands out"
+    return f"{', '.join(spoken(row.name) for row in seen[:MOST_EXCLUDED])} stand out; none was refitted to the end"
+
+
+def _unconverged(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    """What is said if the last fit has not converged."""
+    left = answer.extended.residual
+    squares = f"sum of squares {left @ left:.3g} for {np.count_nonzero(left)} values, and better points beside it"
+    remedy = "Start from a calibration with --from, narrow the priors, or shorten [simulator] time_step."
+    if not findings:
+        found = f" {_leading(answer).capitalize()}." if answer.causes.screens[0].rows else ""
+        return f"No verdict: the fit of the base model has not converged ({squares}).{found} {remedy}"
+    named = " and ".join(_named(finding) for finding in findings)
+    gain = answer.validation.gain
+    worth = "" if gain is None else f"; unseen recordings are missed by {_errors(gain)}"
+    return f"{named} is the best so far{worth}, but the fit with it has not converged ({squares}). {remedy}"
+
+
+def _errors(gain: Gain) -> str:
+    return f"{1e3 * gain.rmse_base:.3g} mm without, {1e3 * gain.rmse_extended:.3g} mm with it"
 
 
 def _small(answer: Answer) -> str:

@@ -20,8 +20,9 @@ NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
 
 
 def unclear(rules: Rules, gain: Gain) -> bool:
-    """Whether unseen trajectories do not say how much of the discrepancy is explained: it is too small, or the fraction
-    differs too much between them, so that its interval reaches from "none" to "all"."""
+    """Whether unseen trajectories leave the explained fraction undetermined: its interval reaches from "none" to "all",
+    because the discrepancy is small or the fraction varies between them.
+    """
     return gain.interval[0] <= rules.significant and gain.interval[1] >= rules.explained
 
 
@@ -30,10 +31,10 @@ SMALL = 0.25
 
 
 def negligible(rules: Rules, size: float, noise: float, numerical: float | None) -> bool:
-    """Whether a discrepancy that is sure need not be mended.
+    """Whether a significant discrepancy is too small to matter.
 
-    It is where it is smaller than what matters, where that is said. Else it is where it is far below the noise of one
-    measurement, and below what half the time step and a finer mesh move; all as distances of a marker [m].
+    It is if smaller than ``rules.matters``, if stated. Otherwise it must be far below the noise of one measurement, and
+    below the change by half the time step and a finer mesh; all are distances of a marker [m].
     """
     if rules.matters is not None:
         return size < rules.matters
@@ -50,18 +51,18 @@ def decide(
 ) -> str:
     """Apply the rules.
 
-    - no_discrepancy: the base model passes the joint test (p > .01), under a noise that may be one;
-    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %, or unseen
-      trajectories are predicted worse with them;
+    - no_discrepancy: the base model passes the joint test (p > .01), under a plausible noise;
+    - unexplained: it fails, and no candidate is significant, or all together explain at most 20 %, or they worsen the
+      prediction of unseen trajectories;
     - explained: the extended model passes (p > .05), the lower bound of the explained fraction exceeds 80 %, and unseen
-      trajectories clearly support it; equivalent where a named class has several members;
-    - partly_explained: a significant gain, but one of these fails.
+      trajectories clearly support it; equivalent if a named class has several members;
+    - partly_explained: a significant gain, but a condition of "explained" fails.
 
     Args:
-        rules: the numbers above.
+        rules: limits of the rules.
         base_p, extended_p: p-values of the joint tests; None without an extension.
-        class_sizes: members of each named class.
-        gain: on unseen trajectories; None where it could not be measured.
+        class_sizes: number of members of each named class.
+        gain: gain on unseen trajectories; None if it could not be measured.
         doubtful: see `Stacked.doubtful`.
     """
     if base_p > rules.base_passes and not doubtful:

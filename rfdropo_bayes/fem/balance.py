@@ -1,8 +1,8 @@
-"""What a rollout did to its surroundings: the force of the clamp, contact forces, energies, work and losses.
+"""Forces and energies of a rollout: the force of the clamp, contact forces, energies, work and losses.
 
-The equation of motion of a step holds exactly on what is free once contacts are added to it, and what it leaves on the
-held part is the clamp. For a mesh all of it follows from the states of a rollout, and nothing is solved again; a rod is
-simulated again (``stage_balance``).
+The equation of motion of a step, with contacts, holds exactly on the free part; its residual on the held part is the
+clamp's force. For a mesh all forces follow from the states of a rollout, without a new solve; a rod is simulated again
+(``stage_balance``).
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ class Energies(NamedTuple):
 
 
 def energies(system: System, prepared: Prepared, state: State) -> Energies:
-    """Kinetic energy with that of the sections' spin, elastic energy of the sections, and gravity's. What a Prony
-    branch, a wall and stretched cables hold is left out, and softening too."""
+    """Kinetic energy including the sections' spin, elastic energy of the sections, and potential energy. Energies of a
+    Prony branch, a wall and stretched cables, and softening, are excluded.
+    """
     twist, length = twist_of(state), jnp.asarray(np.diff(system.body.station))
     return Energies(
         kinetic=0.5 * jnp.sum(twist * momentum(prepared, state, twist)),
@@ -49,19 +50,19 @@ def energies(system: System, prepared: Prepared, state: State) -> Energies:
 
 
 class Balance(NamedTuple):
-    """Forces and energies of a rollout; rows are states, row 0 is the initial one, forces those of the step before.
+    """Forces and energies of a rollout; rows are states, row 0 is the initial one, forces belong to the step before.
 
     Work and losses are summed from row 0 on.
     """
 
     base_force: Float[Array, "rows 3"]  # of the clamp on the body [N]; cables pull on their anchors besides
     base_moment: Float[Array, "rows 3"]  # about the origin of the robot's frame [N m]
-    contact_force: Float[Array, "rows 3"]  # of what touches the body on it [N]
+    contact_force: Float[Array, "rows 3"]  # of touching bodies on the body [N]
     kinetic_energy: Float[Array, " rows"]  # [J]
     elastic_energy: Float[Array, " rows"]  # [J]
     gravitational_energy: Float[Array, " rows"]  # [J]; zero with every node at the origin
     cable_work: Float[Array, " rows"]  # done by the cables on the body [J]
-    contact_work: Float[Array, " rows"]  # done on the body by what touches it [J]
+    contact_work: Float[Array, " rows"]  # done on the body by touching bodies [J]
     damping_loss: Float[Array, " rows"]  # to Rayleigh damping [J]
 
     @property
@@ -83,7 +84,7 @@ UNITS = dict.fromkeys(Balance._fields, "J") | {"base_force": "N", "base_moment":
 class _Step(NamedTuple):
     """Forces [N] and powers [W] of one step."""
 
-    residual: Float[Array, "nodes 3"]  # what the equation of motion lacks
+    residual: Float[Array, "nodes 3"]  # residual of the equation of motion
     cable: Float[Array, ""]
     damping: Float[Array, ""]
 
@@ -107,7 +108,9 @@ def _gathered(
     stored: Energies,
     time_step: Scalar,
 ) -> Balance:
-    """Sums over the nodes and over time; row k of ``steps`` leads to state k, its forces act where the step begins."""
+    """Sums over the nodes and over time; row k of ``steps`` leads to state k, its forces act at the start of the
+    step.
+    """
     clamp = jnp.where(held[:, None], steps.residual, 0.0)
     touch = (steps.residual - clamp).at[0].set(0.0)  # no step leads to the initial state: it may be about to fall
     start = jnp.concatenate([position[:1], position[:-1]])

@@ -1,4 +1,4 @@
-"""What a cable drive makes of a commanded displacement, beside the commands themselves."""
+"""Response of a cable drive to commanded displacements."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 class DriveLimits(NamedTuple):
     """Limits of displacement-driven cables, as SOFA's CableConstraint applies them.
 
-    ``maxDispVariation`` bounds the change against the displacement that SOFA last measured, and that is the one at the
-    START of the step before: a cable that is commanded faster follows at about half the rate, one step late.
+    ``maxDispVariation`` bounds the change against the displacement that SOFA last measured, which is the displacement
+    at the START of the previous step: a cable that is commanded faster follows at about half the rate, one step late.
     """
 
-    displacement: Float[np.ndarray, " cables"]  # largest displacement [m]; infinite where there is no limit
+    displacement: Float[np.ndarray, " cables"]  # largest displacement [m]; infinite without a limit
     rate: float = np.inf  # largest difference from the measured displacement [m per step]
 
     def apply(self, commanded: Float[Array, " cables"], measured: Float[Array, " cables"]) -> Float[Array, " cables"]:
@@ -30,10 +30,10 @@ def animated_commands(
 ) -> Float[np.ndarray, "rows steps cables"]:
     """Commanded displacement of every step when each row's change is carried out by an animation of SOFA's STLIB.
 
-    ``command`` [m] is cumulative, the state before the first row zero. A row's change is handed over in ``steps``
-    equal updates, one at the start of each of the row's steps, until the animation's elapsed time reaches ``steps -
-    1`` time steps. Clock and elapsed time are sums of floats: where the sum rounds below the duration, a further
-    update follows in the next row, and its displacement is never taken back.
+    ``command`` [m] is cumulative, the state before the first row zero. A row's change is handed over in ``steps`` equal
+    updates, one at the start of each of the row's steps, until the animation's elapsed time reaches ``steps - 1`` time
+    steps. Clock and elapsed time are sums of floats: if the sum rounds below the duration, a further update follows in
+    the next row, and its displacement is never taken back.
     """
     duration = time_step * (steps - 1)
     changes = np.diff(np.asarray(command, float), axis=0, prepend=np.zeros((1, command.shape[1]))) / steps

@@ -1,8 +1,8 @@
 """Friction of cables in their guides: Coulomb's with a constant force, and the capstan's.
 
-At guide j the tension drops from T_j to T_j+1 = T_j - D_j where the cable slides towards its drive, and rises where it
-slides away. Coulomb: D = F z. Capstan: D = mu theta (T_j + T_j+1) / 2 z, with the wrap angle theta of the current
-shape; for full sliding that is (2 - mu theta) / (2 + mu theta), the exponential to third order in mu theta of a guide.
+At guide j the tension drops from T_j to T_j+1 = T_j - D_j as the cable slides towards its drive, and rises as it slides
+away. Coulomb: D = F z. Capstan: D = mu theta (T_j + T_j+1) / 2 z, with the wrap angle theta of the current shape; for
+full sliding that is (2 - mu theta) / (2 + mu theta), the exponential to third order in mu theta of a guide.
 
 z in [-1, 1] is the share of the friction that is mobilised: a Prandtl element, dz = slip / PRESLIDING until it slides.
 It sticks at rest and holds its force there. The end of a step is implicit in z, see ``fem.constraints``. Guides next to
@@ -27,12 +27,12 @@ RUNS = 4
 PRESLIDING = 1e-4
 """Slip [m] that mobilises all of the friction."""
 FADING = 0.1
-"""Coulomb's friction fades where the tension [N] falls below this: a slack cable presses on nothing."""
+"""Coulomb's friction fades if the tension [N] falls below this: a slack cable exerts no pressure."""
 SLACK = 1e-9
 """[N] Added to every tension that presses on a guide: a slack cable slides as one with little friction does, whatever
 rounding leaves of its tension."""
 STRAIGHT = 1e-6
-"""Smallest wrap angle [rad]; keeps its derivative finite where the cable runs straight."""
+"""Smallest wrap angle [rad]; keeps its derivative finite for a straight cable."""
 
 
 class Slip(NamedTuple):
@@ -45,7 +45,7 @@ class Slip(NamedTuple):
 
 
 def run_members(layout: CableLayout) -> Bool[np.ndarray, "cables cable_runs guides"]:
-    """Which guides belong to which run of their cable; the last guide of a cable, where it is tied, to none."""
+    """Mask of the guides in each run of their cable; the last guide, to which the cable is tied, is in none."""
     cables, guides = layout.used.shape
     members = np.zeros((cables, RUNS, guides), dtype=bool)
     for cable, used in enumerate(layout.used):

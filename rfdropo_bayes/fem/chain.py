@@ -1,8 +1,8 @@
 """Symmetric positive definite systems along a chain of stations with six unknowns each: Cholesky's factor, written out
 by components, with a batch in the last axis (``lanes``).
 
-Matrices come as the stiffness of the elements between stations and the inertia at stations. Blocks are put together
-where they are eliminated: less is written to memory.
+Matrices come as the stiffness of the elements between stations and the inertia at stations. Blocks are assembled during
+elimination, which saves memory traffic.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Factor(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """What elimination finds."""
+    """Result of the elimination."""
 
     factor: Factor
     solved: Float[Array, "stations 6 ..."]  # y = C^-1 times the right-hand side

@@ -1,16 +1,16 @@
 """Cables, slip at their guides and contacts of a step as one convex problem, in the manner of SAP.
 
-Impulses g make the relative velocities u = W g + b of their rows, with W the condensed compliance and b what the
-velocities would be without them. Every constraint answers its own velocity, g = P(u):
+Impulses g make the relative velocities u = W g + b of their rows, with W the condensed compliance and b the velocities
+without them. Every constraint answers its own velocity, g = P(u):
 
     cable     g = max(-u, 0) / R                                 it pulls and never pushes
     slip      g = h D clip(z - h u / PRESLIDING, -1, 1)          Prandtl's element, see ``fem.cable_friction``
     contact   y = g' + (v - u) / R projected onto the friction cone in the norm of R, with v = (-gap / h, 0, 0) and g'
               the tangential impulse of the step before: friction is a spring that slides, as Prandtl's element is
 
-(Castro, Permenter and Han 2022, IEEE Trans. Robot. 39:1301). R is small against W: the softness is that of the
-numbers, none of the material, and scales with the whole problem. P is the slope of a convex function, so that g is
-unique and a continuous function of the inputs. Newton's method with an exact line search finds it from anywhere.
+(Castro, Permenter and Han 2022, IEEE Trans. Robot. 39:1301). R is small against W: it is a numerical softness, not a
+material's, and scales with the whole problem. P is the slope of a convex function, so that g is unique and a continuous
+function of the inputs. Newton's method with an exact line search finds it from anywhere.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ NORMAL_SOFTNESS = BETA**2 / (4.0 * math.pi**2)
 """R of a contact's normal, relative to the mean entry w of its rows on that diagonal, which no turn of the tangents
 changes."""
 TANGENT_SOFTNESS = 1e-3
-"""R of a contact's tangents relative to w: what sticks yields by this share of what friction stops in a step, once."""
+"""R of a contact's tangents relative to w: sticking contacts yield once by this share of the motion that friction stops
+in a step.
+"""
 RIGID = 1e-12
 """Share of the largest entry on the diagonal of W below which a row counts as one of parts that cannot move."""
 APART = 1e6
@@ -58,11 +60,11 @@ class Contacts(NamedTuple):
 
     opening: Float[Array, " contacts"]  # gap over the time step [m/s]
     friction: Scalar
-    before: Float[Array, "contacts 3"]  # impulses of the step before, in the rows of this one [N s]
+    before: Float[Array, "contacts 3"]  # impulses of the previous step, in the rows of this step [N s]
 
 
 class Impulses(NamedTuple):
-    """What a step's constraints exert."""
+    """Impulses of a step's constraints."""
 
     cable: Float[Array, " cables"]  # [N s], never negative
     share: Float[Array, " runs"]  # of the cables' friction that is mobilised at the end of the step
@@ -127,7 +129,7 @@ def _contact_law(problem: Problem, velocity: Float[Array, "contacts 3"]) -> tupl
 
 
 def answers(problem: Problem, velocity: Float[Array, " n"]) -> Law:
-    """What every row answers to its velocity."""
+    """Impulse of every row as a function of its velocity."""
     cables, runs = len(problem.softness), len(problem.slips.impulse)
     firmness = jnp.where(velocity[:cables] < 0.0, 1.0 / problem.softness, 0.0)
     follows = problem.time_step / PRESLIDING
@@ -221,13 +223,13 @@ def solve_constraints(
 ) -> Impulses:
     """Impulses of cables, of the slip at their guides and of contacts, which follow each other in the rows.
 
-    Differentiable in both modes: the derivatives are those of the equations at the solution.
+    Differentiable in both modes: the derivatives are of the equations at the solution.
 
     Args:
         compliance: W [1/kg], symmetric positive semi-definite.
-        free: b [m/s]; of a cable the rate at which its commanded length lies above its length, of a run of guides
-            minus its slip, of a contact its opening and sliding, without the gap.
-        previous: impulses of the cables, where the iterations start [N s].
+        free: b [m/s]; for a cable (commanded length - length) / h, for a run of guides minus its slip, for a contact
+            its opening and sliding, without the gap.
+        previous: impulses of the cables, the start of the iterations [N s].
         time_step: h [s].
         give: of every cable's length per tension, over the time step squared [1/kg].
     """

@@ -60,6 +60,7 @@ class Material(NamedTuple):
     gravity: Float[Array, "3"]  # [m/s2]
     stiffness_scale: Float[Array, " elements"]  # factor on the stiffness of each element
     point_mass: Float[Array, " stations"]  # lumped at each station [kg]
+    axial_scale: Scalar = 1.0  # factor on the stiffness in tension of every element; bending keeps its own
     effects: BodyEffects = BodyEffects()
 
 
@@ -138,6 +139,7 @@ def prepare(system: System, material: Material) -> Prepared:
     """Stiffness, mass and loads of a body with the given material: once a rollout."""
     body, effects = system.body, material.effects
     section = sections(body, effects, material.young_modulus, material.poisson_ratio, material.stiffness_scale)
+    section = section._replace(stretch=section.stretch.at[2].multiply(material.axial_scale))
     volume, moment = inertia_per_density(body)
     return Prepared(
         section=section,

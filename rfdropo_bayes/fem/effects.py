@@ -40,7 +40,7 @@ class Wall(NamedTuple):
 
 
 class BodyEffects(NamedTuple):
-    """Effects of one rollout; None where absent."""
+    """Effects of one rollout; None if absent."""
 
     bending: BendingLaw | None = None
     viscoelasticity: Viscoelasticity | None = None
@@ -63,7 +63,7 @@ class BodyEffects(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the effects that are present remember from step to step."""
+    """Memory of the present effects from step to step."""
 
     clock: Float[Array, ""] | None = None  # [s] since the start
     branch: Float[Array, "elements 6"] | None = None  # strains of the Prony branch's dashpot

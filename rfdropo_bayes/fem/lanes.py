@@ -1,4 +1,4 @@
-"""Functions of arrays whose last axis is a batch: ``jax.vmap`` adds to that axis in place of making a first one.
+"""Functions of arrays whose last axis is a batch: ``jax.vmap`` extends this axis instead of adding a leading axis.
 
 XLA vectorises over the last axis. With a batch in front, matrices of 6 x 6 would be that axis, and short.
 """

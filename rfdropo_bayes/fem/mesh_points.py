@@ -36,7 +36,7 @@ def joined(maps: Sequence[NodePoints]) -> NodePoints:
 
 
 def node_positions(points: NodePoints, position: Float[Array, "nodes 3"]) -> Float[Array, "points 3"]:
-    """Where the points are, given the places of the nodes [m]; velocities likewise."""
+    """Positions of the points from positions of the nodes [m]; also valid for velocities."""
     return jnp.einsum("pk,pki->pi", points.weight, position[points.node])
 
 

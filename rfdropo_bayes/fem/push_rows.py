@@ -1,4 +1,4 @@
-"""A cube in a stage of the rod that pushes it: rows of the constraint problem, and what their impulses do to it."""
+"""A cube in a stage of the rod that pushes it: rows of the constraint problem, and the effect of their impulses."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ class Push(NamedTuple):
 
     touch: Touch
     cube: Cube
-    state: CubeState  # where the contacts were looked for
+    state: CubeState  # state at which the contacts were found
     twist: Float[Array, "6"]  # velocity and spin at the end of the stage without contacts
     before: Float[Array, "pairs 3"]  # impulses of the stage before, in space [N s]
-    wide: Scalar | None = None  # length of the stage, in those of the stage before
+    wide: Scalar | None = None  # length of the stage, in units of the previous stage's
 
 
 class PushedRows(NamedTuple):
     """The contacts in the constraint problem of a stage, three rows each."""
 
     rows: Float[Array, "stations 6 rows"]
-    base: Float[Array, " rows"]  # of the relative velocities, what the cube does without contacts [m/s]
+    base: Float[Array, " rows"]  # of the relative velocities, the cube's motion without contacts [m/s]
     compliance: Float[Array, "rows rows"]  # of the cube [1/kg]
     contacts: Contacts
 
 
 class Released(NamedTuple):
-    """What the contacts did."""
+    """Effect of the contacts."""
 
     cube: CubeState
     touch: Float[Array, "pairs 3"]  # impulses of all pairs that can touch, in space [N s]
     sudden: Float[Array, "stations 6"]  # impacts on the body [N s], [N m s]
-    sudden_twist: Float[Array, "6"]  # and what they change the cube's velocity and spin by
+    sudden_twist: Float[Array, "6"]  # and their change of the cube's velocity and spin
 
 
 def meet(
@@ -56,13 +56,13 @@ def meet(
     time_step: Scalar,
     change: Float[Array, "6"] | None = None,
 ) -> tuple[Push, Stage]:
-    """The cube in a stage that starts from a state, what it touches, and with which impulses it did so ``before``; and
-    the stage, which impacts make longer.
+    """The cube in a stage that starts from a state, its contacts, and their impulses ``before``; and the stage, which
+    impacts lengthen.
 
     Args:
-        position, orientation, twist: of the body's stations where the stage takes its forces.
+        position, orientation, twist: state of the body's stations at which the stage takes its forces.
         surroundings: gravity, and the damping of the cube's motion [1/s].
-        change: of the cube's velocity and spin in the stage before, a share of which is carried on.
+        change: change of the cube's velocity and spin in the previous stage, a share of which is carried on.
     """
     place = state
     if stage.predicted:
@@ -119,8 +119,9 @@ def released(
     twist: Float[Array, "stations 6"],
     impulse: Float[Array, "contacts 3"],
 ) -> Released:
-    """What the impulses of the contacts did in a stage that took the body's velocities and spins from ``before`` to
-    ``twist``."""
+    """Effect of the contacts' impulses in a stage that changed the body's velocities and spins from ``before`` to
+    ``twist``.
+    """
     on_cube, mass = push.touch.on_cube.reshape(-1, 6), inverse_inertia(push.cube)
     after = push.twist + mass * (on_cube.T @ impulse.ravel())
     moving = after - twist_of(push.state) if stage.predicted else after

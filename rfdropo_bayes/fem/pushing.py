@@ -1,4 +1,4 @@
-"""A trunk that pushes a cube on a plate: where they touch, and what a contact's rows are.
+"""A trunk that pushes a cube on a plate: contacts and their rows.
 
 The trunk's surface is a chain of spheres along its centre line, with the radii of its section profile. A sphere meets
 the cube or the plate along the line to its centre, so that normals and gaps are continuous functions of the positions;
@@ -47,7 +47,7 @@ class MeshSpheres(NamedTuple):
 
 
 class PushGeometry(NamedTuple):
-    """What does not change between rollouts; static, never traced."""
+    """Constants of all rollouts; static, never traced."""
 
     spheres: Spheres | MeshSpheres
     plate_normal: Float[np.ndarray, "3"]  # unit vector out of the plate
@@ -78,7 +78,7 @@ def push_scene(
 
 
 def sphere_heights(start: float, tip: float, tip_radius: float) -> Float[np.ndarray, " spheres"]:
-    """Heights of the spheres' centres along the axis [m]; the last one touches the tip's plane from inside."""
+    """Heights of the spheres' centres along the axis [m]; the last sphere touches the tip's plane from inside."""
     count = max(2, round(SPHERES_PER_METRE * (tip - start)))
     return np.linspace(start, tip - tip_radius, count)
 
@@ -96,8 +96,7 @@ def mesh_spheres(
 ) -> MeshSpheres:
     """Spheres of a mesh along the z axis, whose outline has these radii [m] at these heights [m].
 
-    A sphere's centre and the deformation around it are those of the affine motion that fits the nodes around its height
-    best.
+    A sphere's centre and the deformation around it follow the affine motion that fits the nodes around its height best.
     """
     height = sphere_heights(float(station[0]), float(station[-1]), float(radius[-1]))
     fits = [_affine_fit(rest, at) for at in height]
@@ -112,7 +111,7 @@ def _affine_fit(
 ) -> tuple[Int[np.ndarray, " width"], Float[np.ndarray, "4 width"]]:
     """Nodes nearest to a height on the z axis, and weights of their positions for the point there and its gradient.
 
-    Nodes in one plane say nothing of the motion across it: as many are taken as it needs.
+    Nodes in a plane do not determine the motion across it: enough nodes are taken for a full fit.
     """
     nearest, count = np.argsort(np.abs(rest[:, 2] - height)), FITTED
     while True:
@@ -224,6 +223,6 @@ def untouched(scene: PushGeometry) -> Float[Array, "pairs 3"]:
 
 
 def unchanged(cube: CubeState, moved: CubeState, taken: Bool[Array, ""]) -> CubeState:
-    """The cube after a step that was taken, or where it was, at rest."""
+    """The cube after an accepted step, or at rest in its old pose."""
     stopped = cube._replace(velocity=jnp.zeros(3), spin=jnp.zeros(3))
     return CubeState(*(jnp.where(taken, new, old) for new, old in zip(moved, stopped, strict=True)))

@@ -27,7 +27,7 @@ class Cube(NamedTuple):
 
 
 class CubeState(NamedTuple):
-    """Where the cube is, and how it moves."""
+    """Pose and motion of the cube."""
 
     position: Float[Array, "3"]  # of the centre [m]
     orientation: Float[Array, "4"]  # unit quaternion (x, y, z, w)
@@ -37,11 +37,13 @@ class CubeState(NamedTuple):
 
 def solid_gyration_radius(side: Scalar) -> Float[Array, ""]:
     """Radius of gyration [m] of a homogeneous cube, a / sqrt(6)."""
-    return jnp.asarray(side) * (1.0 / np.sqrt(6.0))  # XLA rounds a quotient in one way where it folds constants
+    return jnp.asarray(side) * (1.0 / np.sqrt(6.0))  # XLA rounds a quotient differently when it folds constants
 
 
 def cube_at(position: Float[Array, "3"], yaw: Scalar, axis: Float[Array, "3"] | Float[np.ndarray, "3"]) -> CubeState:
-    """A cube at rest, turned by ``yaw`` [rad] about a unit vector from where its edges are parallel to the axes."""
+    """A cube at rest, turned by ``yaw`` [rad] about a unit vector from the orientation with edges parallel to the
+    axes.
+    """
     half = 0.5 * jnp.asarray(yaw)
     orientation = jnp.concatenate([jnp.sin(half) * jnp.asarray(axis), jnp.cos(half)[None]])
     return CubeState(jnp.asarray(position), orientation, jnp.zeros(3), jnp.zeros(3))
@@ -83,7 +85,7 @@ def moved(state: CubeState, twist: Float[Array, "6"], time_step: Scalar) -> Cube
     velocity, spin = twist[:3], twist[3:]
     half = 0.5 * time_step * spin
     square = jnp.sum(half**2)
-    # sin(a) / a and cos(a) of half the angle, differentiable where it does not turn.
+    # sin(a) / a and cos(a) of half the angle, differentiable at zero.
     angle = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
     vector = half * jnp.where(square > 0.0, jnp.sin(angle) / angle, 1.0)
     scalar = jnp.where(square > 0.0, jnp.cos(angle), 1.0)

@@ -117,7 +117,9 @@ def profile_rod(
 
 
 def refined(body: Rod, elements: int | Int[np.ndarray, " elements"]) -> Rod:
-    """The rod with every element cut into so many equal elements of the same section, all alike or each as said."""
+    """The rod with every element cut into ``elements`` equal elements of the same section, one number for all or one
+    for each.
+    """
     counts = np.broadcast_to(elements, body.elements)
     rows = np.arange(body.elements + 1)
     at = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)] + [[body.elements]])

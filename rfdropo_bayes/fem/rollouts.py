@@ -65,12 +65,12 @@ def roll(
     points: PointMap,
     horizon: Int[Array, ""] | int | None = None,
 ) -> Rollout:
-    """Rollout of any body, given how it takes a step to commanded cable displacements [m].
+    """Rollout of any body, from its step function to commanded cable displacements [m].
 
     Args:
-        displacement: (rows, substeps, cables), or a tree of arrays (rows, substeps, ...) of which a step takes a part.
-        horizon: rows to compute; later ones are zero. It may be traced: one compilation serves every prefix, rows
-            beyond it cost nothing, and there is no reverse mode. None computes all, in reverse mode, too.
+        displacement: (rows, substeps, cables), or a tree of arrays (rows, substeps, ...) split into steps.
+        horizon: rows to compute; later rows are zero. It may be traced: one compilation serves every prefix, rows
+            beyond it cost nothing, and there is no reverse mode. None computes all rows and allows reverse mode.
     """
 
     def one(progress: _Progress, commanded: Any) -> tuple[_Progress, None]:
@@ -117,9 +117,9 @@ def simulate(
 ) -> Rollout:
     """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
 
-    ``time_step`` [s] is that of one substep. With a ``scene`` and a ``cube`` the body pushes it; ``state.cube``
-    is where it starts. ``horizon`` as for `roll`. Where a step has several stages, ``state.commanded`` are the
-    displacements before the first step, zero where that is None. ``loads`` act in every step besides.
+    ``time_step`` [s] is the length of a substep. With a ``scene`` and a ``cube`` the body pushes it; ``state.cube`` is
+    its initial pose. ``horizon`` as for `roll`. If a step has several stages, ``state.commanded`` are the displacements
+    before the first step, zero if None. ``loads`` act in every step.
     """
     still = integrator == "quasi-static"
     if still and scene is not None:

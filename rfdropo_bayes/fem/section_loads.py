@@ -1,5 +1,6 @@
-"""What acts on a rod from step to step beside its weight: forces on sections, factors on its stiffness and
-damping, and a change of gravity."""
+"""Loads on a rod that change from step to step: forces on sections, factors on its stiffness and damping, and a change
+of gravity.
+"""
 
 from __future__ import annotations
 

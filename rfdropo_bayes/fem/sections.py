@@ -1,7 +1,7 @@
-"""What the sections of a rod answer to its strains: linear, with the laws of ``effects`` that are given.
+"""Response of a rod's sections to strains: linear, or by the laws of ``effects``.
 
-The bending law is a symmetric matrix of bending and twist. The fibre law gives every fibre of the section the energy
-E (x^2 - c x^3) / 2 of its strain x: the section's is E A (e^2 - c e^3) / 2 and (1 - 3 c e) times that of bending.
+The bending law is a symmetric matrix of bending and twist. The fibre law gives every fibre of the section the energy E
+(x^2 - c x^3) / 2 of its strain x: the section's is E A (e^2 - c e^3) / 2 and (1 - 3 c e) times the bending energy.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def energy(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "..
 
 
 def slopes(section: Sections, strain: Float[Array, "6 ..."]) -> Sections:
-    """Tangent stiffness of the sections. It leaves out what stretch and bending do to each other."""
+    """Tangent stiffness of the sections. It neglects the coupling of stretch and bending."""
     if section.fibre is None:
         return section
     left = jnp.maximum(1.0 - 3.0 * section.fibre * strain[2], LEAST_TANGENT)

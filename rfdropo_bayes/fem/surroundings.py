@@ -1,4 +1,4 @@
-"""What surrounds a body and acts on its sections as wholes: the drag of a fluid, and a wall.
+"""Surroundings that act on whole sections of a body: the drag of a fluid, and a wall.
 
 Both act at the centre of a section, with their derivatives by place and velocity, for the implicit step.
 """
@@ -28,7 +28,7 @@ class SectionLoad(NamedTuple):
 
 
 def _contact(depth: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Force of a one-sided spring of unit stiffness and its derivative: zero, then quadratic, then linear."""
+    """Force of a unilateral spring of unit stiffness and its derivative: zero, then quadratic, then linear."""
     into = jnp.clip(depth + WALL_SOFTNESS, 0.0, 2.0 * WALL_SOFTNESS)
     slope = into / (2.0 * WALL_SOFTNESS)
     return 0.5 * slope * into + jnp.maximum(depth - WALL_SOFTNESS, 0.0), slope

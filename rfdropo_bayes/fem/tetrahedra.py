@@ -9,8 +9,8 @@ functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law. Two
   TetrahedronFEMForceField does with ``method="large"`` (Nesme, Payan and Faure 2005, Eurographics short papers). It
   depends on the order of the element's nodes.
 
-Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they are here for fidelity to meshes
-that others simulate, not for accuracy at few unknowns.
+Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they serve fidelity to meshes of other
+simulators, not accuracy with few unknowns.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FRAMES = ("polar", "edges")
 POLAR_ITERATIONS = 6
 """Converge to round-off for stretches between 0.3 and 3."""
 POISSON_LIMIT = 0.499
-"""Larger Poisson ratios are taken as this one: the displacement element has no incompressible limit."""
+"""Larger Poisson ratios are replaced by this limit: the displacement element has no incompressible limit."""
 LARGEST_WEIGHTS = 8
 """Nodes that `NodePoints` and `NodeCables` reserve for each point; a tetrahedron uses the first four."""
 
@@ -57,7 +57,7 @@ class TetrahedralBody(NamedTuple):
 
 
 class TetrahedralSystem(NamedTuple):
-    """What does not change between rollouts; static, never traced."""
+    """Constants of all rollouts; static, never traced."""
 
     body: TetrahedralBody
     cables: NodeCables
@@ -213,7 +213,7 @@ def nodal_force(
     rest: Float[Array, "nodes 3"] | float,
     lame: tuple[Float[Array, "..."], Float[Array, "..."]],
 ) -> Float[Array, "nodes 3"]:
-    """Forces -Q K (Q' field - rest) on the nodes [N]: elastic ones from positions; -K v from velocities with ``rest``
+    """Forces -Q K (Q' field - rest) on the nodes [N]: elastic forces from positions; -K v from velocities with ``rest``
     zero.
 
     ``lame`` are the Lame constants [Pa], of the body or of each element.
@@ -233,7 +233,7 @@ def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> F
 def locate(body: TetrahedralBody, points: Float[np.ndarray, "points 3"]) -> NodePoints:
     """Bind points of the undeformed body [m] to the four nodes around them (weights padded with zeros).
 
-    A point in no element belongs to the one whose centroid is nearest, and follows it by extrapolation (as SOFA's
+    A point in no element belongs to the element with the nearest centroid, and follows it by extrapolation (as SOFA's
     BarycentricMapping does).
     """
     corners = body.rest[body.element]

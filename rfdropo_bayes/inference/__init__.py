@@ -1,4 +1,4 @@
-"""Inference methods. They see a `Problem` and nothing of the simulator behind it.
+"""Inference methods. They depend on a `Problem` alone, not on its simulator.
 
 Other rooms import from here, and the module `methods`; a name's module is loaded when it is first used.
 

@@ -18,14 +18,14 @@ from rfdropo_bayes.errors import InputError
 
 SPACINGS = ("geometric", "linear")
 NOT_A_NUMBER = "not_a_number"
-REDRAWS = 256  # times as many prior draws as are wanted, at most
+REDRAWS = 256  # most prior draws, as a multiple of the requested number
 
 
 @dataclass
 class Ledger:
-    """What has been spent on a problem.
+    """Cost of the work on a problem.
 
-    A rollout of horizon h counts as h / n_rows rollouts, because its cost is that of the steps it simulates.
+    A rollout of horizon h counts as h / n_rows rollouts, because its cost is proportional to its steps.
 
     Attributes:
         rollouts: full-length equivalents used.
@@ -39,7 +39,7 @@ class Ledger:
 
     @property
     def reasons(self) -> str:
-        """What was left out for which reason, in words."""
+        """Counts of excluded parameter sets by reason, in words."""
         return ", ".join(f"{name} {count}" for name, count in sorted(self.excluded.items())) or "no reason given"
 
     def record(self) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class Ledger:
         return cls(record["rollouts"], record["evaluations"], Counter(record["excluded"]))
 
     def __add__(self, other: Ledger) -> Ledger:
-        """What both have spent."""
+        """Sum of both costs."""
         excluded = self.excluded + other.excluded
         return Ledger(self.rollouts + other.rollouts, self.evaluations + other.evaluations, excluded)
 
@@ -62,7 +62,7 @@ class Ledger:
         self.evaluations += n
 
     def exclude(self, problem: Problem, status: Int[np.ndarray, " n"], not_a_number: np.ndarray) -> None:
-        """Count what is left out: by its status, or for a likelihood that is not a number."""
+        """Count excluded parameter sets by status; a NaN likelihood is also a reason."""
         for code, count in zip(*np.unique(status[status != 0], return_counts=True), strict=True):
             self.excluded[problem.status_names.get(int(code), f"status_{int(code)}")] += int(count)
         unexplained = int(np.sum(not_a_number & (status == 0)))
@@ -84,7 +84,7 @@ def evaluate_rows(
 
 
 def evaluate_prior(problem: Problem, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Log prior at unconstrained points; minus infinity where it is not a number."""
+    """Log prior at unconstrained points; minus infinity if it is NaN."""
     density = np.asarray(problem.log_prior(jnp.asarray(u)), dtype=np.float64)
     return np.where(np.isnan(density) | (density == np.inf), -np.inf, density)
 
@@ -92,8 +92,9 @@ def evaluate_prior(problem: Problem, u: Float[np.ndarray, "n d"]) -> Float[np.nd
 def representable_draws(
     problem: Problem, key: PRNGKeyArray, n: int
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, " m"], int]:
-    """Unconstrained prior draws that coordinates can hold, at least ``n`` where `REDRAWS` times as many suffice; their
-    log density; and how many were drawn for them. A scale of 1e-400 is none: its logarithm is infinite."""
+    """Unconstrained prior draws with finite coordinates, their log density, and the number of draws made. There are at
+    least ``n`` if `REDRAWS` times ``n`` draws suffice. A scale of 1e-400 is excluded: its logarithm is infinite.
+    """
     batches: list[tuple[np.ndarray, np.ndarray]] = []
     drawn = found = 0
     while found < n and drawn < REDRAWS * n:
@@ -108,11 +109,11 @@ def representable_draws(
 
 
 def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tuple[int, ...]:
-    """Prefix lengths at which a sequential method looks further ahead; strictly increasing, the last one ``n_rows``.
+    """Prefix lengths of a sequential method; strictly increasing, ending at ``n_rows``.
 
     Args:
         n_rows: rows of data.
-        blocks: number of blocks wanted; fewer where rows do not suffice.
+        blocks: number of blocks wanted; fewer if there are too few rows.
         spacing: ``"geometric"`` doubles (the sum of all prefixes stays below ``2 n_rows``), ``"linear"`` has equal
             blocks.
     """

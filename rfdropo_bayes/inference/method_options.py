@@ -1,4 +1,4 @@
-"""Options of a method of inference, which say what they are when they are shown."""
+"""Options of a method of inference, with a table of their meanings for display."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MethodOptions:
 
     @property
     def call(self) -> str:
-        """The call that makes these options: those that differ from their defaults."""
+        """The call that makes these options: with all values that differ from their defaults."""
         own: Any = self
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(own)}
         changed = (
@@ -69,7 +69,7 @@ def _entry(value: Any) -> Any:
 
 
 def attributes_of(kind: type) -> dict[str, str]:
-    """What the section "Attributes" of a docstring says of each name; ``a, b: text`` speaks of both."""
+    """Text on each name in the section "Attributes" of a docstring; ``a, b: text`` describes both."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
     found: dict[str, str] = {}
     names: list[str] = []

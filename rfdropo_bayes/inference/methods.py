@@ -93,17 +93,17 @@ def run(
     """Run a method by name.
 
     Args:
-        problem: to be inferred.
-        name: of the method.
+        problem: problem to infer.
+        name: name of the method.
         options: table of options, or the method's configuration itself.
         key: random key; the same key gives the same draws.
         checkpoint_dir: folder for checkpoints; None keeps none.
         resume: go on from the checkpoints found there; a finished run is then only read.
-        progress: where to report stages.
+        progress: receives reports of stages.
 
     Raises:
         InputError: no such method or option, a problem that lacks members (`check_problem`) or that the method cannot
-            take; and what the method itself says.
+            take; and the errors of the method itself.
     """
     method = method_named(name)
     check_problem(problem)
@@ -112,7 +112,7 @@ def run(
 
 
 def _build(kind: type, options: Mapping[str, Any], where: str, beside: Sequence[str] = ()) -> Any:
-    """A configuration from a table, which may have been meant to hold the keys ``beside``, too."""
+    """A configuration from a table; an error mentions the keys ``beside`` it."""
     hints = typing.get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
     values = {}

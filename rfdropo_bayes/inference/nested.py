@@ -1,5 +1,6 @@
-"""Nested slice sampling of blackjax, a cross-check on small problems: tempering can miss nats where a posterior has a
-phase transition, and nested sampling, which shrinks the prior, does not temper."""
+"""Nested slice sampling of blackjax, a cross-check on small problems: tempering can miss nats if a posterior has a
+phase transition, and nested sampling, which shrinks the prior, does not temper.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +31,10 @@ EVALUATIONS = 8  # of a slice, roughly: stepping out and shrinking
 
 @dataclass(frozen=True, repr=False)
 class NestedConfig(MethodOptions, called="Nested"):
-    """Nested slice sampling: posterior and evidence, where JAX can trace the likelihood.
+    """Nested slice sampling: posterior and evidence, if JAX can trace the likelihood.
 
     Attributes:
-        live: points that are kept; twice as many are drawn from the posterior.
+        live: number of live points; the posterior has twice this number of draws.
     """
 
     live: int = 500

@@ -1,7 +1,7 @@
-"""What a long inference shows and keeps as it goes.
+"""Reports and checkpoints of a long inference.
 
 - `Progress`: a bar with the time left for people, one JSON line per stage for programs.
-- `say_step`: what a run does after the work that a bar shows.
+- `say_step`: a report on the work after a bar.
 - `Checkpoint`: a killed run goes on from its last whole stage and ends with the same draws.
 - `Logbook`: both of them, for a run or a part of one.
 """
@@ -37,19 +37,19 @@ from rfdropo_bayes.interrupts import check_interrupt
 SCHEMA_VERSION = 6
 _META = "meta_json"
 SHOWN = ("horizon", "ess", "acceptance", "loss", "rollouts")
-SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal
-UNFINISHED = 0.99  # what rollouts alone can fill of the bar: stages say when the work is done
-SMALLEST_SHARE = 0.01  # of the work, from whose time that of the rest is guessed
+SECONDS_BETWEEN_LINES = 30.0  # without a terminal
+UNFINISHED = 0.99  # share of the bar that rollouts can fill: stages report the end
+SMALLEST_SHARE = 0.01  # of the work, from which the remaining time is estimated
 
 
 class Progress:
     """Reports stages, and rollouts between them. Nothing of it influences a result.
 
     Args:
-        title: what is running.
+        title: name of the work.
         show: draw a bar on stderr; None draws it on a terminal, and prints a line now and then elsewhere.
         log: file that gets one JSON object per line and stage, appended.
-        budget: rollouts that the work takes at most, which move the bar between stages.
+        budget: largest number of rollouts, which moves the bar between stages.
     """
 
     def __init__(
@@ -84,10 +84,10 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.stop()
-        self._prints = False  # rollouts after the work, such as those of predictions, are no part of it
+        self._prints = False  # rollouts after the work, such as for predictions, are not part of it
 
     def spend(self, rollouts: float) -> None:
-        """Report rollouts as they are done, in full-length ones."""
+        """Report rollouts as they are done, in full-length equivalents."""
         check_interrupt()
         self._spent += rollouts
         if self.budget:
@@ -113,7 +113,7 @@ class Progress:
 
     @property
     def seconds_left(self) -> float | None:
-        """At the pace since the first report; None where too little is done since to say."""
+        """Time left at the pace since the first report [s]; None until enough work is done."""
         if self._first is None or self.share - self._first[1] < SMALLEST_SHARE:
             return None
         return (time.monotonic() - self._first[0]) * (1.0 - self.share) / (self.share - self._first[1])
@@ -137,10 +137,10 @@ class Progress:
 
 
 def say_step(words: str, *, show: bool | None = None) -> None:
-    """Say on stderr what a run does next, where no bar shows it, and answer Ctrl-C.
+    """Report the next step of a run on stderr if no bar shows it, and respond to Ctrl-C.
 
     Args:
-        words: what is done, such as "drawing report.html".
+        words: description of the step, such as "drawing report.html".
         show: False says nothing, see `Progress`.
     """
     check_interrupt()
@@ -149,7 +149,7 @@ def say_step(words: str, *, show: bool | None = None) -> None:
 
 
 def say_lines(show: bool | None = None) -> Callable[[str], None]:
-    """A function that says on stderr what a run has found so far, with the seconds since now, and answers Ctrl-C.
+    """A function that reports interim results on stderr with the elapsed seconds, and responds to Ctrl-C.
 
     Args:
         show: False says nothing, see `Progress`.
@@ -212,7 +212,7 @@ class Checkpoint:
         self.path, self.digest = path, digest
 
     def save(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        """Write atomically: a kill leaves the previous file or this one, never half of one."""
+        """Write atomically: a kill leaves the previous or the new file, never a partial file."""
         if self.path is None:
             return
         text = json.dumps({"digest": self.digest, "schema_version": SCHEMA_VERSION, **meta})
@@ -225,7 +225,7 @@ class Checkpoint:
                 os.fsync(file.fileno())
 
     def load(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-        """Arrays and the rest of the last whole stage, or None where there is no checkpoint yet.
+        """Arrays and the rest of the last whole stage, or None without a checkpoint.
 
         Raises:
             InputError: the file is damaged, or belongs to another run.
@@ -265,13 +265,13 @@ UNSAVED = Checkpoint(None, "")
 
 @dataclass(frozen=True)
 class Logbook:
-    """Checkpoints and progress of a run; the empty one keeps and shows nothing.
+    """Checkpoints and progress of a run; the empty logbook stores and shows nothing.
 
     Attributes:
-        folder: for checkpoints; None keeps none.
+        folder: folder for checkpoints; None keeps none.
         resume: go on from the checkpoints found there.
-        progress: where stages are reported.
-        begin, end: shares of the whole work that are done before this part of it and after.
+        progress: receives reports of stages.
+        begin, end: shares of the whole work before and after this part.
     """
 
     folder: Path | None = None
@@ -285,7 +285,7 @@ class Logbook:
         return open_checkpoint(self.folder, name, digest, resume=self.resume)
 
     def part(self, begin: float, end: float, folder: str | None = None) -> Logbook:
-        """Of a part of the work, from one share of it to another, in a folder of its own where one is named."""
+        """Logbook of a part of the work, from share ``begin`` to ``end``, in a folder of its own if named."""
         own = self.folder if self.folder is None or folder is None else self.folder / folder
         width = self.end - self.begin
         return Logbook(own, self.resume, self.progress, self.begin + begin * width, self.begin + end * width)

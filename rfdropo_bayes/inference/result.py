@@ -1,4 +1,4 @@
-"""What every inference method returns."""
+"""Result of every inference method."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 SCATTERED = 0.5  # nats
 APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
 STUCK = 0.7  # correlation with their start that last moves may leave unsaid
-PRIOR_DRAWS = 2000  # that tell where a prior is, and whether it is one of logarithms
+PRIOR_DRAWS = 2000  # they show the range of a prior, and whether it is logarithmic
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
 
 
 @dataclass(frozen=True)
 class InferenceResult:
-    """Draws of equal weight, and how they came about.
+    """Draws of equal weight, and facts about the run.
 
     Attributes:
         method: registry name of the method.
         draws: one array (chain, draw) per parameter, physical units; independent repetitions are chains.
-        log_evidence: value and standard deviation in nats, or None; the deviation is NaN where nothing measures it.
-        prefix_log_evidence: log p(first h rows) for h = 1 ... n_rows, NaN where the method did not pass h; or None.
+        log_evidence: value and standard deviation in nats, or None; the deviation is NaN if it was not measured.
+        prefix_log_evidence: log p(first h rows) for h = 1 ... n_rows, NaN if the method did not pass h; or None.
         block_scores: prequential scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` =
             log p(block | rows before it) and its ``sd`` over repetitions.
         log_likelihood: (chain, draw, row) log density of each row at each draw, or None.
         trace: one dictionary per stage.
         rollouts: full-length equivalents used; evaluations: parameter sets tried.
         excluded: parameter sets that got no weight, by reason.
-        cautions: what speaks against the draws.
+        cautions: reasons to doubt the draws.
         seconds: time spent, earlier parts of a resumed run included.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None.
-        held: {name: value} of the parameters that the method did not infer and took for known.
-        optimum: posterior mode {name: value} where the method finds one; else None.
+        held: {name: value} of fixed parameters.
+        optimum: posterior mode {name: value} if the method finds it; else None.
         details: further numbers of the method, plain values.
     """
 
@@ -79,11 +79,11 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
 
 
 def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
-    """A caution for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, which
-    decide there, and one for those that the data put where the prior hardly is.
+    """A caution for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, and for
+    every parameter that the data put in a region of little prior mass.
 
-    A prior that is more even in logarithms has its posterior compared with a bound in logarithms: a scale that ranges
-    over decades has much of a linear range's mass at the lower end.
+    A prior that is more uniform in the logarithm is compared with its bounds in logarithms: a scale over decades has
+    most of its linear mass near the lower end.
     """
     drawn, ends = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS), problem.prior_ends
     found, apart = [], []
@@ -108,7 +108,7 @@ def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
 
 
 def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None) -> list[Caution]:
-    """What the stages of all replicates say against the draws: a budget that ran out, particles that did not move.
+    """Cautions from the stages of all replicates: an exhausted budget, or particles that did not move.
 
     Args:
         trace: a dictionary per stage, as in the result of `smc.sampler`.
@@ -126,22 +126,24 @@ def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None) -> list[
         found.append(Caution(Code.BUDGET_SPENT, sentence, grave=True))
     if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > STUCK:
         sentence = (
-            f"the last moves left the particles {stuck:.2f} correlated with where they were, so that the posterior may "
-            "be too narrow: several modes, a rugged likelihood, or a shape that moves cannot follow; compare replicates"
+            f"the last moves left the particles {stuck:.2f} correlated with their old positions, so that "
+            "the posterior may be too narrow: several modes, a rugged likelihood, or a shape that moves "
+            "cannot follow; compare replicates"
         )
         found.append(Caution(Code.PARTICLES_STUCK, sentence, grave=True))
     return found
 
 
 def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) -> list[Caution]:
-    """What independent repetitions do not agree about: the evidence, or where parameters lie (R-hat)."""
+    """Cautions if independent repetitions disagree on the evidence or on parameters (R-hat)."""
     if len(log_evidence) < 2:
         return []
     found, sd = [], float(np.std(log_evidence, ddof=1))
     if sd > SCATTERED:
         sentence = (
-            f"the log evidences of {len(log_evidence)} replicates scatter by {sd:.2g}: compare models only where they "
-            "differ by several times that, or take more particles or a target_ess closer to 1"
+            f"the log evidences of {len(log_evidence)} replicates scatter by {sd:.2g}: compare models "
+            "only if they differ by several times that, or take more particles or a target_ess closer to "
+            "1"
         )
         found.append(Caution(Code.EVIDENCE_SCATTERED, sentence))
     apart = {}
@@ -161,11 +163,11 @@ def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
 
 
 def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
-    """A caution where nothing would show a lost mode: particles of one replicate end in one mode of several.
+    """A caution if a lost mode would go unnoticed: particles of one replicate may end in a single mode.
 
     Args:
         replicates: independent repetitions of the sampler.
-        climbs: independent searches for the optima that all replicates start around; None for starts at the prior.
+        climbs: number of independent optimisations for the starts of all replicates; None for starts at the prior.
     """
     if replicates > 1 and climbs != 1:
         return []
@@ -178,7 +180,7 @@ def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
 
 
 def exclusion_cautions(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[Caution]:
-    """A caution where more than ``share`` of the rollouts had to be left out."""
+    """A caution if more than ``share`` of the rollouts were excluded."""
     total = sum(excluded.values())
     if evaluations == 0 or total / evaluations <= share:
         return []

@@ -24,11 +24,12 @@ SIZES = ("loc", "scale")  # entries of a prior's table that have the parameter's
 
 
 class InCommandUnit:
-    """Base of such mechanisms: a class gives its parameters for metres of cable.
+    """Base of mechanisms whose parameters are in the unit of commands: a class gives its parameters for metres of
+    cable.
 
     Args:
-        unit: of the commands.
-        stroke: size of usual commands, where they are neither metres nor radians.
+        unit: unit of the commands.
+        stroke: size of usual commands, if they are neither metres nor radians.
     """
 
     parameters: tuple[ParameterSpec, ...]
@@ -45,9 +46,9 @@ class InCommandUnit:
 
 
 def in_unit(spec: ParameterSpec, unit: str, per_metre: float) -> ParameterSpec:
-    """A parameter given for metres of cable, in another unit of commands, of which so many stand for a metre.
+    """A parameter given for metres of cable, in another unit of commands, with ``per_metre`` units per metre.
 
-    For radians that is a usual spool; for other units, what their usual commands are to those of cables.
+    For radians this is a usual spool; for other units, the ratio of usual commands.
     """
     if unit == "m":
         return spec
@@ -76,7 +77,7 @@ class CommandDelay:
     stage = "actuation"
     inside_drive = True
     cause = "communication and drive latency"
-    remedy = "stamp commands where they are executed, or shift the clock by this much"
+    remedy = "stamp commands at their execution, or shift the clock by this much"
     parameters = (ParameterSpec("command_delay", "s", 0.0, 2.0, 0.0, half_normal(0.1), "delay of every command"),)
 
     def actuate(
@@ -107,7 +108,7 @@ def _read_late(
     late: Float[Array, ""],
     read: Callable[[Int[Array, "*step"]], Float[Array, "*step channel"]],
 ) -> Float[Array, "*step channel"]:
-    """What ``read`` gives so many steps earlier, 0 at the earliest, linearly between steps."""
+    """Value of ``read`` by ``late`` steps earlier, not before step 0, linear between steps."""
     at = step - late
     # Interpolating towards the past keeps the derivative right at zero delay, where only later times count.
     after = jnp.maximum(jnp.ceil(at), 0).astype(int)
@@ -130,7 +131,7 @@ class ActuatorLag(SteppedActuation):
     parameters = (ParameterSpec("actuator_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant of the lag"),)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
-        """Where the drives stand."""
+        """Position of the drives."""
         return first
 
     def advance(
@@ -232,7 +233,7 @@ class Backlash(InCommandUnit, SteppedActuation):
     )
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
-        """How far the drive leads the cable, and what it was sent last: the middle of the play at first."""
+        """Lead of the drive over the cable, and its last command; starts in the middle of the play."""
         return jnp.zeros_like(first), first
 
     def advance(
@@ -254,7 +255,7 @@ class EndStop(InCommandUnit, MemorylessActuation):
     stage = "actuation"
     inside_drive = True
     cause = "a mechanical end stop, a software limit or the largest torque of a drive"
-    remedy = "read the drives' limits and their measured positions where the command is largest"
+    remedy = "read the drives' limits and their measured positions at the largest command"
     in_metres = (
         ParameterSpec(
             "inverse_travel_limit",
@@ -285,7 +286,9 @@ class TravelStop(InCommandUnit, SteppedActuation):
     name = "travel_stop"
     stage = "actuation"
     inside_drive = True
-    cause = "a drive that moves from where it is, and ignores moves beyond its stop or a limit of its controller"
+    cause = (
+        "a drive that moves relative to its position, and ignores moves beyond its stop or a limit of its controller"
+    )
     remedy = "record the positions of the drives beside their commands; command absolute positions"
     in_metres = (
         ParameterSpec(
@@ -311,7 +314,7 @@ class TravelStop(InCommandUnit, SteppedActuation):
     )
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
-        """What was lost at the stops, and the command that travel is counted from."""
+        """Motion lost at the stops, and the command from which travel is counted."""
         return jnp.zeros_like(first), first
 
     def advance(
@@ -349,7 +352,7 @@ class RateLimit(InCommandUnit, SteppedActuation):
     )
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
-        """Where the drives stand."""
+        """Position of the drives."""
         return first
 
     def advance(
@@ -407,7 +410,7 @@ class DriveCreep(SteppedActuation):
     )
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
-        """The slowly following command, and where it started."""
+        """The slowly following command, and its start."""
         return first, first
 
     def advance(

@@ -28,7 +28,7 @@ class Payload:
     name = "payload"
     stage = "body"
     cause = "a gripper, marker or weight at the tip that the model lacks"
-    remedy = "weigh what hangs at the tip"
+    remedy = "weigh the load at the tip"
     parameters = (ParameterSpec("payload_mass", "kg", 0.0, 5.0, 0.0, half_normal(0.1), "mass hung at the tip"),)
 
     def embody(self, values: Values, material: Material, body: Rod) -> Material:
@@ -58,6 +58,31 @@ class StiffnessGradient:
         )
 
 
+class AxialStiffness:
+    """The body is stiffer or softer in tension than its bending says; zero is the base simulator."""
+
+    name = "axial_stiffness"
+    stage = "body"
+    bodies = ("rod",)
+    cause = "a hollow, notched or reinforced section, whose stiffness in tension does not follow from its bending"
+    remedy = "hang a known weight on the body and measure how much longer it gets"
+    parameters = (
+        ParameterSpec(
+            "axial_stiffness",
+            "-",
+            -4.0,
+            4.0,
+            0.0,
+            normal(1.0),
+            "log ratio of the stiffness in tension and its value by the section profile",
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
+        """Scale the stiffness in tension of every layer."""
+        return material._replace(axial_scale=material.axial_scale * jnp.exp(values["axial_stiffness"]))
+
+
 class BaseTilt:
     """The base is mounted at an angle: gravity turns about axes of the base; zero is the base simulator.
 
@@ -80,7 +105,7 @@ class BaseTilt:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> BaseTilt:
-        """The two axes across a robot's gravity: about the one that is most along it, a tilt changes nothing."""
+        """The two axes across a robot's gravity: a tilt about the axis along gravity has no effect."""
         along = int(np.argmax(np.abs(robot.gravity)))
         return cls([axis for k, axis in enumerate(AXES) if k != along])
 
@@ -262,12 +287,12 @@ class CoulombFriction:
 
 
 class CapstanFriction:
-    """Tension decays along a bent cable by exp(-mu angle) where it slides; zero is the base simulator."""
+    """Tension decays along a bent cable by exp(-mu angle) as it slides; zero is the base simulator."""
 
     name = "capstan_friction"
     stage = "body"
     bodies = ("rod",)
-    cause = "friction of cables pressed against their guides where the body bends"
+    cause = "friction of cables pressed against their guides as the body bends"
     remedy = "measure the tension at both ends of a cable over a known bend; lubricate or line the guides"
     parameters = (
         ParameterSpec(
@@ -334,13 +359,13 @@ class QuadraticDrag:
 
 
 class WallContact:
-    """A surface beside the body pushes back where the body's axis passes it; zero stiffness is the base simulator."""
+    """A surface beside the body pushes back if the body's axis passes it; zero stiffness is the base simulator."""
 
     name = "wall_contact"
     stage = "body"
     bodies = ("rod",)
     cause = "the body touches its mount, a table, a cable bundle or itself"
-    remedy = "look where the trajectory ends on one side; clear the workspace or measure where the surface is"
+    remedy = "check whether the trajectory ends on one side; clear the workspace or measure the surface's position"
     parameters = (
         ParameterSpec(
             "wall_stiffness",

@@ -1,4 +1,4 @@
-"""Features: what a law at a port may depend on, each a number at every time step: of time, commands or the motion.
+"""Features: the inputs of a law at a port. Each is a number per time step, from time, commands or motion.
 
 A feature is written as a step with a memory, so that a whole rollout, which scans it, and a session give the same.
 """
@@ -18,21 +18,21 @@ from rfdropo_bayes.tables import nearest
 
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
 OWN = -1
-"""In the place of a command: that of the cable on which a law acts, at a port of several cables."""
+"""Stands for the command of the cable on which a law acts, at a port of several cables."""
 OWN_NAME = "own"
 GAUGES = ("tip x", "tip y", "tip z", "tip distance")
-"""The motion as features see it [m]: the last marker from where it was before the first step, and its distance."""
+"""Inputs of motion features [m]: displacement of the last marker since the first step, and its norm."""
 
 
 class Kind(NamedTuple):
     """A kind of feature.
 
     Attributes:
-        channels: how many commands it is made of.
-        unit: powers of the command's unit and of seconds.
-        words: in a sentence; the names of its commands and its shape are put in.
-        formula: as a symbol, likewise.
-        shapes: values of its shape that are tried, as shares of the stroke of the commands or in seconds; none without.
+        channels: number of commands it uses.
+        unit: exponents of the command's unit and of seconds.
+        words: phrase with placeholders for its commands and shape.
+        formula: symbol with the same placeholders.
+        shapes: tried values of its shape, as shares of the commands' stroke or in seconds; empty without a shape.
     """
 
     channels: int
@@ -60,7 +60,11 @@ KINDS: Mapping[str, Kind] = {
         (0.1, 0.3),
     ),
     "play": Kind(
-        1, (0, 0), "by what {0} did last, as with a play of {shape:.2g}", "play(u_{0}, {shape:.2g})", (0.05, 0.1, 0.2)
+        1,
+        (0, 0),
+        "by the last motion of {0}, as with a play of {shape:.2g}",
+        "play(u_{0}, {shape:.2g})",
+        (0.05, 0.1, 0.2),
     ),
     "largest": Kind(1, (1, 0), "with the largest {0} so far", "max|u_{0}|"),
     "travelled": Kind(1, (1, 0), "with all the travel of {0} so far", "travel(u_{0})"),
@@ -131,7 +135,7 @@ class Feature(NamedTuple):
         return jnp.ones((), first.dtype) if self.kind == "constant" else jnp.zeros((), first.dtype)
 
     def advance(self, memory: Any, given: Float[Array, " channel"], interval: float) -> tuple[Any, Float[Array, ""]]:
-        """Memory and value at the end of a step of so many seconds, given the command that has been reached."""
+        """Memory and value at the end of a step of ``interval`` seconds, given the command reached."""
         own = [given[k] for k in self.channels]
         if self.kind not in ("time", "drift", "rate", "direction", "low_pass", "lag", "play", "largest", "travelled"):
             return memory, self.at_rest(given)
@@ -205,7 +209,7 @@ def gauges_of(path: Float[Array, "row 3"]) -> Float[Array, "row 4"]:
 
 
 def motion_dictionary() -> list[Feature]:
-    """All features of the motion: where the last marker is, how fast, and the largest distance so far."""
+    """All features of the motion: position and velocity of the last marker, and its largest distance so far."""
     last = len(GAUGES) - 1
     found = [Feature("position", (k,), of_motion=True) for k in range(len(GAUGES))]
     found += [Feature("rate", (k,), of_motion=True) for k in range(last)]
@@ -213,7 +217,7 @@ def motion_dictionary() -> list[Feature]:
 
 
 def dictionary(channels: int, stroke: float) -> list[Feature]:
-    """All features of time and of so many commands, whose largest change is ``stroke`` [m or rad]."""
+    """All features of time and of ``channels`` commands, whose largest change is ``stroke`` [m or rad]."""
     return _of_channels(range(channels), stroke)
 
 
@@ -247,11 +251,11 @@ def feature_named(
     """A feature as a file has it.
 
     Args:
-        kind: a key of `KINDS`.
-        commands: names of its commands, among them `OWN_NAME` where ``names`` has that; or of its gauges.
+        kind: key of `KINDS`.
+        commands: names of its commands, including `OWN_NAME` if ``names`` has it; or of its gauges.
         shape: its time constant or width; None without.
-        names: of the commands, in their order; `OWN_NAME`, if it may be used, comes last. Or `GAUGES`.
-        where: the place in the file.
+        names: names of the commands, in their order; `OWN_NAME`, if it may be used, comes last. Or `GAUGES`.
+        where: location in the file.
         of_motion: whether it is made of gauges.
 
     Raises:
@@ -274,7 +278,7 @@ def feature_named(
         raise InputError(
             f"the feature {kind!r} is made of {wanted.channels} commands, not {len(commands)}",
             where=where,
-            remedy="name as many in commands = [...]",
+            remedy="name the same number in commands = [...]",
         )
     if bool(wanted.shapes) != (shape is not None) or (shape is not None and not shape > 0.0):
         needs = "a positive shape" if wanted.shapes else "no shape"

@@ -24,8 +24,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.port_signals import BodySignals, read_late
 
 WHERE = "[[model.laws]]"
-FAR = 1e3  # prior scales to each side of null, where a coefficient's hard bounds are
-SHAPES = 10.0  # times a shape, and its inverse, where the hard bounds of an inferred shape are
+FAR = 1e3  # hard bounds of a coefficient, in prior scales from null
+SHAPES = 10.0  # hard bounds of an inferred shape: times a shape, and its inverse
 WIDE = 0.5  # deviation of a shape's prior, as a share of the shape: audits try shapes that are 2 to 10 times apart
 
 
@@ -33,9 +33,9 @@ class Term(NamedTuple):
     """One coefficient of a law, and the feature that it belongs to.
 
     Attributes:
-        feature: as it is where nothing is known of its shape.
-        spec: of the coefficient.
-        shape: parameter in the place of the feature's own shape; None where that stays.
+        feature: feature with its initial shape.
+        spec: specification of the coefficient.
+        shape: parameter that replaces the feature's shape; None for a fixed shape.
     """
 
     feature: Feature
@@ -72,13 +72,13 @@ def _raised(name: str, power: int) -> str:
 
 
 class Law:
-    """What the laws of each stage share.
+    """Base of the laws of every stage.
 
     Args:
-        port: where it acts.
-        terms: what it is made of.
+        port: port at which it acts.
+        terms: terms of its sum.
         ports: all ports of the robot.
-        formula: in symbols, for its name.
+        formula: formula that names it.
     """
 
     stage: str
@@ -101,7 +101,7 @@ def _summed(terms: Sequence[Term], values: Values, levels: Float[Array, "row cha
 
 
 class CableLaw(Law):
-    """Adds its signal to what reaches one cable, or to each cable that by its own command."""
+    """Adds its signal to the command of one cable, or of every cable by its own command."""
 
     stage = "actuation"
     inside_drive = False
@@ -254,7 +254,7 @@ class SensingLaw(SignalLaw):
 
 
 class ClockedSensingLaw(Law):
-    """Acts on the measured markers by time alone, and so in sessions, too."""
+    """Acts on the measured markers by time alone; sessions can therefore use it."""
 
     stage = "sensing"
 
@@ -351,6 +351,6 @@ def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command
         terms.append(Term(feature, spec, _shape_of(table, feature, command_unit, where)))
     names_given = [spec.name for term in terms for spec in (term.spec, term.shape) if spec is not None]
     if len(set(names_given)) < len(names_given):
-        raise InputError("two terms share a parameter", where=where, remedy="name each after what it does")
+        raise InputError("two terms share a parameter", where=where, remedy="name each after its effect")
     formula = " + ".join(f"{term.spec.name} {term.feature.formula(channels)}" for term in terms)
     return law_at(port, terms, ports, formula)

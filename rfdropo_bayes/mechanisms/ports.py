@@ -1,4 +1,4 @@
-"""Ports by name: the places where an effect may enter a simulated robot, and what a signal does there.
+"""Ports by name: the places at which an effect may enter a simulated robot, and the action of a signal there.
 
 A port of actuation or of the body acts on a rollout (`simulators.ports`); one of sensing is a map of the markers.
 """
@@ -17,27 +17,27 @@ from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 
 AXES = "xyz"
 SIZES = {"m": 1e-3, "rad": 0.05}
-"""Of an effect on a command in each unit."""
+"""Size of an effect on a command, by unit."""
 SHARE = 0.05
-"""Of usual commands in any other unit, likewise."""
+"""Size of an effect in other units, as a share of usual commands."""
 EVERY_CABLE, EVERY_ACTUATOR = "every cable", "every actuator"
 PLACES = ("base", "middle", "tip")
-"""Names of the places that forces may act on, as many as the engine has; see `simulators.engine.LOAD_PLACES`."""
+"""Names of the places that forces may act on, one per place of the engine; see `simulators.engine.LOAD_PLACES`."""
 
 
 class Port(NamedTuple):
-    """A place where a signal w(t) may act.
+    """A place at which a signal w(t) may act.
 
     Attributes:
-        name: as in a file, such as "cable left" or "marker m3 along".
+        name: name in files, such as "cable left" or "marker m3 along".
         stage: "actuation", "body" or "sensing".
-        kind: what it is a port of.
-        number: which one of its kind: a channel, a place or a marker; of "cables" the number of them.
-        axis: 0 to 2, and 3 along the body; -1 where there is none.
-        unit: of the signal.
-        size: of an effect that a laboratory might see: the scale of priors and of differences.
-        look: what to look for at the robot.
-        spoken: its name in sentences, tables and figures, where that is not the name in files; see `words`.
+        kind: kind of place.
+        number: index within its kind: a channel, a place or a marker; for "cables" the number of cables.
+        axis: 0 to 2, and 3 along the body; -1 without an axis.
+        unit: unit of the signal.
+        size: size of a typical effect: the scale of priors and of differences.
+        look: check to make at the robot.
+        spoken: its name in sentences, tables and figures, if it differs from the name in files; see `words`.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Port(NamedTuple):
 
 
 class PortMap(NamedTuple):
-    """The ports of a robot on an engine, and what signals there are made of.
+    """The ports of a robot on an engine, and the composition of signals there.
 
     Attributes:
         ports: all of them.
         left_out: ports that the body cannot carry, with the reason.
-        channels: number of commands; places: number of stations that forces may act on, 0 where none can.
-        gravity: [m/s2].
+        channels: number of commands; places: number of stations for forces, 0 if none.
+        gravity: acceleration [m/s2].
     """
 
     ports: tuple[Port, ...]
@@ -73,11 +73,11 @@ class PortMap(NamedTuple):
     gravity: tuple[float, float, float]
 
     def named(self, name: str) -> Port | None:
-        """A port by its name in files or in sentences; None where there is none."""
+        """A port by its name in files or in sentences; None if there is none."""
         return next((port for port in self.ports if name in (port.name, port.words)), None)
 
     def members(self, port: Port) -> tuple[Port, ...]:
-        """The ports at which a law acts that is placed at this one: at every cable by the cable's own command."""
+        """The ports at which a law of this port acts: for "cables" every cable, by its own command."""
         if port.kind == "cables":
             return tuple(each for each in self.ports if each.kind == "cable")
         return (port,)
@@ -87,7 +87,7 @@ class PortMap(NamedTuple):
         return PortSignals(jnp.zeros((rows, self.channels)), jnp.zeros(rows), self.no_push(rows))
 
     def no_push(self, rows: int) -> BodySignals | None:
-        """Signals of zeros on the body; None where it cannot carry any."""
+        """Signals of zeros on the body; None if it cannot carry signals."""
         if not self.places:
             return None
         return BodySignals(jnp.zeros((rows, self.places, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
@@ -119,7 +119,7 @@ class PortMap(NamedTuple):
 def sensed(
     port: Port, w: Float[Array, " time"], position: Float[Array, "time marker 3"], time: Float[Array, " time"]
 ) -> Float[Array, "time marker 3"]:
-    """Measured positions [m] with a signal at a port of sensing, given those without."""
+    """Measured positions [m] with a signal at a port of sensing, from positions without the signal."""
     if port.kind == "observation":
         return read_at(position, time, time - w)
     axis, w = jnp.eye(3)[min(max(port.axis, 0), 2)], w[:, None]
@@ -134,9 +134,9 @@ def sensed(
 
 
 def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
-    """The ports of a simulator, of whose markers some are measured.
+    """The ports of a simulator, for the measured ``markers``.
 
-    A simulator that does not take signals has those of sensing only.
+    A simulator without signal inputs has ports of sensing only.
     """
     left_out: dict[str, str] = {}
     ports: list[Port] = []
@@ -160,17 +160,18 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
 
 
 def _of_actuation(channels: Sequence[str], unit: str, stroke: float | None, *, wound: bool) -> list[Port]:
-    """Ports of drives that wind cables, or of the commands of a simulator of one's own; metres are those of cables. In
-    other units than metres and radians an effect is measured by the size of usual commands, ``stroke``."""
+    """Ports of drives that wind cables, or of the commands of your own simulator; metres are cable lengths. In units
+    other than metres and radians an effect is scaled by the size of usual commands, ``stroke``.
+    """
     cables, size = wound or unit == "m", SIZES.get(unit, SHARE * (stroke or 1.0))
-    look = "guide, spool and tension of cable {0}, and what it shares with other cables"
-    look = look if wound else "the drive of {0}, what it moves, and what it shares with other drives"
+    look = "guide, spool and tension of cable {0}, and all parts shared with other cables"
+    look = look if wound else "the drive of {0}, its load, and all parts shared with other drives"
     found = []
     for k, name in enumerate(channels):
         words = f"cable {name}" if cables else f"actuator {name}"
         found.append(Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name), words))
     if len(found) > 1:
-        look_at = "what all drives and cables share: gears, spools, guides, and the material of the cables"
+        look_at = "all parts shared by drives and cables: gears, spools, guides, and the material of the cables"
         look_at = look_at if wound else "what all drives share"
         words = EVERY_CABLE if cables else EVERY_ACTUATOR
         found.append(Port(EVERY_CABLE, "actuation", "cables", len(found), -1, unit, size, look_at, words))
@@ -179,14 +180,14 @@ def _of_actuation(channels: Sequence[str], unit: str, stroke: float | None, *, w
 
 
 def _of_body(places: int, gravity: tuple[float, float, float]) -> list[Port]:
-    look = "what pulls, pushes or touches the body near its {0}"
+    look = "anything that pulls, pushes or touches the body near its {0}"
     found = [
         Port(f"force {AXES[i]} at the {name}", "body", "force", k, i, "N", 0.05, look.format(name))
         for k, name in enumerate(PLACES[3 - places :] if places <= 3 else PLACES)
         for i in range(3)
     ]
     found.append(Port("stiffness", "body", "stiffness", 0, -1, "-", 0.1, "warmth, use and age of the body's material"))
-    found.append(Port("damping", "body", "damping", 0, -1, "-", 0.3, "what rubs or flows in the body and along it"))
+    found.append(Port("damping", "body", "damping", 0, -1, "-", 0.3, "friction or flow in the body and along it"))
     for i in range(3):
         if any(abs(g) > 0.0 for k, g in enumerate(gravity) if k != i):
             found.append(Port(f"base tilt {AXES[i]}", "body", "tilt", 0, i, "rad", 0.05, "whether the base moves"))
@@ -196,7 +197,7 @@ def _of_body(places: int, gravity: tuple[float, float, float]) -> list[Port]:
 def _of_sensing(markers: Sequence[str]) -> list[Port]:
     found: list[Port] = []
     for k, name in enumerate(markers):
-        look = f"whether marker {name} slides, comes loose or is taken for another one"
+        look = f"whether marker {name} slides, comes loose or is confused with another marker"
         ends = [*enumerate(AXES), (3, "along the body")] if len(markers) > 1 else list(enumerate(AXES))
         found += [Port(f"marker {name} {way}", "sensing", "marker", k, i, "m", 1e-3, look) for i, way in ends]
     look = "whether the cameras move against the base"
@@ -204,5 +205,5 @@ def _of_sensing(markers: Sequence[str]) -> list[Port]:
     found += [Port(f"camera turn {a}", "sensing", "turn", 0, i, "rad", 0.01, look) for i, a in enumerate(AXES)]
     look = "the cameras' calibration of lengths"
     found.append(Port("camera scale", "sensing", "scale", 0, -1, "-", 0.01, look))
-    look = "the cameras' clock against that of the drives"
+    look = "the cameras' clock against the drives' clock"
     return [*found, Port("observation delay", "sensing", "observation", 0, -1, "s", 0.02, look)]

@@ -31,6 +31,7 @@ from rfdropo_bayes.mechanisms.actuation import (
     TravelStop,
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
+    AxialStiffness,
     BaseTilt,
     BendTwistCoupling,
     CableCompliance,
@@ -75,6 +76,7 @@ REGISTRY: dict[str, type] = {
         DriveCreep,
         DriveDrift,
         Payload,
+        AxialStiffness,
         StiffnessGradient,
         BaseTilt,
         CoulombFriction,
@@ -109,7 +111,7 @@ def mechanisms_named(
     folder: Path = Path(),
     where: str = "[model] mechanisms",
 ) -> tuple[Mechanism, ...]:
-    """The mechanisms of an experiment file, in its order: those of `choose_mechanisms`, for a robot."""
+    """The mechanisms of an experiment file, in its order, made for a robot."""
     return tuple(choice.made_for(robot) for choice in choose_mechanisms(names, folder=folder, where=where))
 
 
@@ -139,12 +141,12 @@ def choose_mechanisms(
     """The mechanisms that names stand for.
 
     Args:
-        names: of the registry, ``module:ClassName`` of a user's own, or a mechanism itself, as a class or an object.
-        folder: that files of a user's own are relative to.
-        where: the names stand, for messages.
+        names: names in the registry, ``module:ClassName`` of user code, or mechanisms as classes or objects.
+        folder: base folder of user files.
+        where: location of the names, for messages.
 
     Raises:
-        InputError: an unknown name, or a module or class that cannot be imported or is no mechanism.
+        InputError: an unknown name, or a module or class that cannot be imported or does not define a mechanism.
     """
     chosen = []
     for name in names:
@@ -196,7 +198,7 @@ def _imported(name: str, folder: Path, where: str) -> Any:
 
 
 def _check_kind(kind: Any, name: str, where: str) -> None:
-    """Raise InputError where a user's class lacks what a mechanism must have, or has the name of another."""
+    """Raise InputError if a user's class lacks a required member of a mechanism, or has the name of another."""
     lacking = [key for key in ("name", "stage", "cause", "remedy") if not hasattr(kind, key)]
     # A class that is made for a robot may have its parameters only then.
     if not hasattr(kind, "for_robot") and not hasattr(kind, "parameters"):

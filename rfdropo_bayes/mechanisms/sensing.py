@@ -1,4 +1,4 @@
-"""Mechanisms between the true motion of the markers and what the cameras report."""
+"""Mechanisms between the true motion of the markers and the reports of the cameras."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class CameraRotation:
         """Rotate about the base's origin (Rodrigues' formula, written so that it is smooth at zero)."""
         vector = jnp.stack([values[spec.name] for spec in self.parameters])
         square = jnp.sum(vector**2)
-        # sin(a)/a and (1 - cos(a))/a^2 by their series near zero, where the square root has no derivative.
+        # sin(a)/a and (1 - cos(a))/a^2 by their series near zero, at which the square root has no derivative.
         small = square < 1e-8
         angle = jnp.sqrt(jnp.where(small, 1.0, square))
         first = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
@@ -64,7 +64,7 @@ class CameraScale:
 
 
 class CameraOffset:
-    """The origin of the measuring frame lies beside that of the robot's base; nowhere else at null."""
+    """The origin of the measuring frame is displaced from the robot's base; by zero in the base simulator."""
 
     name = "camera_offset"
     stage = "sensing"
@@ -123,11 +123,11 @@ class CameraDrift:
 
 
 class MarkerOffset:
-    """Each marker displaced from its place by an arm that turns with the body; nowhere at null.
+    """Each marker displaced from its place by an arm that turns with the body; zero in the base simulator.
 
     The arm is given as it is in the first row. From there it turns as little as takes the body's direction at the
-    marker, which its neighbours in the robot's order show (their chord), to what it is later: without twist, exact for
-    bending between markers that are close. A robot with one marker shows no direction, and its arm keeps its own.
+    marker, which its neighbours in the robot's order show (their chord), to its later direction: without twist, exact
+    for bending between markers that are close. A robot with one marker shows no direction, and its arm keeps its own.
 
     Args:
         markers: names; numbers by default.
@@ -136,7 +136,7 @@ class MarkerOffset:
     name = "marker_offset"
     stage = "sensing"
     cause = "markers glued beside the places that the robot's description gives"
-    remedy = "measure where each marker sits on the body, and correct the robot's description"
+    remedy = "measure each marker's position on the body, and correct the robot's description"
 
     def __init__(self, markers: Sequence[str] = NUMBERED) -> None:
         self.parameters = tuple(
@@ -219,13 +219,13 @@ class SensorLag:
         return jax.lax.scan(follow, self.begin(values, position[0], 0.0), (position, time - time[0]))[1]
 
     def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[Array, Array, Array]:
-        """The last position as it was seen and as it was, and its time: the first one at zero."""
+        """The last position as seen and as it was, and its time, from zero."""
         return first, first, jnp.zeros(())
 
     def advance(
         self, values: Values, memory: tuple[Array, Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]
     ) -> tuple[tuple[Array, Array, Array], Float[Array, "marker 3"]]:
-        """Exact response to a position that ran straight from the last one to this."""
+        """Exact response to a position that ran straight from the last position to this."""
         last, before, then = memory
         tau = values["sensor_lag"]
         on = tau > 0.0
@@ -245,9 +245,7 @@ class ClockOffset:
     cause = "cameras and drives on clocks that were not synchronised, or frames stamped when they arrive"
     remedy = "synchronise the clocks by a trigger that both record"
     parameters = (
-        ParameterSpec(
-            "clock_offset", "s", -1.0, 1.0, 0.0, normal(0.05), "what is seen at a time happened so much earlier"
-        ),
+        ParameterSpec("clock_offset", "s", -1.0, 1.0, 0.0, normal(0.05), "delay between motion and its time stamp"),
     )
 
     def sense_over_time(
@@ -262,7 +260,7 @@ class ClockOffset:
         return jnp.broadcast_to(first, (rows, *first.shape)), jnp.zeros(rows)
 
     def check_steps(self, values: Mapping[str, Float[np.ndarray, " lane"]]) -> None:
-        """Raise InputError where a session would have to show what has not happened yet."""
+        """Raise InputError if a session would need future positions."""
         if np.any(values["clock_offset"] < 0.0):
             raise InputError(
                 f"clock_offset = {np.min(values['clock_offset']):g} s would show the future",
@@ -282,7 +280,7 @@ class ClockOffset:
 def read_at(
     position: Float[Array, "time marker 3"], time: Float[Array, " time"], at: Float[Array, "*when"]
 ) -> Float[Array, "*when marker 3"]:
-    """Positions at other times, linearly between those given; beyond the ends they stand still."""
+    """Positions at other times, linearly between the given times; constant beyond the ends."""
     # Not a clip, whose derivative at the first and last row would be halved.
     until = jnp.where(at > time[-1], time[-1], at)
     after = jnp.clip(jnp.searchsorted(time, until), 1, len(time) - 1)

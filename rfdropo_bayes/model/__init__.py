@@ -1,1 +1,1 @@
-"""What an experiment means: its file, the objects behind it, the model made of them, and the folders of runs."""
+"""Experiments: their file, the objects it describes, the model made of them, and the folders of runs."""

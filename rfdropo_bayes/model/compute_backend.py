@@ -1,4 +1,4 @@
-"""What computes the motion of the body."""
+"""Backends that compute the motion of the body."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from rfdropo_bayes.simulators.body_engine import Backend
 def backend(table: SimulatorTable, rod: bool) -> Backend:
     """The backend that [simulator] asks for.
 
-    "auto" takes the compiled one for meshes, which JAX has not, and for rods where JAX has only a
-    CPU.
+    "auto" is the compiled backend for meshes, which JAX lacks, and for rods if JAX has only a CPU.
     """
     compiled = table.engine == "numba"
     if table.engine == "auto":

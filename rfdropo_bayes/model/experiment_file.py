@@ -19,14 +19,13 @@ from rfdropo_bayes.tables import parse_assignment, plain, read_toml, set_entry
 ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
 FILE_KEYS = ("observations", "commands")
-NO_COMMANDS = "none"  # stands for zero commands where a file of them could be named
+NO_COMMANDS = "none"  # zero commands instead of a file of commands
 WRITTEN_BY_RUNS = ("config.toml", "extended.toml")
 RESULTS_OF_RUNS = ("run.json", "summary.json", "audit.json")
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Tables of a TOML file. One that a run wrote states its integrator; where an earlier version wrote it, it says
-    nothing, and is read as ``"euler"``, which that version had alone.
+    """Tables of a TOML file. A file written by a run states its integrator; without this key it is read as ``"euler"``.
 
     Raises:
         InputError: no such file, or not TOML.
@@ -67,9 +66,9 @@ def describe(tables: Mapping[str, Any]) -> str:
 
 
 def look_through(path: Path, overrides: Sequence[str] = ()) -> None:
-    """See that the files which an experiment names are there, at once.
+    """Check that the files of an experiment exist.
 
-    What else may be wrong with it is said by `load_experiment` and by the rooms that read its tables.
+    Other faults are found by `load_experiment` and by the rooms that read its tables.
 
     Raises:
         InputError: the experiment file cannot be read, or a recording or a robot file is missing.
@@ -98,7 +97,7 @@ def _recordings(tables: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _robot_file(robot: str, folder: Path) -> Path:
-    """Beside the experiment, or else from where the program was started."""
+    """Path of a robot file, relative to the experiment or else to the current folder."""
     beside = folder / robot
     return beside if beside.is_file() else Path(robot)
 
@@ -106,13 +105,13 @@ def _robot_file(robot: str, folder: Path) -> Path:
 def self_contained(
     tables: Mapping[str, Any], folder: Path, out: Path | None = None, made: Container[str] = ()
 ) -> dict[str, Any]:
-    """The tables such that they mean the same in another folder.
+    """Tables that are valid in another folder.
 
     Args:
-        tables: of an experiment.
-        folder: that of the experiment file.
-        out: folder that gets copies of the robot's file and of mechanisms' code; without one, their paths are given.
-        made: names of files that a program has made: no file of such a name that lies about is meant.
+        tables: tables of an experiment.
+        folder: folder of the experiment file.
+        out: folder for copies of the robot's file and of mechanisms' code; without it, their paths are written.
+        made: names of files made by a program, which do not refer to existing files.
 
     Raises:
         InputError: a file cannot be copied.
@@ -133,17 +132,17 @@ def self_contained(
 
 
 def _robot_placed(robot: str, folder: Path, out: Path | None) -> str:
-    """A robot such that it is found from another folder, too; names of robots that come with the package stay."""
+    """A robot's name or path that is valid from any folder; names of bundled robots are unchanged."""
     file = _robot_file(robot, folder)
     if file.suffix == ".toml" and file.is_file():
         return _brought(file, out, ROBOT_COPY)
-    if file.suffix in MODEL_FILES and file.is_file():  # which may name meshes beside it: it stays where it is
+    if file.suffix in MODEL_FILES and file.is_file():  # it may name meshes beside it, and is not moved
         return str(file.resolve())
     return code_placed(robot, folder, out) if ".py:" in robot else robot
 
 
 def _placed(entry: Any, folder: Path) -> Any:
-    """A recording's path such that it is found from another folder, too."""
+    """A recording's path that is valid from any folder."""
     if isinstance(entry, dict):
         return {k: _placed(v, folder) if k in FILE_KEYS else v for k, v in entry.items()}
     try:
@@ -154,7 +153,7 @@ def _placed(entry: Any, folder: Path) -> Any:
 
 
 def code_placed(source: str, folder: Path, out: Path | None = None) -> str:
-    """``"mine.py:Mechanism"`` such that it is found from another folder, too; names of the registry stay."""
+    """``"mine.py:Mechanism"`` with a path that is valid from any folder; names in the registry are unchanged."""
     file, colon, name = source.partition(".py:")
     if not colon:
         return source
@@ -169,7 +168,7 @@ def _copy_name(file: str) -> str:
 
 
 def _brought(file: Path, out: Path | None, name: str) -> str:
-    """Where a file is found: in the folder it is copied to, under ``name``, or where it is."""
+    """Path of a file: its copy ``name`` in ``out``, or the file itself."""
     if out is None:
         return str(file.resolve())
     try:

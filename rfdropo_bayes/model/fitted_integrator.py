@@ -1,4 +1,4 @@
-"""Whether a calibration is used with the integrator that it was fitted with: what a fit finds carries its time step."""
+"""Check that a calibration is used with its own integrator: fitted values depend on the time step."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ INTEGRATOR = "integrator"
 
 
 def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None) -> str:
-    """How time steps were taken in a fit.
+    """Integrator of a fit.
 
     Args:
-        attributes: of its posterior; a posterior of an earlier version says nothing.
-        folder: of its run, whose config.toml says it then. Without one it was "euler", which those versions had alone.
+        attributes: attributes of its posterior.
+        folder: folder of its run, whose config.toml is used if the attributes lack it; "euler" if both lack it.
     """
     if INTEGRATOR in attributes:
         return str(attributes[INTEGRATOR])

@@ -12,7 +12,7 @@ from rfdropo_bayes.simulators.mechanisms import BODIES, ENGINES, Mechanism, bodi
 
 Row = dict[str, str]
 EXAMPLE_ROBOT = "smooth_arm"
-"""Mechanisms with parameters per cable are listed for this one."""
+"""Robot for which mechanisms with parameters per cable are listed."""
 
 
 def mechanism_rows() -> list[Row]:
@@ -25,7 +25,7 @@ def mechanism_rows() -> list[Row]:
 
 
 def mechanism_facts(name: str, robot: str = EXAMPLE_ROBOT) -> tuple[Row, list[Row]]:
-    """What one mechanism is, and a row for each of its parameters.
+    """Facts about a mechanism, and a row for each of its parameters.
 
     Raises:
         InputError: no such mechanism, or no such robot.

@@ -1,6 +1,6 @@
-"""What an experiment file means: the model as objects, and what the verbs are told. The file is names and numbers.
+"""Meaning of an experiment file: the model as objects, and the settings of verbs. The file has names and numbers.
 
-A file is parsed once, by `spec_of` and `RunSettings.of`. What is changed afterwards is changed here, with
+A file is parsed once, by `spec_of` and `RunSettings.of`. Later changes are made to these objects with
 `dataclasses.replace`, and checked again.
 """
 
@@ -37,12 +37,12 @@ from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import nearest
 
 Workpiece = Robot | BlackBox
-"""What is simulated."""
+"""Type of the simulated object."""
 
 
 @dataclass(frozen=True)
 class DataChannels:
-    """What of the recordings is data beside the markers: tensions, motor angles, poses of an object."""
+    """Data channels of the recordings beside the markers: tensions, motor angles, poses of an object."""
 
     tension: bool = False
     motor_angle: bool = False
@@ -52,29 +52,29 @@ class DataChannels:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """What is simulated, what is inferred, and what is data.
+    """Simulated robot, inferred parameters and data channels.
 
     Attributes:
         robot: robot or black box, without the ``drives`` that are stated here.
-        named: name or path by which a file asks for the robot; empty where it was made in Python.
+        named: name or path of the robot in a file; empty if it was made in Python.
         mechanisms: effects on top of the base simulator.
         simulator: body, engine and discretisation.
-        priors: what is inferred: tables of priors by parameter; an empty one is the parameter's default.
+        priors: inferred parameters: tables of priors by parameter; an empty table is the parameter's default.
         fixed: values of parameters that are not inferred.
-        noise: of the positions, by name.
-        stated: the noise of the positions where its size is known; what `simulate` adds.
-        per_recording: parameters that are free in each of the recordings that match.
-        groups: recordings that have a set-up in common.
+        noise: noise of the positions, by name.
+        stated: noise of the positions of known size, which `simulate` adds.
+        per_recording: parameters that are free in each matching recording.
+        groups: recordings that share a set-up.
         per_group: scale of the spread between groups of parameters that differ between them, in their unit.
-        only_in: groups that have a parameter, each its own value; it is neutral in all others.
-        drives: what is known of the drives, beside what the robot says.
-        channels: what is data beside the markers.
+        only_in: groups that have a parameter, with one value each; it is neutral in other groups.
+        drives: known properties of the drives, in addition to the robot's.
+        channels: data channels beside the markers.
         weighed: sums of parameters that were measured.
-        adapter: what a file tells the adapter of a black box.
-        folder: that the mesh of the body, and code of one's own, are relative to.
+        adapter: settings of a black box's adapter.
+        folder: base of relative paths of the mesh and of user code.
 
     Raises:
-        InputError: no robot, an unknown noise, or drives of cables that the robot does not have.
+        InputError: no robot, an unknown noise, or drives of unknown cables.
     """
 
     robot: Workpiece
@@ -150,7 +150,7 @@ class ModelSpec:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What an experiment says beside its model: see the fields of these names in `Experiment`."""
+    """Settings of an experiment beside its model: see the fields of the same names in `Experiment`."""
 
     seed: int = 0
     title: str = ""
@@ -163,7 +163,7 @@ class RunSettings:
 
     @classmethod
     def of(cls, experiment: Experiment) -> RunSettings:
-        """What a file says."""
+        """Settings of a file."""
         return cls(
             seed=experiment.seed,
             title=experiment.title,
@@ -183,7 +183,7 @@ class RunSettings:
 
 
 def _dumped(tables: Mapping[str, BaseModel | None]) -> dict[str, Any]:
-    """What of some tables was given, as a file has it."""
+    """The given keys of some tables, as in a file."""
     given = {
         name: table.model_dump(mode="json", exclude_unset=True, exclude_none=True)
         for name, table in tables.items()
@@ -195,13 +195,13 @@ def _dumped(tables: Mapping[str, BaseModel | None]) -> dict[str, Any]:
 def spec_of(
     experiment: Experiment, folder: Path, robot: Workpiece | None = None, mechanisms: Sequence[Any] | None = None
 ) -> ModelSpec:
-    """What a file says of the model.
+    """Specification of the model in a file.
 
     Args:
         experiment: the file.
-        folder: that its paths are relative to.
-        robot: instead of the one that the file names.
-        mechanisms: names, classes or objects, instead of those that it names.
+        folder: base of its relative paths.
+        robot: replaces the robot of the file.
+        mechanisms: names, classes or objects that replace the mechanisms of the file.
 
     Raises:
         InputError: as `ModelSpec`; or an unknown robot or mechanism.
@@ -231,7 +231,7 @@ def spec_of(
 
 
 def _own_priors(robot: Workpiece, fixed: Mapping[str, float]) -> dict[str, dict[str, Any]]:
-    """What is inferred where nothing says so: the parameters of a black box, less those of its families."""
+    """Default inferred parameters: a black box's parameters, less its families."""
     if not isinstance(robot, BlackBox):
         return {}
     return {name: {} for name in robot.parameters if name not in fixed and name not in robot.families}
@@ -244,11 +244,11 @@ def law_choice(table: LawTable) -> MechanismChoice:
 
 
 def find_robot(name: str, folder: Path, adapter: Mapping[str, Any] | None = None) -> Workpiece:
-    """The robot that an experiment file names: one that comes with the package, a file relative to the experiment's, or
-    another simulator, whose adapter gets the keys of ``adapter``.
+    """The robot that an experiment file names: a bundled robot, a file relative to the experiment's, or another
+    simulator, whose adapter gets the keys of ``adapter``.
 
     Raises:
-        InputError: no such robot, or an adapter where there is none.
+        InputError: no such robot, or an adapter for a robot without adapter.
     """
     if is_adapted(name):
         return adapted(name, folder, adapter or {})

@@ -31,12 +31,12 @@ def robot_rows() -> list[Row]:
 
 
 def named_robot_facts(name: str) -> Row:
-    """What one robot is, and where its file is: of the package, or a path."""
+    """Facts about a robot, by name or path, with the path of its file."""
     return {"file": str(find_robot_file(name)), **robot_facts(Robot.load(name))}
 
 
 def robot_facts(robot: Robot) -> Row:
-    """What a robot is."""
+    """Facts about a robot."""
     body = robot.body
     across = max(max(pair) for pair in body.half_width_m)
     return {
@@ -55,7 +55,7 @@ def robot_facts(robot: Robot) -> Row:
 
 
 def simulator_facts(box: BlackBox) -> Row:
-    """What a simulator of another kind is."""
+    """Facts about a black-box simulator."""
     return {
         "robot": box.name,
         "engine": f"{box.engine}, steps of {1e3 * box.time_step:.4g} ms",

@@ -1,4 +1,4 @@
-"""Folders that runs write to: what may be written there, what was run, and whether it came to its end."""
+"""Folders of runs: write protection, record of the run, and its completion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RUN, CONFIG, LOG, CHECKPOINTS, PAGE = "run.json", "config.toml", "log.jsonl", "c
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
 SCHEMA_VERSION = 1
 NAMED_DIFFERENCES = 3
-# What a run computes does not depend on these; they say how it is headed and how far it goes.
+# Results of a run do not depend on these: title and length of the run.
 FREE_TO_CHANGE = (
     "experiment.title",
     "experiment.audit.minutes",
@@ -34,13 +34,14 @@ FREE_TO_CHANGE = (
 
 
 MOVABLE = ("experiment.data.fit", "experiment.data.test")
-# What runs of earlier versions meant where their settings say nothing.
+# Default of settings that a run's file does not state.
 MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
 
 
 class RunKind(NamedTuple):
-    """What a command writes: the first of ``results`` says that it has ended; whether it can be resumed; and whether
-    several programs may share its folder, each with rows of its own."""
+    """Output files of a command: the first of ``results`` marks its completion; whether it can be resumed; and whether
+    several programs may share its folder, each with rows of its own.
+    """
 
     results: tuple[str, ...]
     resumable: bool = False
@@ -72,20 +73,20 @@ def run_folder(
     resume: bool = False,
     overwrite: bool = False,
 ) -> Iterator[Path]:
-    """The folder of one run, which holds ``run.json`` and what is needed to run it again: ``config.toml``, the robot.
+    """The folder of one run, with ``run.json`` and the files needed to repeat it: ``config.toml``, the robot.
 
-    A run that has ended is not replaced, and one that was interrupted not started anew, unless ``overwrite`` asks for
-    it. A run goes on with the settings it began with.
+    A finished run is not replaced, and an interrupted run is not restarted, unless ``overwrite`` is set. A resumed run
+    keeps its settings.
 
     Args:
         out: the folder.
-        command: that runs, one of `COMMANDS`.
-        tables: of the experiment, where there is one; folder: that of its file.
+        command: name of the command, one of `COMMANDS`.
+        tables: tables of the experiment, if any; folder: folder of its file.
         options: settings of the command line that results depend on.
         data: hashes of the recordings, by their names.
-        texts: files that the tables name and no folder holds, such as the description of a robot made in Python.
+        texts: files named in the tables that exist in no folder, such as the description of a robot made in Python.
         resume: go on with the run that the folder holds, if any.
-        overwrite: start anew whatever the folder holds.
+        overwrite: start anew in any folder of this program.
 
     Yields:
         the folder.
@@ -101,7 +102,7 @@ def run_folder(
         settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
         check_folder(out, command, resume=resume, overwrite=overwrite)
         if resume and earlier is not None:
-            with TemporaryDirectory() as trial:  # a run that does not go on keeps what it was made of
+            with TemporaryDirectory() as trial:  # a run that does not continue keeps its files
                 _check_settings(out, earlier["settings"], settings | _brought_along(tables, folder, texts, Path(trial)))
         settings |= _brought_along(tables, folder, texts, out)
         if not resume:
@@ -159,7 +160,9 @@ def _held(out: Path, *, shared: bool) -> Iterator[None]:
 def _brought_along(
     tables: Mapping[str, Any] | None, folder: Path, texts: Mapping[str, str] | None, out: Path
 ) -> dict[str, Any]:
-    """The experiment as it is found from any folder, and the digest of its robot; ``out`` gets what it names."""
+    """The experiment with paths valid from any folder, and the digest of its robot; ``out`` gets copies of its
+    files.
+    """
     made = dict(texts or {})
     for name, text in made.items():
         write_text(out / name, text)
@@ -209,7 +212,7 @@ def _digest(path: Path) -> str:
 
 
 def _clear(out: Path, results: Sequence[str]) -> None:
-    """Remove what an earlier run of this command has left."""
+    """Remove the files of an earlier run of this command."""
     try:
         for name in (*results, LOG):
             (out / name).unlink(missing_ok=True)
@@ -256,8 +259,9 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
 
 
 def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise InputError where the run began with other settings; names the first few. Recordings of the same content may
-    have been moved."""
+    """Raise InputError if the run began with other settings; names the first few. Recordings of the same content may
+    have been moved.
+    """
     old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(plain(dict(now)), default=str))))
     if before.get("data") and before["data"] == now["data"]:
         for tables, name in product((old, new), MOVABLE):

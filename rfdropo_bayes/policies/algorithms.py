@@ -48,7 +48,7 @@ def algorithm_class(name: str, kind: str) -> Any:
 
 
 def check_critic(name: str, critic: str) -> None:
-    """Raise an InputError where the critic of an algorithm cannot see parameters."""
+    """Raise an InputError if the critic of an algorithm cannot see parameters."""
     if critic == "parameters" and name not in ACTOR_CRITIC:
         raise InputError(
             f"the critic of {name} cannot see parameters",
@@ -60,15 +60,15 @@ def check_critic(name: str, critic: str) -> None:
 def algorithm_options(
     name: str, kind: str, gamma: float, given: Mapping[str, Any], environments: int = 128
 ) -> dict[str, Any]:
-    """Arguments of an algorithm: ours for these tasks, then what was given.
+    """Arguments of an algorithm: the defaults for these tasks, overridden by ``given``.
 
     Args:
-        name: of the algorithm.
-        kind: of actions.
+        name: name of the algorithm.
+        kind: kind of actions.
         gamma: discount factor of one control period, unless ``given`` has another.
         given: options of the algorithm by Stable-Baselines3's own names; ``net_arch``, ``log_std_init`` and
             ``activation`` (tanh, relu or elu) may stand among them without ``policy_kwargs``.
-        environments: how many are simulated at once; a batch of PPO divides what they gather.
+        environments: number of environments simulated at once; a batch of PPO divides the rows they gather.
 
     Raises:
         InputError: an option that the algorithm does not have or no file can hold, or another activation.

@@ -67,7 +67,7 @@ def make_episodes(
 
     Args:
         task: name of the environment.
-        lanes: how many.
+        lanes: number of episodes simulated at once.
         simulator: to use as it is; made from the next arguments by default.
         robot: name, file or description; the task's own by default.
         mechanisms, precision, threads, integrator: see `trunk_simulator`.

@@ -1,4 +1,4 @@
-"""A critic that sees what a robot never shows: the parameters of the episode.
+"""A critic that sees the simulator's parameters of the episode, which a robot never shows.
 
 Only the actor is exported, so that the critic may know more (Pinto et al. 2018, "Asymmetric actor critic for
 image-based robot learning"). Environments append the parameters to the observation; the actor's network begins with the
@@ -21,7 +21,7 @@ from rfdropo_bayes.policies.randomisation import Randomisation
 from rfdropo_bayes.policies.spaces import FAR
 
 DRAWS, SEED = 512, 0
-"""Draws of a randomisation that say how far each parameter varies; the same in every process."""
+"""Number and seed of the draws that measure the variation of each parameter; the same in every process."""
 LIMIT = 10.0
 """Deviations beyond which a parameter counts as that far: the limit that `VecNormalize` has for observations."""
 
@@ -40,7 +40,7 @@ class VariedParameters(NamedTuple):
 
 
 def varied_parameters(randomisation: Randomisation) -> VariedParameters:
-    """What a critic of a training under this randomisation sees beside the observation.
+    """Parameters that vary under a randomisation, which a critic sees beside the observation.
 
     Raises:
         InputError: nothing differs between episodes.
@@ -133,7 +133,7 @@ class AsymmetricPolicy(ActorCriticPolicy):
 
 
 class _Networks(MlpExtractor):
-    """Hidden layers of actor and critic; those of the actor begin with the features before the unseen ones."""
+    """Hidden layers of actor and critic; the actor's layers read only the features before the parameters."""
 
     def __init__(self, features: int, unseen: int, **options: Any) -> None:
         super().__init__(features, **options)

@@ -1,7 +1,6 @@
 """Many episodes of a task at once, each lane with its own parameters, goal, commands and age.
 
-What Gymnasium and Stable-Baselines3 want of an environment differs in form only; `gym_env` and `vec_env` give this the
-one form or the other.
+Gymnasium and Stable-Baselines3 use different interfaces of an environment; `gym_env` and `vec_env` provide them.
 """
 
 from __future__ import annotations
@@ -36,20 +35,23 @@ from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 REDRAWS = 200
-"""Times that a lane whose initial state was not found is given other parameters. Of the ranges that uniform
-randomisation fits to the virtual trunk, one draw in eight hangs clear of the cube: one reset in 10^11 is given up."""
+"""Number of redraws for a lane whose initial state was not found. Under the uniform ranges of the virtual trunk one
+draw in eight hangs clear of the cube, so one reset in 10^11 fails.
+"""
 LEVER = 0.0175
-"""Half a side of the paper's cube [m]: where motion capture sees the points that tell how the cube is turned."""
+"""Half a side of the paper's cube [m]: distance from the centre of the points from which motion capture measures the
+cube's rotation.
+"""
 
 
 class EpisodeStep(NamedTuple):
-    """What came of an action in every lane."""
+    """Result of an action in every lane."""
 
     observation: Float[np.ndarray, "lane size"]
     reward: Float[np.ndarray, " lane"]
     terminated: Bool[np.ndarray, " lane"]
     truncated: Bool[np.ndarray, " lane"]
-    distance: Float[np.ndarray, " lane"]  # [m]; that of the last good state where the simulation failed
+    distance: Float[np.ndarray, " lane"]  # [m]; of the last good state if the simulation failed
     diverged: Bool[np.ndarray, " lane"]
     tension: Float[np.ndarray, " lane"]  # largest of any cable at the action's time steps [N]; NaN if none is told
     stopped: Bool[np.ndarray, " lane"]  # by the limit on tension
@@ -57,12 +59,12 @@ class EpisodeStep(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """How a task is played.
+    """Settings of a task.
 
     Attributes:
         actions, observed, period, step, history: see `layout_of`.
-        noise: standard deviation of white noise on what is seen of the markers and of points of the cube [m]. What a
-            marker has moved is the difference of two sightings, as on a robot.
+        noise: standard deviation of white noise on the observed positions of markers and cube [m]. A marker's
+            displacement is the difference of two observations, as on a robot.
         near: an episode ends within this distance of the goal [m]; None lets it go on, which keeps the reward of
             staying there.
         tension_limit: an episode ends once a cable pulls more [N], as drives stop then; None lets it pull.
@@ -84,19 +86,19 @@ class Episodes:
     Args:
         simulator: whose parameters are drawn, with mechanisms or without.
         task: goal and reward.
-        lanes: how many.
-        randomisation: where parameters come from.
-        settings: how the task is played.
+        lanes: number of episodes simulated at once.
+        randomisation: source of the parameters.
+        settings: settings of the task.
 
     Attributes:
-        layout: of observations and actions.
-        redrawn: parameter sets that were drawn anew because no initial state was found.
-        goal: of every lane [m].
-        parameters: of every lane, those that were drawn or given.
+        layout: layout of observations and actions.
+        redrawn: number of parameter sets redrawn because no initial state was found.
+        goal: goal of every lane [m].
+        parameters: drawn or given parameters of every lane.
 
     Raises:
         InputError: a randomisation that does not fit the simulator, a task that does not fit the robot, or a limit on
-            tensions that is not positive, or that the simulator does not tell.
+            tensions that is not positive, or a limit without tensions in the observation.
     """
 
     def __init__(
@@ -128,24 +130,24 @@ class Episodes:
         self.earlier = Earlier(settings.history - 1, lanes, len(self.layout.channels), 3 * len(self.shown))
 
     def seed(self, lane: int, seed: int | np.random.SeedSequence) -> None:
-        """Let a lane draw from a generator with this seed from now on; without, no two episodes are alike."""
+        """Let a lane draw from a generator with this seed from now on; unseeded lanes draw fresh entropy."""
         self.generators[lane] = np.random.default_rng(seed)
 
     def reset(
         self, rows: Sequence[int] | Int[np.ndarray, " row"], options: Sequence[Mapping[str, Any]] | None = None
     ) -> Float[np.ndarray, "row size"]:
-        """Begin an episode in some lanes; the others stay where they are.
+        """Begin an episode in some lanes; the others continue.
 
         Args:
             rows: lanes.
-            options: for each row what is not drawn: ``parameters``, values by name, and ``goal`` [m].
+            options: values that replace draws, for each row: ``parameters`` by name, and ``goal`` [m].
 
         Returns:
             The first observations of these rows.
 
         Raises:
-            InputError: an unknown option or parameter, values outside their bounds, no initial state after
-                `REDRAWS` draws, or a limit on tension below what cables pull in every lane without an action.
+            InputError: an unknown option or parameter, values outside their bounds, no initial state after `REDRAWS`
+                draws, or a limit on tension below the tension of every lane without an action.
         """
         refuse_lost_threads()
         rows = np.asarray(rows, dtype=int)
@@ -221,12 +223,13 @@ class Episodes:
         return distance_to(self.task, place, self.goal)
 
     def begun_with(self, lane: int) -> dict[str, Any]:
-        """What the episode of a lane began with, enough to begin it again as an option of `reset`."""
+        """Parameters and goal of a lane's episode, as options of `reset` that start it again."""
         return {"parameters": dict(self.parameters[lane]), "goal": self.goal[lane].tolist()}
 
     def _largest_tension(self, found: Observation, good: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
-        """Largest tension of any cable since the last action [N]; NaN where the simulator tells none, which is an error
-        in ``good`` lanes under a limit."""
+        """Largest tension of any cable since the last action [N]; NaN if the simulator reports none, which is an error
+        in ``good`` lanes under a limit.
+        """
         tension = np.full(self.lanes, np.nan)
         if found.peak is not None and self.simulator.cable_names:
             tension = np.asarray(found.peak, dtype=float).max(axis=1)
@@ -235,9 +238,9 @@ class Episodes:
         return tension
 
     def _compare_at_rest(self, rows: Int[np.ndarray, " row"]) -> None:
-        """Once, where all lanes have just begun: raise if a period without an action passes the limit in each.
+        """Raise if a period without an action passes the limit in every lane; runs once, after a reset of all lanes.
 
-        A session's first observation does not tell the tension of an arm that begins at rest.
+        A session's first observation does not contain the tension of an arm that begins at rest.
         """
         if self._compared or len(rows) < self.lanes:
             return
@@ -274,7 +277,7 @@ class Episodes:
         return self.session.reset(np.array(rows), values_of)
 
     def _take(self, rows: Int[np.ndarray, " row"], found: Observation) -> None:
-        """Let lanes be where an observation shows them, at the start of an episode."""
+        """Set the state of lanes from an observation, at the start of an episode."""
         if not len(rows):
             return
         self.marker = self.marker.copy()
@@ -290,7 +293,7 @@ class Episodes:
         self.seen_before[rows] = self.seen[rows]
 
     def _look(self, rows: Int[np.ndarray, " row"]) -> None:
-        """Let some lanes be seen, with the errors of motion capture."""
+        """Observe some lanes, with the errors of motion capture."""
         noise, count = self.settings.noise, self.marker[0].size
         if not noise:
             self.seen, self.seen_pose = self.marker, self.pose

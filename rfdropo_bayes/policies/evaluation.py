@@ -1,8 +1,8 @@
-"""Policies judged on the same episodes: success within a distance, with intervals.
+"""Evaluation of policies on the same episodes: success within a distance, with intervals.
 
-A case is what an episode starts from: parameters of the simulator and a goal. Policies that are compared see the same
+A case is the start of an episode: parameters of the simulator and a goal. Policies that are compared see the same
 cases, in the same order. An episode succeeds if the distance to the goal at its end is within a threshold, as in the
-paper's Table II. One that a failed simulation or the limit on tension ended fails at every threshold.
+paper's Table II. An episode that ends by a failed simulation or the tension limit fails at every threshold.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Act = Callable[[Float[np.ndarray, "lane size"]], np.ndarray]
 
 @dataclass(frozen=True)
 class Case:
-    """Where an episode starts: values of the simulator's parameters [SI] and the goal [m]."""
+    """Start of an episode: values of the simulator's parameters [SI] and the goal [m]."""
 
     parameters: Mapping[str, float]
     goal: tuple[float, ...]
@@ -36,15 +36,15 @@ class Case:
 
 @dataclass(frozen=True)
 class Episode:
-    """What came of a case.
+    """Result of one case.
 
     Attributes:
-        case: its index.
+        case: index of the case.
         distances: distance to the goal after every action [m].
         total: sum of rewards.
         diverged: whether the simulation failed; the episode then counts as a failure at every distance.
         actions: the actions taken, to see the episode again.
-        tension: largest tension of any cable [N]; NaN if none is told.
+        tension: largest tension of any cable [N]; NaN if the simulator reports none.
         stopped: whether a tension beyond the limit ended it; it then counts as a failure at every distance.
     """
 
@@ -76,20 +76,20 @@ def draw_cases(venv: Any, count: int, seed: int) -> list[Case]:
 
 
 def _first_seed(seed: int, *stream: int) -> int:
-    """Seeds of lanes count up from here: far from those of another seed or stream."""
+    """First seed of the lanes, which count up from it; far from the seeds of other streams."""
     return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0])
 
 
 def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int = 10_000) -> list[Episode]:
-    """Play every case once, with the same noise whatever the policy and however many cases are played at once.
+    """Play every case once. The noise depends neither on the policy nor on the number of lanes.
 
     Args:
         act: the policy; it sees observations as the environments give them.
         venv: environments that take ``parameters`` and ``goal`` as reset options and report ``distance`` and
             ``diverged`` in their info, and perhaps ``tension`` and ``stopped``.
-        cases: what to start from.
-        seed: of the noise.
-        longest: no episode has more actions.
+        cases: starts of the episodes.
+        seed: seed of the noise.
+        longest: most actions of an episode.
 
     Returns:
         an episode for every case, in order.
@@ -146,8 +146,9 @@ def success(episodes: Sequence[Episode], threshold: float, level: float = 0.95) 
 
 
 def peak_tension(episodes: Sequence[Episode]) -> dict[str, float] | None:
-    """Median and largest over episodes of their largest tension [N], and how many the limit stopped; None where no
-    tension is told. Episodes whose simulation failed do not count."""
+    """Median and largest over episodes of their largest tension [N], and the number of episodes that the limit stopped;
+    None without tensions. Episodes whose simulation failed do not count.
+    """
     known = [each.tension for each in episodes if not each.diverged and np.isfinite(each.tension)]
     if not known:
         return None
@@ -156,7 +157,7 @@ def peak_tension(episodes: Sequence[Episode]) -> dict[str, float] | None:
 
 
 def tension_sentence(pull: Mapping[str, float], limit: float | None) -> str:
-    """What `peak_tension` found, in words; ``limit`` on tension [N]."""
+    """Sentence about the result of `peak_tension`; ``limit`` on tension [N]."""
     words = f"Cables pull at most {pull['median']:.3g} N in half of the episodes, {pull['largest']:.3g} N in all"
     return f"{words}." if limit is None else f"{words}; the limit of {limit:g} N stopped {pull['stopped']:.0f} of them."
 
@@ -174,12 +175,12 @@ def interquartile_mean(
     Args:
         groups: episodes of each training seed (Agarwal et al. 2021, "Deep RL at the edge of the statistical
             precipice").
-        seed: of the bootstrap.
-        level: of the interval.
-        resamples: of the bootstrap.
+        seed: seed of the bootstrap.
+        level: level of the interval.
+        resamples: number of bootstrap samples.
 
     Returns:
-        the mean and the ends of its interval; these are not a number where a group has a single episode.
+        the mean and the ends of its interval; the ends are NaN if a group has a single episode.
     """
     distances = [np.array([episode.distance for episode in group]) for group in groups]
 

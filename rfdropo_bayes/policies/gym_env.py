@@ -23,7 +23,7 @@ class TrunkEnv(gymnasium.Env):
         render_mode: ``"rgb_array"`` or None.
         options: see `make_episodes`.
 
-    ``reset`` takes the options ``parameters`` and ``goal``; its info holds what the episode began with.
+    ``reset`` takes the options ``parameters`` and ``goal``; its info holds both.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / PERIOD)}  # noqa: RUF012
@@ -94,14 +94,15 @@ class TrunkVectorEnv(VectorEnv):
         return seen, self._begun()
 
     def _begun(self) -> dict[str, np.ndarray]:
-        """What the episodes of all lanes began with."""
+        """Parameters and goals of the episodes in all lanes."""
         parameters = np.empty(self.num_envs, dtype=object)
         parameters[:] = [dict(values) for values in self.episodes.parameters]
         return {"parameters": parameters, "goal": self.episodes.goal.copy()}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One action in every lane. Where episodes end, ``final_obs`` and ``final_info`` tell of them, and
-        ``parameters`` and ``goal`` of those that begin."""
+        """One action in every lane. If an episode ends, ``final_obs`` and ``final_info`` describe it; ``parameters``
+        and ``goal`` describe its successor.
+        """
         step = self.episodes.act(np.asarray(actions))
         info: dict[str, Any] = {name: getattr(step, name) for name in ("distance", "diverged", "tension", "stopped")}
         seen = step.observation

@@ -1,10 +1,10 @@
 """A trained policy as ONNX: normalisation, network, clipping and the map to commands in one graph.
 
 The graph has one input, ``observation`` (float32, batch by size), and two float32 outputs. ``action`` (batch by
-channel) is what to add to each channel's command in a control period [m or rad]. ``raw`` is the action as the
-environment takes it: a number from -1 to 1 for every channel, or the index of a discrete action (batch by 1). The
-metadata hold the layout (`PolicyLayout.to_json`) and where the policy comes from. The graph is built node by node:
-PyTorch's own exporter needs one more package, and would leave the normalisation out.
+channel) is the change of each channel's command per control period [m or rad]. ``raw`` is the action as the environment
+takes it: a number from -1 to 1 for every channel, or the index of a discrete action (batch by 1). The metadata hold the
+layout (`PolicyLayout.to_json`) and the origin of the policy. The graph is built node by node: PyTorch's own exporter
+needs one more package, and would leave the normalisation out.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Graph:
         return name
 
     def apply(self, kind: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
-        """An operation on the last result and further inputs; ``name`` is that of its result."""
+        """An operation on the last result and further inputs; ``name`` names its result."""
         from onnx import helper
 
         name = name or f"n{len(self.nodes)}"
@@ -172,7 +172,7 @@ class ExportedPolicy:
         self.facts = facts
 
     def change(self, observation: Float[np.ndarray, "lane size"]) -> Float[np.ndarray, "lane channel"]:
-        """What to add to each channel's command [m or rad]."""
+        """Change of each channel's command [m or rad]."""
         return self._session.run(["action"], {"observation": np.asarray(observation, dtype=np.float32)})[0]
 
     def act(self, observation: Float[np.ndarray, "lane size"]) -> np.ndarray:

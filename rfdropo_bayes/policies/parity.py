@@ -2,7 +2,7 @@
 
 Some options of an algorithm change the network in ways that an export may not follow. A training of hours must not end
 there, so that the untrained policy is exported and compared first: as it is, and with numbers drawn for its weights,
-because the actions of an untrained policy are near zero, where a tanh or a limit that is missing does not show.
+because an untrained policy's actions are near zero, and hide a missing tanh or limit.
 """
 
 from __future__ import annotations
@@ -23,26 +23,28 @@ from rfdropo_bayes.robots.policy_layout import PolicyLayout
 
 ROWS = 512
 SMALLEST, USUAL, LARGEST = 0.01, 3.0, 20.0
-"""Observations in deviations from their mean: from almost none to what a trained policy meets, and to twice what a
-normalisation lets through."""
+"""Observations in deviations from their mean: nearly zero, usual for a trained policy, and twice the clipping limit of
+a normalisation.
+"""
 DEVIATION = 0.1
-"""Of observations that are not normalised [m]."""
+"""Deviation of observations without normalisation [m]."""
 
 TOLERANCE = 1e-3
-"""Of a continuous action, whose ends are -1 and 1. Float32 in another order changes it by less than a tenth of this; a
-missing layer by a hundred times as much."""
+"""Largest difference of a continuous action, which ranges from -1 to 1. The order of float32 operations causes less
+than a tenth of it; a missing layer causes a hundred times it.
+"""
 TIES = 0.01
-"""Share of discrete actions that may differ: where two are worth the same to the last bit, either is right."""
+"""Share of discrete actions that may differ: if two actions have equal values to the last bit, both are right."""
 
 OUTPUT = 4.0
-"""Deviation of the last layer's output with drawn weights, in deviations of its input: twice where gSDE limits it."""
+"""Deviation of the last layer's output with drawn weights, in deviations of its input: twice the limit of gSDE."""
 
 
 def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float[np.ndarray, "row size"]:
     """Observations from near their mean to ``largest`` deviations away from it, as the environments give them.
 
     Args:
-        normalisation: the ``VecNormalize`` of the policy, or None where it sees metres as they are.
+        normalisation: the ``VecNormalize`` of the policy, or None for observations in metres.
         size: of an observation.
         largest: deviations of the last row.
     """
@@ -103,8 +105,8 @@ def _compare(model: Any, normalisation: Any, act: Act, layout: PolicyLayout, pat
 def _drawn(model: Any, normalisation: Any) -> Iterator[None]:
     """A model with drawn weights and a normalisation with drawn moments, for as long as the context lasts.
 
-    Tensors and moments are exchanged and put back, not changed: what is trained afterwards is what was there before,
-    bit for bit.
+    Tensors and moments are exchanged and put back, not changed: training then starts from the original values, bit for
+    bit.
     """
     import torch
 

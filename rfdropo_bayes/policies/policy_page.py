@@ -1,4 +1,4 @@
-"""report.html of a training: how it went, how often the policy succeeds, for which draws it fails, what to try next."""
+"""report.html of a training: learning curve, success rate, draws for which the policy fails, and next steps."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ EVERY = 2  # frames of an episode that a film shows
 
 
 class Played(NamedTuple):
-    """What a policy did under its own randomisation.
+    """Episodes of a policy under its own randomisation.
 
     Attributes:
         cases: parameters and goals of the episodes.
-        episodes: what came of them.
-        films: GIFs of single episodes by what they show.
+        episodes: results of the cases.
+        films: GIFs of single episodes, by title.
     """
 
     cases: Sequence[Case]
@@ -68,7 +68,7 @@ class Played(NamedTuple):
 
     @property
     def distances(self) -> np.ndarray:
-        """From the goal at the end of every episode [m]; infinite where a simulation or the drives failed."""
+        """Distance from the goal at the end of every episode [m]; infinite if simulation or drives failed."""
         return np.array([episode.distance for episode in self.episodes])
 
     @property
@@ -140,7 +140,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
 
 
 def next_steps(summary: Mapping[str, Any], played: Played) -> list[str]:
-    """What to try next, each a sentence with its ground."""
+    """Recommended next steps, each a sentence with its reason."""
     found = []
     medians = [np.inf if row["distance_median"] is None else row["distance_median"] for row in summary["curve"]]
     before = medians[(2 * len(medians)) // 3 - 1] if len(medians) > 2 else np.inf
@@ -149,7 +149,7 @@ def next_steps(summary: Mapping[str, Any], played: Played) -> list[str]:
         found.append(f"The median distance fell from {ratio} in the last third of the training: raise training.steps.")
     if played.stopped:
         words = f"{played.stopped} of {len(played.episodes)} episodes were stopped by the limit on tension"
-        found.append(f"{words}: train longer, or raise training.tension_limit where the motors bear more.")
+        found.append(f"{words}: train longer, or raise training.tension_limit if the motors allow more.")
     if played.failed:
         words = f"{played.failed} of {len(played.episodes)} simulations failed"
         found.append(f"{words}: see for which parameters below, and shorten simulator.time_step or narrow their range.")
@@ -159,8 +159,8 @@ def next_steps(summary: Mapping[str, Any], played: Played) -> list[str]:
         if rank is not None and rank.pvalue * len(played.varied) < SIGNIFICANT and abs(rank.statistic) > STRONG:
             side = "large" if rank.statistic > 0.0 else "small"
             found.append(
-                f"Episodes end farther from the goal where {name} is {side} (rank correlation {rank.statistic:.2f}): "
-                "train longer, or record what determines it better."
+                f"Episodes end farther from the goal when {name} is {side} (rank correlation "
+                f"{rank.statistic:.2f}): train longer, or record motions that determine it better."
             )
     found.append(
         "It has seen a simulator only: play it on another model with rfdropo evaluate, then on simulated drives."

@@ -1,4 +1,4 @@
-"""Where the parameters of an episode come from: a posterior, RF-DROPO's phi, uniform ranges, or one point."""
+"""Sources of the parameters of an episode: a posterior, RF-DROPO's phi, uniform ranges, or one point."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Randomisation(Protocol):
 
     @property
     def sha256(self) -> str:
-        """Digest of what it was made from."""
+        """Digest of its inputs."""
         ...
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -64,7 +64,7 @@ class Point:
 
     @property
     def sha256(self) -> str:
-        """Of the values."""
+        """Digest of the values."""
         return _digest(dict(self.values))
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -91,7 +91,7 @@ class Uniform:
 
     @property
     def sha256(self) -> str:
-        """Of the ranges."""
+        """Digest of the ranges."""
         return _digest({name: list(ends) for name, ends in self.ranges.items()})
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -113,7 +113,7 @@ class Phi:
 
     @property
     def sha256(self) -> str:
-        """Of the normals."""
+        """Digest of the normals."""
         return _digest({name: dict(normal) for name, normal in self.normals.items()})
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -143,12 +143,12 @@ class Draws:
 
 @dataclass(frozen=True)
 class Days:
-    """Rows of a posterior, each on a day of its own that no fit has seen.
+    """Rows of a posterior, each in a new session that no fit has seen.
 
     Attributes:
-        draws: the rows; their parameters are what all days share.
-        spreads: standard deviations between days of the parameters that differ, one for each row.
-        ends: hard bounds of these parameters, beyond which no day is.
+        draws: the rows; their parameters are shared by all sessions.
+        spreads: standard deviations between sessions of the varying parameters, one value per row.
+        ends: hard bounds of these parameters.
     """
 
     draws: Draws
@@ -163,7 +163,7 @@ class Days:
 
     @property
     def sha256(self) -> str:
-        """Of rows and spreads."""
+        """Digest of rows and spreads."""
         return _digest([self.draws.sha256, {name: column.tolist() for name, column in self.spreads.items()}])
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -178,11 +178,11 @@ class Days:
 
 @dataclass(frozen=True)
 class Layers:
-    """Several randomisations at once; where two vary one parameter, the later one has the say.
+    """Several randomisations at once; if two vary the same parameter, the later part wins.
 
     Attributes:
-        parts: from what is held at one value to what differs from episode to episode.
-        kind: that of the part that gives the whole its name.
+        parts: randomisations, from fixed values to values that differ between episodes.
+        kind: kind of the part that names the whole.
     """
 
     parts: tuple[Randomisation, ...]
@@ -195,7 +195,7 @@ class Layers:
 
     @property
     def sha256(self) -> str:
-        """Of all parts."""
+        """Digest of all parts."""
         return _digest([part.sha256 for part in self.parts])
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -247,10 +247,10 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
 def spread_out(randomisation: Randomisation, width: float, specs: Sequence[ParameterSpec]) -> Randomisation:
     """A posterior or phi whose draws are ``width`` times as far from their middle, up to the parameters' hard bounds.
 
-    Of a parameter that is positive, distances are those of logarithms: factors stay factors.
+    Positive parameters are spread in logarithms.
 
     Raises:
-        InputError: ranges or one point, which say themselves how wide they are.
+        InputError: ranges or one point, whose width is given by the user.
     """
     if isinstance(randomisation, Layers):
         *held, last = randomisation.parts
@@ -284,17 +284,17 @@ def _spread_rows(draws: Draws, width: float, known: Mapping[str, ParameterSpec])
 
 
 def read_posterior(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox | None = None) -> Draws:
-    """Draws of a saved posterior, of the parameters that the simulator has: noise is none, nor what belongs to one
-    recording.
+    """Draws of a saved posterior, restricted to the simulator's parameters; noise and values of single recordings are
+    left out.
 
     Args:
         path: posterior.nc, or the run folder that holds it.
-        specs: parameters of the simulator.
-        robot: that is simulated, for which mechanisms have their parameters.
+        specs: the simulator's parameters.
+        robot: simulated robot, which determines the parameters of mechanisms.
 
     Raises:
-        InputError: no such file, no posterior of ours, one that shares no parameter with the simulator, or one with a
-            mechanism that the simulator lacks.
+        InputError: no such file, no posterior of ours, a posterior that shares no parameter with the simulator, or a
+            posterior with a mechanism that the simulator lacks.
     """
     path = Path(path)
     file = path / POSTERIOR if path.is_dir() else path
@@ -354,7 +354,7 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
 
 
 def _require_mechanisms(missing: Sequence[str], robot: Robot | BlackBox | None, where: str) -> None:
-    """Raise an InputError where a parameter that the simulator lacks is one of a mechanism of the library."""
+    """Raise an InputError if a parameter that the simulator lacks belongs to a mechanism of the library."""
     for name in REGISTRY:
         (mechanism,) = mechanisms_named([name], robot)
         own = [spec.name for spec in mechanism.parameters if spec.name in missing]

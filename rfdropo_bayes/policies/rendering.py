@@ -27,7 +27,7 @@ PAPER, PLATE, GRID, INK = (250, 250, 250), (232, 232, 228), (205, 205, 200), (40
 LIGHT = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
 GOAL_RADIUS = 0.004
 THICKNESS = 0.03
-"""Of a black box, radius of the line that is drawn through its markers, over its length."""
+"""Radius over length of the line that is drawn through the markers of a black box."""
 
 
 class View(NamedTuple):
@@ -60,7 +60,7 @@ def view_of(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> View:
 
 
 def picture(episodes: Episodes, lane: int) -> UInt8[np.ndarray, "height width 3"]:
-    """What a lane looks like now."""
+    """Picture of a lane's present state."""
     robot = episodes.robot
     turn = upright(robot.gravity)
     line, width = _body(episodes, lane)
@@ -94,11 +94,11 @@ def frames_of(
     parameters: Mapping[str, float],
     goal: Sequence[float],
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """An episode again, a picture before every action and one at its end.
+    """Replay an episode: a picture before every action and a final picture.
 
     Args:
         episodes: lanes of the same task; all of them are reset.
-        actions: that were taken; ``parameters`` [SI] and ``goal`` [m]: what the episode started from.
+        actions: actions of the episode; ``parameters`` [SI] and ``goal`` [m]: its start.
     """
     option = {"parameters": dict(parameters), "goal": list(goal)}
     episodes.reset(np.arange(episodes.lanes), [option] * episodes.lanes)
@@ -127,7 +127,7 @@ def _body(episodes: Episodes, lane: int) -> tuple[Float[np.ndarray, "point 3"], 
 
 
 def _stage(episodes: Episodes, turn: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box that is shown: where the trunk can be, goals, cube and plate."""
+    """Corners of the box that is shown: reach of the trunk, goals, cube and plate."""
     task, robot = episodes.task, episodes.robot
     goals = [list(task.goal_low), list(task.goal_high)]
     if robot.body is None:
@@ -206,7 +206,7 @@ def _draw_shadow(draw: ImageDraw.ImageDraw, view: View, line: np.ndarray, width:
 
 
 def _draw_cables(draw: ImageDraw.ImageDraw, view: View, episodes: Episodes, line: np.ndarray, turn: np.ndarray) -> None:
-    """Cables along the body, on the side where their guides are; pulled ones are drawn thicker."""
+    """Cables along the body, on the side of their guides; pulled cables are drawn thicker."""
     robot = episodes.robot
     length = float(robot.body.station_m[-1])
     at = np.linspace(0.0, length, len(line))

@@ -1,8 +1,8 @@
-"""The tasks of the paper: goals, reward, what is observed and what an action does. No JAX, no simulator.
+"""The tasks of the paper: goals, reward, observations and actions. No JAX, no simulator.
 
-Facts of the scene and of the reward are those of the authors' SOFA environments (RF-DROPO, section IV, and their code).
-Differences, each with its reason: an episode does not end near the goal unless asked to, as that forfeits the positive
-reward of staying there; and the cube starts at rest on its plate, where SOFA's falls 23 mm first.
+Facts of the scene and of the reward are taken from the authors' SOFA environments (RF-DROPO, section IV, and their
+code). Differences, each with its reason: an episode does not end near the goal unless asked to, as that forfeits the
+positive reward of staying there; and the cube starts at rest on its plate, whereas SOFA's cube first falls 23 mm.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ PERIOD = 0.05
 STEP = 0.005
 """Most that an action moves a cable [m], unless said otherwise."""
 TRACKED_HEIGHTS = (0.0363, 0.0792, 0.1292, 0.179)
-"""Where motion capture sees the physical trunk [m along the axis]."""
+"""Heights along the axis at which motion capture tracks the physical trunk [m]."""
 
 
 class Commanded(Protocol):
-    """What a task asks of a robot, or of what stands in its place."""
+    """Interface that a task needs of a robot or its substitute."""
 
     name: str
 
@@ -62,7 +62,7 @@ class Commanded(Protocol):
         """Least and greatest command of each channel."""
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
-        """Size of each channel's command that pulls a cable by so much [m], or is as large where nothing is wound."""
+        """Size of each channel's command that pulls a cable by ``pull`` [m]; ``pull`` itself if nothing is wound."""
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
         """Indices of the markers nearest to these heights [m] of the undeformed body."""
@@ -73,9 +73,9 @@ class Task:
     """A goal for the tip, or for a cube that the trunk pushes.
 
     Attributes:
-        name: of the environment.
+        name: name of the environment.
         robot: the robot it is made for.
-        push: whether a cube stands before the trunk; its centre is then what must reach the goal.
+        push: whether a cube stands before the trunk; its centre must then reach the goal.
         goal_low, goal_high: corners of the box that goals are drawn from [m], in the frame of the base.
         axes: coordinates in which the distance to the goal is measured.
         gamma: discount factor of one action with which the task is learnt well.
@@ -125,11 +125,11 @@ def reward(
 
 
 NEAREST = 0.005
-"""Of episodes that begin nearer than this to their goal [m], rewards are those of one that began there: the potential
-goes through zero at a millimetre."""
+"""Least initial distance that scales the rewards [m]: the potential goes through zero at a millimetre."""
 FLOOR = -1.05
-"""Reward for each action that a failed simulation leaves undone: that of being about twice as far off as at first. For
-one that a tension beyond the limit leaves undone the worst reward of the episode counts where it is lower still."""
+"""Reward for each action that is missing after a failed simulation: the reward at about twice the initial distance.
+After a stop by the tension limit the episode's worst reward is used if it is lower.
+"""
 
 
 def distance_to(
@@ -168,12 +168,13 @@ def layout_of(
         observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
             marker has moved since the last action; "markers", the same with the markers that motion capture sees.
         period: from one action to the next [s].
-        step: most that an action moves a channel, in the unit of its commands, or that of each; by default as much as
-            pulls a cable by 5 mm, see `Commanded.command_of`.
-        history: actions of which the commands and the markers' movements are seen, from the last one back.
+        step: largest change of a channel per action, in the unit of its commands, or a value per channel; by default
+            the command that pulls a cable by 5 mm, see `Commanded.command_of`.
+        history: number of past actions whose commands and marker displacements are observed.
 
     Raises:
-        InputError: a cube for a robot that has none, commands that nothing limits, or a history of what is not seen.
+        InputError: a cube for a robot that has none, commands that nothing limits, or a history of unobserved
+            quantities.
     """
     if task.push and robot.push is None:
         raise InputError(f"robot {robot.name!r} has no cube to push", where="task", remedy="use a reaching task")
@@ -213,7 +214,7 @@ def layout_of(
 
 
 def observed_of(layout: PolicyLayout, markers: int) -> Observed:
-    """Which observation of a robot with so many markers a layout has; see `layout_of`."""
+    """Kind of observation of a layout for ``markers`` markers; see `layout_of`."""
     sizes = {part.name: part.size for part in layout.observation}
     if "commands" not in sizes:
         return "paper"
@@ -235,7 +236,7 @@ def parts_seen(
     commands: Float[np.ndarray, "lane channel"],
     pose: Float[np.ndarray, "lane 7"] | None,
 ) -> dict[str, np.ndarray]:
-    """Pieces of an observation that a layout may ask for, from what is measured now and one action ago."""
+    """Pieces of an observation that a layout may ask for, from the measurements now and one action ago."""
     seen, moved = marker[:, shown], (marker - before)[:, shown]
     lanes = len(goal)
     found = {

@@ -1,8 +1,8 @@
-"""Training in legs: each starts from a checkpoint, so that a run that was killed goes on as if it had not been.
+"""Training in legs: each starts from a checkpoint, so that a killed run continues without a trace.
 
 At the end of a leg the policy is evaluated on the same cases as before, and everything is saved. The next leg begins
-with all environments reset and all generators seeded by the run's seed and the leg's number, in the same process or in
-a new one. The learning curve therefore does not depend on interruptions.
+with all environments reset and all generators seeded by the run's seed and the leg's number, in the same or a new
+process. The learning curve therefore does not depend on interruptions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rfdropo_bayes.policies.training_config import TrainingTable
 
 EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
 CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
-LAST, BEST = "", "best_"  # what files of a checkpoint begin with
+LAST, BEST = "", "best_"  # prefixes of a checkpoint's files
 STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")
 """Keys of a checkpoint's state.json."""
 
@@ -42,17 +42,17 @@ in reports/table2/README.md."""
 
 @dataclass(frozen=True)
 class Trained:
-    """The policy of the evaluation with the highest reward: learning goes up and down until its end.
+    """The policy of the evaluation with the highest reward: the last evaluation need not be the best.
 
     Attributes:
-        model: of Stable-Baselines3.
+        model: model of Stable-Baselines3.
         normalisation: the ``VecNormalize`` around its environments, or None.
         curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m],
-            infinite where episodes have no end; episodes whose simulation failed; where tensions are told, median and
-            largest over episodes of their largest [N], and episodes that the limit stopped.
+            infinite without an end; episodes whose simulation failed; with tensions, median and maximum of the
+            episodes' largest tension [N], and the number of episodes stopped by the limit.
         diverged: training episodes that ended because the simulation failed.
-        seconds: of all legs.
-        redrawn: parameter sets for which no initial state was found, and others drawn.
+        seconds: run time of all legs.
+        redrawn: number of parameter sets redrawn because no initial state was found.
     """
 
     model: Any
@@ -88,15 +88,15 @@ def train(
     """Train a policy.
 
     Args:
-        environments: makes so many environments as one ``VecEnv`` with a ``layout``, a ``randomisation``, a ``log`` and
-            how many parameter sets it has ``redrawn``.
+        environments: makes the given number of environments as one ``VecEnv`` with a ``layout``, a ``randomisation``, a
+            ``log`` and the count ``redrawn``.
         table: algorithm and budget.
-        out: folder for ``log.jsonl``, ``episodes.jsonl`` (what every training episode began with and how it ended),
-            TensorBoard's files and the checkpoint.
-        seed: of everything.
+        out: folder for ``log.jsonl``, ``episodes.jsonl`` (start and end of every training episode), TensorBoard's files
+            and the checkpoint.
+        seed: seed of all random numbers.
         gamma: discount factor of a control period, unless the options have one.
         resume: go on from the checkpoint in ``out``.
-        fingerprint: what a checkpoint must agree with: settings, posterior, versions.
+        fingerprint: settings, posterior and versions that a checkpoint must match.
         show: progress on stderr; None draws a bar on a terminal, and prints a line now and then elsewhere.
 
     Raises:
@@ -174,7 +174,7 @@ def _begin(
     model, normalisation = _load(maker, venv, table, folder, LAST, tensorboard)
     if getattr(model, "replay_buffer", None) is not None:
         if not (folder / REPLAY).exists():
-            remedy = "start anew with --overwrite: without what it has seen, the run would go on as another one"
+            remedy = "start anew with --overwrite: without its history the run would not continue the same training"
             raise InputError(f"the checkpoint has no {REPLAY}", where=str(folder), remedy=remedy)
         model.load_replay_buffer(folder / REPLAY)
     return model, normalisation
@@ -193,7 +193,7 @@ def _load(
 
 
 def _learnt_in(around: Any, table: TrainingTable) -> Any:
-    """The environments that a model learns in: those that a policy acts in, with more to see for its critic."""
+    """Environments for training: the policy's environments, with further observations for the critic."""
     if table.critic == "observation":
         return around
     from rfdropo_bayes.policies.critic import ParametersBeside
@@ -202,7 +202,7 @@ def _learnt_in(around: Any, table: TrainingTable) -> Any:
 
 
 def _policy_class(around: Any, table: TrainingTable, options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-    """What Stable-Baselines3 makes a policy of, and the options with what this needs to know."""
+    """Policy class for Stable-Baselines3, and the options completed for it."""
     if table.critic == "observation":
         return "MlpPolicy", options
     from rfdropo_bayes.policies.critic import AsymmetricPolicy
@@ -264,7 +264,7 @@ def _leg(
 
 def _failures(steps: int) -> Any:
     """A callback that counts training episodes whose simulation failed, has schedules count the whole run's steps, and
-    stops where Ctrl-C was pressed twice.
+    stops if Ctrl-C was pressed twice.
 
     Stable-Baselines3 imports are heavy, so that the class is made here.
     """
@@ -286,7 +286,7 @@ def _failures(steps: int) -> Any:
 
 def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
     distance = np.array([episode.distance for episode in episodes])
-    # Of an infinite neighbour that has no weight in a quantile, NumPy makes NaN.
+    # NumPy returns NaN for a quantile with an infinite neighbour of zero weight.
     found = np.quantile(np.where(np.isfinite(distance), distance, NO_END), [0.05, 0.5, 0.95])
     low, middle, high = np.where(found > 1e-100 * NO_END, np.inf, found)
     pull = peak_tension(episodes)
@@ -301,7 +301,7 @@ def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint beside the last one, then put it in its place: a kill leaves one of the two."""
+    """Write a checkpoint beside the previous checkpoint, then replace it: a kill leaves one of the two."""
     partial = folder.with_name(f"{CHECKPOINT}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -359,7 +359,7 @@ def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None
         )
     before = json.loads(json.dumps(state["known"]))
     now = json.loads(json.dumps(known))
-    # A checkpoint of an earlier version lacks keys that came later: it was made with what they are by default.
+    # Keys that a checkpoint lacks have their default.
     before["table"] = TrainingTable().model_dump(mode="json") | before["table"]
     changed = [name for name in now if name != "table" and now[name] != before.get(name)]
     changed += [name for name in now["table"] if name != "steps" and now["table"][name] != before["table"].get(name)]

@@ -21,7 +21,7 @@ class TrainingTable(BaseModel):
     observation: Literal["full", "paper", "markers"] = Field(
         default="full",
         description="full: centre line, goal, object, cable levels and changes; paper: without cable levels and "
-        "changes; markers: what motion capture sees of the robot, with cable levels and changes",
+        "changes; markers: the markers seen by motion capture, with cable levels and changes",
     )
     period: float = Field(default=0.05, gt=0.0, description="time from one action to the next [s]")
     step: float | None = Field(
@@ -30,12 +30,12 @@ class TrainingTable(BaseModel):
         description="most that an action moves a command, in its unit; 5 mm of cable by default, or a twentieth of the "
         "range of commands that are no lengths",
     )
-    noise: float = Field(default=0.0, ge=0.0, description="white noise on what is seen of the markers [m]")
+    noise: float = Field(default=0.0, ge=0.0, description="white noise on the observed markers [m]")
     history: int = Field(
         default=1,
         ge=1,
         le=10,
-        description="actions whose commands, and movements of the markers since, are seen, from the last one back",
+        description="number of past actions whose commands and marker displacements are observed",
     )
     tension_limit: float | None = Field(
         default=None,
@@ -48,19 +48,19 @@ class TrainingTable(BaseModel):
     )
     critic: Literal["observation", "parameters"] = Field(
         default="observation",
-        description="what the critic of PPO or A2C sees in training: the observation, or also the parameters that "
+        description="input of the critic of PPO or A2C in training: the observation, or also the parameters that "
         "differ between episodes; the policy never sees them",
     )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(
         default=False,
-        description="lower the learning rate in proportion to what is left of the steps, from evaluation to evaluation",
+        description="lower the learning rate in proportion to the remaining steps, from evaluation to evaluation",
     )
     environments: int = Field(default=128, ge=1, le=4096, description="environments that are simulated at once")
     randomisation: Literal["posterior", "phi", "uniform", "none"] = Field(
         default="none",
-        description="where every episode's parameters come from: draws of a posterior, RF-DROPO's phi, the ranges of "
-        "[training.ranges], or nowhere: nominal and fixed values",
+        description="source of every episode's parameters: draws of a posterior, RF-DROPO's phi, the ranges of "
+        "[training.ranges], or none: nominal and fixed values",
     )
     source: str | None = Field(
         default=None, description="run folder or posterior.nc that the posterior or phi is read from"
@@ -69,15 +69,17 @@ class TrainingTable(BaseModel):
         default=1.0,
         gt=0.0,
         le=10.0,
-        description="draws of the posterior or of phi are so many times as far from their middle, up to hard bounds",
+        description=(
+            "factor by which draws of the posterior or of phi are spread about their middle, up to hard bounds"
+        ),
     )
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="lowest and highest value of each parameter, for uniform randomisation"
     )
     start: dict[str, tuple[float, float]] = Field(
         default_factory=dict,
-        description="lowest and highest value of what differs from episode to episode whatever the randomisation, such "
-        "as where the cube stands",
+        description="lowest and highest value of parameters that differ between episodes under any randomisation, "
+        "such as the cube's position",
     )
     goals: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
         default=None, description="corners of the box that goals are drawn from [m]; the task's own by default"

@@ -21,13 +21,13 @@ class TrunkVecEnv(VecEnv):
 
     Args:
         episodes: the lanes.
-        log: file that gets one JSON line per finished episode: what it began with and how it ended. An episode can be
-            begun again with that as an option of a reset.
+        log: file that gets one JSON line per finished episode: its start and its end. The start, as an option of a
+            reset, begins the episode again.
 
     The info of every step holds ``distance`` [m], ``diverged``, ``tension`` [N], the largest since the step before, and
     ``stopped``, whether it was beyond the limit; at the end of an episode also ``terminal_observation``,
-    ``TimeLimit.truncated``, ``episode`` (r: sum of rewards, l: actions), and what it began with: ``parameters`` and
-    ``goal``. ``reset_infos`` holds what the present episode of each lane began with.
+    ``TimeLimit.truncated``, ``episode`` (r: sum of rewards, l: actions), and its start: ``parameters`` and ``goal``.
+    ``reset_infos`` holds the start of each lane's present episode.
     """
 
     def __init__(self, episodes: Episodes, log: Path | None = None) -> None:
@@ -45,7 +45,7 @@ class TrunkVecEnv(VecEnv):
 
     @property
     def randomisation(self) -> Randomisation:
-        """Where the parameters of episodes come from."""
+        """Source of the parameters of episodes."""
         return self.episodes.randomisation
 
     def reset(self) -> np.ndarray:
@@ -85,7 +85,7 @@ class TrunkVecEnv(VecEnv):
         return seen, step.reward.astype(np.float32), done, infos
 
     def _finish(self, ended: np.ndarray, step: EpisodeStep, infos: list[dict[str, Any]]) -> None:
-        """Say how episodes ended, in their infos and in the log."""
+        """Write the ends of episodes to their infos and to the log."""
         lines = []
         for lane in ended:
             length, total = int(self.episodes.age[lane]), float(self.total[lane])

@@ -1,4 +1,4 @@
-"""Draws and predictions on disk: the one room that knows ArviZ and its version."""
+"""Draws and predictions on disk: the only room that depends on ArviZ."""
 
 from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, piled_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products

@@ -1,4 +1,4 @@
-"""Whether draws are piled up at a bound, however wide the bounds are, or lie where the prior hardly is."""
+"""Whether draws are piled up at a bound, for bounds of any width, or lie in a region of little prior mass."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def piled_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarit
     Its outer 5 % quantile then lies within a tenth of a standard deviation of that end.
 
     Args:
-        draws: of one parameter.
-        low, high: ends of its range; infinite where there is none.
+        draws: draws of one parameter.
+        low, high: ends of its range; infinite without an end.
         logarithmic: compare positive draws in logarithms.
     """
     if logarithmic and np.all(draws > 0):
@@ -35,11 +35,11 @@ def piled_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarit
 
 
 def contradicts(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) -> bool:
-    """Whether the median of a posterior lies in the outermost 1 % of its prior, and where that is sparse; False if too
-    few draws tell.
+    """Whether the median of a posterior lies in the outermost 1 % of its prior, in a region of low prior density; False
+    if there are too few draws.
 
-    An end of a wide uniform prior, or zero of a half-normal one, is outermost and as dense as any other place; so is,
-    to draws, zero of a log-normal one that ranges over decades.
+    The ends of a wide uniform prior, zero of a half-normal prior, and zero of a log-normal prior over decades are
+    outermost but dense.
 
     Args:
         draws: of one parameter's posterior.

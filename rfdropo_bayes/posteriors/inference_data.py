@@ -1,4 +1,6 @@
-"""Posteriors as trees of datasets, in NetCDF and as ArviZ has them; what depends on ArviZ's version is here."""
+"""Posteriors as trees of datasets, in NetCDF and as ArviZ has them; all code that depends on ArviZ's version is
+here.
+"""
 
 from __future__ import annotations
 
@@ -45,16 +47,15 @@ def to_tree(
     parameters: Sequence[ParameterInfo] = (),
     attrs: Mapping[str, Any] | None = None,
 ) -> xr.DataTree:
-    """Put draws and what belongs to them into ArviZ's layout.
+    """Put draws and their data into ArviZ's layout.
 
     Args:
         posterior: draws of each parameter, physical (SI) units.
         prior: prior draws of each parameter.
-        posterior_predictive, prior_predictive, observed_data, constant_data, sample_stats: groups as they shall be
-            stored.
-        log_likelihood: of every data row at every draw.
-        parameters: what is known of them, kept as attributes of the variables.
-        attrs: attributes of the whole, numbers, strings or JSON-able objects (data hash, seed, versions, ...).
+        posterior_predictive, prior_predictive, observed_data, constant_data, sample_stats: groups to store unchanged.
+        log_likelihood: log likelihood of every data row at every draw.
+        parameters: facts about the parameters, stored as attributes of the variables.
+        attrs: attributes of the tree, numbers, strings or JSON-able objects (data hash, seed, versions, ...).
 
     Raises:
         InputError: draws that are not (chain, draw), differ in shape, or are not finite.
@@ -102,7 +103,7 @@ def to_tree(
 
 
 def in_arviz(tree: xr.DataTree) -> InferenceData:
-    """What ArviZ calls a posterior: InferenceData, and from 1.0 on the tree itself."""
+    """ArviZ's type of a posterior: InferenceData, and from 1.0 on the tree itself."""
     found: Any = tree
     if not TREES:
         groups: dict[str, Any] = {name: child.to_dataset() for name, child in tree.children.items()}
@@ -127,7 +128,7 @@ def _attribute(value: Any) -> str | int | float:
 
 
 def save_posterior(tree: xr.DataTree, path: Path) -> None:
-    """Write NetCDF; an interrupted call leaves what was there before.
+    """Write NetCDF; an interrupted call leaves the earlier file.
 
     Raises:
         InputError: if the file cannot be written.
@@ -138,7 +139,7 @@ def save_posterior(tree: xr.DataTree, path: Path) -> None:
 
 
 def load_posterior(path: Path) -> xr.DataTree:
-    """Read what `save_posterior` wrote, all of it into memory.
+    """Read a file of `save_posterior` into memory.
 
     Raises:
         InputError: if the file is missing, damaged, or not a posterior of ours.
@@ -165,8 +166,8 @@ def load_posterior(path: Path) -> xr.DataTree:
 def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
     """ArviZ's summary of each parameter: bulk and tail effective sample size, Monte-Carlo error of the mean, R-hat.
 
-    ``r_hat`` (rank-normalised, split) needs chains and is NaN where there is one only. Chains that never moved, or of
-    fewer than four draws, give NaN throughout.
+    ``r_hat`` (rank-normalised, split) needs chains and is NaN for a single chain. Chains that never moved, or of fewer
+    than four draws, give NaN throughout.
     """
     chains, draws = next(iter(posterior.values())).shape
     if draws < 4:
@@ -192,8 +193,8 @@ def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
 def central_interval(draws: Float[np.ndarray, " n"], mass: float = 0.9) -> tuple[float, float]:
     """Quantiles of the posterior that leave the same mass on either side.
 
-    Of n draws the k-th smallest has k / (n + 1) of the posterior below it, on average (Weibull's plotting position).
-    The usual quantiles of samples take less, and of 100 draws hold only 88 % where 90 % are meant.
+    The k-th smallest of n draws has k / (n + 1) of the posterior below it, on average (Weibull's plotting position).
+    The usual sample quantiles are too narrow: with 100 draws a nominal 90 % interval holds 88 %.
     """
     low, high = np.quantile(draws, [0.5 - 0.5 * mass, 0.5 + 0.5 * mass], method="weibull")
     return float(low), float(high)

@@ -1,4 +1,4 @@
-"""What is known of a parameter beside its draws."""
+"""Facts about a parameter beside its draws."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ SPREAD = "_spread"  # ends the name of a standard deviation between groups
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """What is known of a parameter beside its draws.
+    """Facts about a parameter beside its draws.
 
     Attributes:
-        name: as in the experiment file; ``name@recording`` for one that belongs to a recording.
+        name: name in the experiment file; ``name@recording`` for a parameter of one recording.
         unit: SI unit, "-" if it has none.
-        low, high: hard bounds, infinite where there is none.
+        low, high: hard bounds, infinite without a bound.
         prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.
         description: one line on its physical meaning.
     """
@@ -32,14 +32,14 @@ class ParameterInfo:
 
     @property
     def logarithmic(self) -> bool:
-        """True where the prior is one of the logarithm."""
+        """Whether the prior is on the logarithm."""
         return str(self.prior.get("distribution", "")).startswith("Log")
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Where its prior ends: on the hard bounds or between them; infinite where there is neither.
+        """Ends of its prior, at the hard bounds or inside them; infinite without an end.
 
-        A spread between groups that is zero is no end of anything: the groups do not differ.
+        Zero is not counted as an end of a spread between groups: the groups are then equal.
         """
         if self.name.endswith(SPREAD):
             return -np.inf, min(self.high, self.prior.get("high", np.inf))

@@ -1,4 +1,4 @@
-"""A posterior and its predictions as plain arrays: what a report reads, free of ArviZ."""
+"""A posterior and its predictions as plain arrays: the input of a report, free of ArviZ."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ class RecordingPrediction:
     """One recording, measured and predicted, in the robot's base frame.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         split: "fit" if the parameters were inferred from it, "test" if no fit ever saw it.
         time: [s].
-        marker_names: base to tip; the last one is the headline.
-        observed: measured positions [m]; anything finite where masked.
-        mask: True where ``observed`` may be used.
-        predicted: draws of what would be measured [m], observation noise included.
+        marker_names: base to tip; the last marker is the headline.
+        observed: measured positions [m]; finite placeholders if masked.
+        mask: True for usable positions.
+        predicted: predictive draws of the measurement [m], observation noise included.
         mean: predictive mean without noise [m]; the mean of ``predicted`` if None.
         prior_predicted: the same as ``predicted`` under the prior, or None.
         repeat_group: equal numbers mark repeats of the same commands; -1 marks none.
-        object_pose: draws of where a pushed object is, position [m] and unit quaternion (x, y, z, w), or None. It is
-            not kept in `posterior.nc`.
+        object_pose: draws of a pushed object's pose, position [m] and unit quaternion (x, y, z, w), or None. It is not
+            kept in `posterior.nc`.
     """
 
     name: str
@@ -297,7 +297,7 @@ def _number(value: Any) -> float | None:
 
 
 def _rows(stats: xr.Dataset, dim: str) -> tuple[dict[str, float], ...]:
-    """One dictionary per stage or block; what was not recorded there is left out."""
+    """One dictionary per stage or block; missing values are left out."""
     columns = {str(key).removeprefix(f"{dim}_"): v.values for key, v in stats.items() if v.dims == (dim,)}
     return tuple(
         {key: float(column[i]) for key, column in columns.items() if not np.isnan(column[i])}

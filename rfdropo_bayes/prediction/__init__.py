@@ -1,1 +1,1 @@
-"""Predictions under a posterior: of fitted recordings, and of new ones from commands and at most a first row."""
+"""Predictions under a posterior: of fitted recordings, and of new recordings from commands and at most a first row."""

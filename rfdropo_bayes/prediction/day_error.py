@@ -1,8 +1,8 @@
-"""How far a model is off on a day that no fit has seen, beyond what its draws say: a slow error with heavy tails.
+"""Model error in a session that no fit has seen, beyond its draws: a slow error with heavy tails.
 
-What a model leaves of fitted recordings is what parameters could not follow. On another day they follow nothing. The
-error there is measured on days left out of the fit, in units of what was left of the fitted ones: a model that is twice
-as far off where it was fitted is taken to be twice as far off elsewhere, and a robot that moves twice as far, too.
+Parameters reduce the residuals of fitted recordings, but not the errors in another session. These errors are measured
+on sessions left out of the fit, in units of the fitted residuals. They are assumed proportional to the fitted residuals
+and to the distance that the robot moves.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_erro
 
 DAY_ERROR = "day_error"  # among the attributes of a posterior
 
-# The prior of `times`, in force where no day was left out, and worth FREEDOM days where some were. docs/days.md has the
-# days of two robots that it rests on.
+# The prior of `times`, used if no session was left out, and worth FREEDOM sessions otherwise. It rests on the sessions
+# of two robots in docs/days.md.
 TIMES, FREEDOM = 0.8, 3.0
 CONSTANT = 0.6  # share of the variance that lasts for a whole recording: 0.5 to 0.66 in 8 recordings left out
 CORRELATION_TIME = 1.0  # [s] of the rest: bands do not depend on it
@@ -28,22 +28,23 @@ SMALLEST_REACH = 1e-6  # [m]
 
 
 class DayError(NamedTuple):
-    """The slow error of a model on a day that it was not fitted to.
+    """The slow error of a model in an unseen session.
 
     Attributes:
-        markers: names.
-        left: root mean square distance [m] of each marker in the fitted recordings.
-        reach: root mean square over these of how far each marker had been from where it started [m]; empty where that
-            is not known: a recording is then taken to go as far as the fitted ones.
-        times: scale of the error in units of ``left``, where a marker has been as far as ``reach``.
-        freedom: degrees of freedom of that scale: the error is Student's t.
-        constant: share of its variance that lasts for a whole recording.
-        correlation_time: over which the rest forgets its sign [s].
-        days: error of the last marker [m] on each day left out, by its group; empty without one.
-        held: share of the coordinates of these days in the 90 % bands, each day's widened by the others; None without.
-        shown: how far each marker went in a recording of the day that was fitted [m]: only what goes beyond counts;
-            empty where no recording of the day was seen.
-        missed: days that could not be left out, because the others could not be fitted without them.
+        markers: names of the markers.
+        left: root mean square residual [m] of each marker in the fitted recordings.
+        reach: root mean square of each marker's largest distance from its start [m]; empty if unknown: a recording is
+            then assumed to move as far as the fitted recordings.
+        times: scale of the error in units of ``left``, for a marker at the distance ``reach``.
+        freedom: degrees of freedom: the error is Student's t.
+        constant: share of its variance that is constant over a recording.
+        correlation_time: correlation time of the other share [s].
+        days: error of the last marker [m] in each session left out, by group; empty without such sessions.
+        held: share of the coordinates of these sessions in the 90 % bands, each widened by the other sessions; None
+            without such sessions.
+        shown: distance of each marker in the fitted recording of this session [m]: only motion beyond it adds error;
+            empty without such a recording.
+        missed: sessions that could not be left out, because the others cannot be fitted without them.
     """
 
     markers: tuple[str, ...]
@@ -61,11 +62,11 @@ class DayError(NamedTuple):
     def unit(
         self, path: Float[np.ndarray, "time marker 3"], markers: Sequence[str]
     ) -> Float[np.ndarray, "time marker"]:
-        """What ``times`` multiplies [m], for each coordinate: it grows with how far the marker has been from its start.
+        """Unit of ``times`` [m] for each coordinate; it grows with the marker's largest distance from its start.
 
         Args:
             path: mean prediction [m].
-            markers: names.
+            markers: names of the markers.
         """
         index = [self.markers.index(name) for name in markers]
         far = reach_of(path)
@@ -105,16 +106,16 @@ class DayError(NamedTuple):
 
 
 def reach_of(path: Float[np.ndarray, "time marker 3"]) -> Float[np.ndarray, "time marker"]:
-    """How far [m] each marker has been from where it started, by each row."""
+    """Largest distance [m] of each marker from its start, up to each row."""
     return np.maximum.accumulate(np.linalg.norm(path - path[0], axis=-1), axis=0)
 
 
 def prior_day_error(left: ModelError, fitted: Sequence[RecordingPrediction]) -> DayError:
-    """The slow error of a day where no day was left out of the fit.
+    """The slow error of a session if no session was left out of the fit.
 
     Args:
-        left: what the model left of the fitted recordings.
-        fitted: their predictions, as far as they are known.
+        left: residuals of the model on the fitted recordings.
+        fitted: their predictions, if known.
     """
     scale = tuple(np.linalg.norm(np.reshape(left.scale, (-1, 3)), axis=1).tolist())
     if not fitted:
@@ -145,7 +146,7 @@ def day_error(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]]
 
 
 def recorded_day_error(record: PosteriorRecord) -> DayError | None:
-    """As a fit says, or its prior for one that does not; None where it does not say what its model leaves either."""
+    """The error from a fit's file, or its prior; None if the file has no residuals either."""
     given = record.attrs.get(DAY_ERROR)
     if given is not None:
         return DayError.from_dict(given)
@@ -160,7 +161,7 @@ def _with_times(prior: DayError, squares: Sequence[float]) -> DayError:
 
 
 def _squared_times(prior: DayError, predictions: Sequence[RecordingPrediction]) -> float:
-    """The mean over the markers of what squared errors exceed the variance of the draws by, in squared units."""
+    """Mean over markers of the squared error less the variance of the draws, in squared units."""
     excess, units = np.zeros(len(predictions[0].marker_names)), np.zeros(len(predictions[0].marker_names))
     for p in predictions:
         error = (p.observed - p.central) ** 2 - p.predicted.var(axis=0)
@@ -170,7 +171,7 @@ def _squared_times(prior: DayError, predictions: Sequence[RecordingPrediction]) 
 
 
 def _constant_share(prior: DayError, predictions: Sequence[RecordingPrediction]) -> float:
-    """Of the squared error in units, the share of its mean over each recording."""
+    """Share of the squared error, in units, that is constant over each recording."""
     constant, total = 0.0, 0.0
     for p in predictions:
         unit = prior.unit(p.central, p.marker_names)
@@ -201,18 +202,18 @@ def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], sq
 
 
 def day_sentence(error: DayError) -> str:
-    """What is known of the error on a day of which no recording was seen, for people."""
+    """Sentence on the error in a session without a recording."""
     begin = "No recording of this day was seen."
     if not error.days:
         return (
-            f"{begin} This run has no days that were left out of its fit: its bands are widened by {error.times:.2g} "
-            "times what it left of fitted days, as days left out of the fits of two other robots ask for."
+            f"{begin} This run left no session out of its fit: its bands are widened by {error.times:.2g} "
+            "times the residuals of fitted sessions, as found on two other robots."
         )
     return f"{begin} {left_out_sentence(error)}"
 
 
 def left_out_sentence(error: DayError) -> str:
-    """How far the model was off on days left out of the fit, and what its bands held; empty without one."""
+    """Sentence on errors and coverage in sessions left out of the fit; empty without such sessions."""
     missed = f" It could not be fitted without {', '.join(error.missed)}." if error.missed else ""
     if not error.days:
         return missed.lstrip()

@@ -1,4 +1,4 @@
-"""What a fitted model leaves of the recordings that it was fitted to, and so is off by in others."""
+"""Residuals of a fitted model, as an estimate of its error in other recordings."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from rfdropo_bayes.data.sample_times import ONE_RATE, sample_time
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 
 MODEL_ERROR = "model_error"  # among the attributes of a posterior
-MOST_LAGS = 100  # rows of memory, of noise that lasts: longer recordings forget its constant part over as many
+MOST_LAGS = 100  # rows of memory of correlated noise: longer recordings forget its constant part within this time
 MOST_CONSTANT = 0.95
-FEWEST_ROWS = 4  # that say how long an error lasts
+FEWEST_ROWS = 4  # least rows for an estimate of the correlation time
 ADAPTED_TO = "adapted_to"  # among the attributes of a posterior: the day, of an adaptation
 CONSTANT_ROUNDS = 5  # until share and memory agree
 
 
 class ModelError(NamedTuple):
-    """What a fitted model leaves: its size for each coordinate of each marker, and how long it lasts.
+    """Residuals of a fitted model: size for each coordinate of each marker, and correlation time.
 
     Attributes:
-        markers: names.
-        scale: root mean square [m], marker by marker, x, y and z of each.
-        correlation_time: over which it forgets its sign [s].
-        share: what a coordinate of a row counts, because markers err together: independent coordinates of equal worth
-            are as many as their correlation matrix has eigenvalues of note (its participation ratio).
+        markers: names of the markers.
+        scale: root mean square [m] of x, y and z of each marker.
+        correlation_time: correlation time [s].
+        share: weight of a coordinate of a row, because errors of markers are correlated; the number of independent
+            coordinates is the participation ratio of the correlation matrix.
         step: time between rows of the fitted recordings [s].
-        memory: correlation of an error with that of 0, 1, 2 ... rows before, its mean not taken out; empty where it
-            is not known.
+        memory: autocorrelation at lags 0, 1, 2 ... rows, about zero; empty if unknown.
     """
 
     markers: tuple[str, ...]
@@ -43,7 +42,7 @@ class ModelError(NamedTuple):
     memory: tuple[float, ...] = ()
 
     def of_marker(self, name: str) -> float:
-        """How far [m] a marker is off, root mean square, where all coordinates of a row are taken for independent."""
+        """Root mean square error [m] of a marker, scaled so that coordinates of a row count as independent."""
         index = self.markers.index(name)
         return float(np.linalg.norm(self.scale[3 * index : 3 * index + 3]) / np.sqrt(self.share))
 
@@ -67,8 +66,9 @@ class ModelError(NamedTuple):
         return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf, step=step)
 
     def constant(self, seconds: float) -> float:
-        """Share of the variance that lasts for so many seconds: with it, the mean error over as many varies as it did
-        in the fitted recordings; zero where that is not known."""
+        """Share of the variance that is constant over ``seconds``, so that the mean error over this time has the
+        variance seen in the fitted recordings; zero if unknown.
+        """
         rows = min(round(seconds / self.step), len(self.memory)) if self.step else 0
         if rows < FEWEST_ROWS:
             return 0.0
@@ -83,15 +83,15 @@ class ModelError(NamedTuple):
 def model_error(
     predictions: Sequence[RecordingPrediction], widened: Float[np.ndarray, " column"] | float = 1.0
 ) -> ModelError | None:
-    """What the mean prediction leaves in the recordings that were fitted; None without one.
+    """Residuals of the mean prediction in the fitted recordings; None without such recordings.
 
-    It is taken for a first-order autoregression, which has a time constant: the error then counts as little in rows of
-    another rate. White noise of the same size would give three seconds of a recording the weight of three hundred
-    independent measurements, of a model whose error lasts for one of them.
+    They are modelled as a first-order autoregression, whose time constant applies to rows of any rate. White noise of
+    the same size would give three seconds of a recording the weight of three hundred independent measurements, although
+    the error is correlated over a second.
 
     Args:
-        predictions: of recordings, the fitted ones among them.
-        widened: what residuals of the coordinates have to be multiplied by, because parameters follow them.
+        predictions: predictions of recordings, including the fitted recordings.
+        widened: factor from residuals to errors per coordinate, because parameters reduce residuals.
     """
     fitted = [p for p in predictions if p.split == "fit" and p.mask.any()]
     if not fitted:
@@ -116,9 +116,9 @@ def model_error(
 
 
 def error_memory(predictions: Sequence[RecordingPrediction], step: float) -> tuple[float, ...]:
-    """Correlation of the error of mean predictions with that of 0, 1, 2 ... rows before, about zero; of half a
-    recording at most, beyond which there are few pairs. Recordings whose rows are not ``step`` seconds apart have no
-    part in it."""
+    """Autocorrelation of the error of mean predictions at lags 0, 1, 2 ... rows, about zero, up to half a recording.
+    Recordings whose rows are not ``step`` seconds apart are ignored.
+    """
     fitted = [p for p in predictions if 1.0 / ONE_RATE < sample_time(p.time) / step < ONE_RATE]
     count = min(MOST_LAGS, max(len(p.time) for p in fitted) // 2)
     products, pairs = np.zeros(count), np.zeros(count)
@@ -137,15 +137,14 @@ def _fast(memory: float, constant: float) -> float:
 
 
 def _mean_variance(memory: Float[np.ndarray, " lag"]) -> float:
-    """Variance of the mean of as many rows as there are lags, over that of one row."""
+    """Variance of the mean over ``len(memory)`` rows, relative to a single row."""
     rows = len(memory)
     lags = np.arange(1, rows)
     return float((1.0 + 2.0 * np.sum((1.0 - lags / rows) * memory[1:])) / rows)
 
 
 def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
-    """What the fit's model leaves: as the fit says, or as its predictions of the fitted recordings show; None where it
-    holds neither."""
+    """Residuals of a fit, from its file or from its predictions of the fitted recordings; None if it has neither."""
     given = record.attrs.get(MODEL_ERROR)
     if given is None:
         return model_error(record.recordings)
@@ -153,6 +152,6 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     found, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
     if found.memory or not fitted or record.attrs.get(ADAPTED_TO):
         return found
-    # An earlier version did not say how long errors last. Of several rates one is taken, not what lies between them.
+    # A record may lack the correlation time. With several rates, one is used rather than an intermediate value.
     step = sample_time(max(fitted, key=lambda p: len(p.time)).time)
     return found._replace(step=step, memory=error_memory(fitted, step))

@@ -1,9 +1,8 @@
-"""Least squares of many draws at once, each with its own optimum: what is a recording's own, fitted draw by draw.
+"""Least squares of many draws at once, each with its own optimum: fits the parameters of a recording for every draw.
 
-Every draw has k standard normal coordinates and m whitened residuals. Its cost is half of the sum of squares of the
-residuals, and of what the coordinates are off a draw from their prior. With residuals under perturbed data, and the
-prior's draw as the centre, the optimum is a draw from the posterior, exactly where residuals are linear (randomised
-maximum likelihood, Oliver, He & Reynolds 1996).
+Every draw has k standard normal coordinates and m whitened residuals. Its cost is half the sum of squares of the
+residuals and of the distance to a prior draw. With perturbed data and the prior draw as the centre, the optimum is a
+draw from the posterior, exactly so for linear residuals (randomised maximum likelihood, Oliver, He & Reynolds 1996).
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 STEP = 0.05  # of a central difference, in prior deviations
-TOLERANCE = 0.01  # nats that a step promises, or delivers: what remains is a seventh of a posterior deviation
-CREDIBLE = 100.0  # tolerances that a step may promise and not deliver: what differences promise has the size of kinks
+TOLERANCE = 0.01  # nats of predicted or actual gain: the remaining distance is a seventh of a posterior deviation
+CREDIBLE = 100.0  # tolerances of predicted gain without actual gain: finite differences see gains of the size of kinks
 MOST_STEPS = 60
-LEAST_GAIN = 0.5  # of what a step promised, below which corrected slopes are not trusted with another
-DAMPINGS = (0.1, 1.0, 10.0, 100.0)  # of a draw's last one: the first that lowers its cost is taken
+LEAST_GAIN = 0.5  # of the predicted gain, below which updated slopes are not trusted with another step
+DAMPINGS = (0.1, 1.0, 10.0, 100.0)  # of a draw's last damping: the first that lowers its cost is taken
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e6
 
 Residuals = Callable[[Float[np.ndarray, "b k"], Int[np.ndarray, " b"]], Float[np.ndarray, "b m"]]
@@ -29,11 +28,11 @@ class OwnFit(NamedTuple):
     """Optima of all draws.
 
     Attributes:
-        point: coordinates of each draw.
-        residual: at the point; not finite where the draw has none.
-        slope: of the residuals there.
-        converged: draws whose next step promises, or whose last one delivered, less than `TOLERANCE`.
-        steps: that the last of them took.
+        point: coordinates of each draw's optimum.
+        residual: residuals at the point; not finite if the simulation failed.
+        slope: derivatives of the residuals there.
+        converged: draws whose predicted or last gain is less than `TOLERANCE`.
+        steps: number of steps.
     """
 
     point: Float[np.ndarray, "n k"]
@@ -49,17 +48,17 @@ def fit_own(
     start: Float[np.ndarray, "n k"] | None = None,
     report: Callable[[int, float], None] = lambda step, share: None,
 ) -> OwnFit:
-    """Levenberg-Marquardt steps of all draws in one batch, until the next step of each promises nothing.
+    """Levenberg-Marquardt steps of all draws in one batch, until the predicted gain of each is negligible.
 
-    Slopes cost twice as many rollouts as there are coordinates. All draws begin with those of the first, and a step
-    corrects them by what it has found (Broyden 1965). A draw gets slopes of its own where the corrected ones promise
-    more than twice what they deliver, and where it seems to be done.
+    Derivatives cost two rollouts per coordinate. All draws start with the derivatives of the first draw, and each step
+    updates them (Broyden 1965). A draw gets its own derivatives if the predicted gain is more than twice the actual
+    gain, and before it counts as converged.
 
     Args:
-        residuals: whitened residuals of points, and of the draw that each belongs to.
-        centre: a draw from the prior, which its prior pulls each to.
-        start: where each begins; its centre by default.
-        report: is told the step, and the share of the draws that have converged.
+        residuals: function of points and draw indices, returns whitened residuals.
+        centre: prior draw at the centre of each draw's penalty.
+        start: start of each draw; its centre by default.
+        report: called with the step and the share of converged draws.
     """
     draws, (count, k) = np.arange(len(centre)), centre.shape
     point = (centre if start is None else start).copy()
@@ -90,7 +89,7 @@ def fit_own(
             point[going], value[going] = moved, found
             delivered[going] = before - _cost(found, moved, centre[going])
         still = delivered[todo] < TOLERANCE
-        # Six decades of damping that gain nothing: what differences promise there is rounding, or the edge of a cliff.
+        # Six decades of damping without gain: the gain predicted by differences is rounding, or the edge of a cliff.
         lost = todo[still & own[todo] & (promised >= CREDIBLE * TOLERANCE) & (damping[todo] >= MOST_DAMPING)]
         done = todo[still & own[todo] & (promised < CREDIBLE * TOLERANCE)]
         converged[done] = True
@@ -111,7 +110,7 @@ def fit_own(
 def _corrected(
     slope: Float[np.ndarray, "n m k"], moved: Float[np.ndarray, "n k"], changed: Float[np.ndarray, "n m"]
 ) -> Float[np.ndarray, "n m k"]:
-    """Slopes that agree with what a step has changed; those of a draw that has not moved stay."""
+    """Derivatives after Broyden's update; unchanged for a draw that has not moved."""
     length = np.sum(moved**2, axis=1)
     missing = changed - np.einsum("nij,nj->ni", slope, moved)
     return slope + missing[:, :, None] * (moved / np.where(length > 0.0, length, 1.0)[:, None])[:, None]
@@ -127,7 +126,7 @@ def _step(
     curvature: Float[np.ndarray, "n k k"],
     draws: Int[np.ndarray, " n"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, residuals and dampings after the least damped step that lowers each cost; where none does, as before."""
+    """Points, residuals and dampings after the least damped step that lowers each cost; unchanged if none does."""
     before, waiting = _cost(value, point, centre), np.arange(len(point))
     diagonal = np.einsum("njj->nj", curvature)[:, None] * np.eye(point.shape[1])
     point, value, tried = point.copy(), value.copy(), damping.copy()

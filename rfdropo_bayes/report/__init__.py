@@ -1,4 +1,4 @@
-"""What a run leaves behind for people and programs: summary.json, figures, the self-contained report.html."""
+"""Results of a run for people and programs: summary.json, figures, the self-contained report.html."""
 
 from rfdropo_bayes.report.baselines import BaselineErrors, baseline_errors
 from rfdropo_bayes.report.facts import RecordingFacts, RunFacts, software_versions

@@ -1,4 +1,4 @@
-"""Figures of an audit: where and when the base model fails, how alike candidates look, what an extension changes."""
+"""Figures of an audit: place and time of the base model's misfit, similarity of candidates, effect of an extension."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIGN = "direction"  # the cause that is a sign
 
 @dataclass(frozen=True)
 class Residuals:
-    """What a model leaves of the fitted recordings, beside what might have caused it; rows of all groups in a line.
+    """Residuals of the fitted recordings and their possible causes; rows of all groups in sequence.
 
     Attributes:
         main: the residual's dominant pattern over the channels, a coordinate per row [m].
@@ -57,10 +57,10 @@ class Signal:
     """A signal at a port, with its band.
 
     Attributes:
-        port, unit: where, and of what.
+        port, unit: port, and unit of the signal.
         recordings: names, the first of each group of repeats.
         time: [s].
-        mean, sd: of every recording [unit].
+        mean, sd: posterior mean and deviation in every recording [unit].
     """
 
     port: str
@@ -73,20 +73,21 @@ class Signal:
 
 @dataclass(frozen=True)
 class Shown:
-    """What the figures of an audit show.
+    """Data of the figures of an audit.
 
     Attributes:
-        residuals: of the base model.
-        blocks: misfit of each block of rows, for each model; 1 where a model is right.
+        residuals: residuals of the base model.
+        blocks: misfit of each block of rows, for each model; 1 if a model is right.
         seconds: length of a block [s].
         models: names of the base model and of its extensions, in the order of ``blocks``.
-        names: of the candidates that were probed.
-        cosines: between their signatures.
+        names: names of the tested candidates.
+        cosines: cosines between their signatures.
         unseen: time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst:
             measured, base model, extended model; None without one.
-        remainder: time [s], mean and deviation [m] of what the final model leaves of the last marker; None if nothing.
-        tracks: unseen recordings as they are replayed.
-        port: the signal at the port where something acts that the library does not have; None where nothing does.
+        remainder: time [s], mean and deviation [m] of the final model's residual at the last marker; None if nothing
+            remains.
+        tracks: replays of unseen recordings.
+        port: the signal at the port with an effect that the library lacks; None without such an effect.
     """
 
     residuals: Residuals
@@ -102,7 +103,7 @@ class Shown:
 
 
 def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:
-    """What residuals are drawn against, by name: a label and a value for each row."""
+    """Abscissae of the residual plots, by name: a label and a value for each row."""
     held = _strongest(residuals.command, residuals.main)
     turned = _strongest(residuals.rate, residuals.main)
     channel, unit = residuals.channels[turned], residuals.unit
@@ -157,7 +158,7 @@ def _binned(x: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.nda
 
 
 def draw_blocks(axes: Axes, shown: Shown) -> None:
-    """Draw when each model fails: mean square of the block means, 1 where a model is right."""
+    """Draw when each model fails: mean square of the block means, 1 if a model is right."""
     for row, model in zip(shown.blocks, shown.models, strict=True):
         axes.stairs(row, shown.seconds * np.arange(len(row) + 1), baseline=None, label=model, linewidth=1.4)
     axes.axhline(1.0, color=style.MEASURED, linewidth=0.8)
@@ -165,7 +166,7 @@ def draw_blocks(axes: Axes, shown: Shown) -> None:
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         ticks(style.PlainLogFormatter(minor_thresholds=(1.5, 0.6)))
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("mean square / that of noise [-]")
+    axes.set_ylabel("mean square / noise variance [-]")
 
 
 @style.styled
@@ -178,7 +179,7 @@ def blocks_figure(shown: Shown) -> Figure:
 
 
 def draw_cosines(axes: Axes, shown: Shown) -> AxesImage:
-    """Draw how alike the candidates' signatures are, once the base parameters have done what they can."""
+    """Draw the cosines between the candidates' signatures, after projection on the base parameters."""
     image = axes.imshow(np.abs(shown.cosines), vmin=0.0, vmax=1.0, cmap="Blues")
     labels = [display_name(name) for name in shown.names]
     axes.set_xticks(range(len(labels)), labels, rotation=60, ha="right", rotation_mode="anchor")
@@ -193,7 +194,7 @@ def draw_cosines(axes: Axes, shown: Shown) -> AxesImage:
 
 @style.styled
 def cosine_figure(shown: Shown) -> Figure:
-    """How alike the candidates' signatures are."""
+    """Cosines between the candidates' signatures."""
     size = 1.6 + 0.34 * len(shown.names)
     figure = Figure(figsize=(min(style.WIDTH, size + 2.0), size))
     axes = figure.subplots()
@@ -223,7 +224,7 @@ def unseen_figure(shown: Shown) -> Figure:
 
 
 def draw_remainder(axes: Axes, shown: Shown) -> None:
-    """Draw what the final model leaves of the last marker, as a Gaussian process with two standard deviations."""
+    """Draw the final model's residual at the last marker as a Gaussian process with two standard deviations."""
     assert shown.remainder is not None
     time, mean, sd = shown.remainder
     for axis, colour in enumerate(style.AXIS_COLOURS):
@@ -237,7 +238,7 @@ def draw_remainder(axes: Axes, shown: Shown) -> None:
 
 @style.styled
 def remainder_figure(shown: Shown) -> Figure:
-    """What the final model leaves of the last marker."""
+    """Residual of the final model at the last marker."""
     figure = Figure(figsize=(style.WIDTH, 2.4))
     axes = figure.subplots()
     draw_remainder(axes, shown)

@@ -34,11 +34,11 @@ def render_audit(
     """HTML of an audit.
 
     Args:
-        seen: what its figures show.
-        content: of audit.json.
-        title: of the experiment.
+        seen: data of its figures.
+        content: content of audit.json.
+        title: title of the experiment.
         config: the experiment file as it was run.
-        outline: of the robot, for its picture.
+        outline: outline of the robot.
     """
     return render(
         "audit.html.j2",
@@ -86,7 +86,7 @@ def residuals_of(answer: Answer) -> figures.Residuals:
 
 
 def shown(answer: Answer) -> figures.Shown:
-    """What the figures of an audit show."""
+    """Data of the figures of an audit."""
     step = float(np.median(np.diff(answer.target.measurements.time[0])))
     probed = [row for row in answer.causes.screens[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
@@ -99,7 +99,7 @@ def shown(answer: Answer) -> figures.Shown:
         measured = np.where(valid, recordings.position, np.nan)
         series = {"measured": measured, "base model": base, "extended model": extended}
         unseen = (step * np.flatnonzero(seen), {name: path[worst, seen, -3:] for name, path in series.items()})
-        names = answer.problem.model.recordings.markers  # those that all recordings have
+        names = answer.problem.model.recordings.markers  # markers that all recordings have
         for index in np.argsort([-each.rmse_base for each in found.gain.differences.values()]):
             rows = slice(0, int(np.flatnonzero(valid[index].any(axis=1))[-1]) + 1)
             moved = {name: path[index, rows].reshape(-1, len(names), 3) for name, path in series.items()}
@@ -134,7 +134,7 @@ def _signal(answer: Answer) -> figures.Signal | None:
 
 
 def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:
-    """The figures of the page by name, None where there is nothing to show."""
+    """The figures of the page by name, None if there is nothing to show."""
     drawn = {
         "robot": (robot_figure(outline), "The robot from the side and from its base") if outline else None,
         "panels": (
@@ -144,7 +144,7 @@ def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[st
         "blocks": (figures.blocks_figure(seen), "Misfit of each block of rows"),
         "cosines": (figures.cosine_figure(seen), "Cosines between signatures") if len(seen.names) > 1 else None,
         "overlay": (figures.unseen_figure(seen), "Measured, base model and extended model") if seen.unseen else None,
-        "remainder": (figures.remainder_figure(seen), "Gaussian process of what remains") if seen.remainder else None,
-        "port": (figures.signal_figure(seen.port), "Signal at the port where something acts") if seen.port else None,
+        "remainder": (figures.remainder_figure(seen), "Gaussian process of the residual") if seen.remainder else None,
+        "port": (figures.signal_figure(seen.port), "Signal at the port of the missing effect") if seen.port else None,
     }
     return {name: None if picture is None else embed(*picture) for name, picture in drawn.items()}

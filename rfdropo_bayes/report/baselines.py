@@ -23,13 +23,13 @@ Predictor = Callable[[Trajectory], Float[np.ndarray, "time marker 3"]]
 
 @dataclass(frozen=True)
 class BaselineErrors:
-    """How one predictor fared.
+    """Errors of one predictor.
 
     Attributes:
         name: key in summary.json.
         title: name for people.
         description: how it predicts, in one sentence.
-        fit, test: its errors; None where it has none.
+        fit, test: its errors; None if it has none.
         reason: why it could not predict; empty if it could.
     """
 
@@ -57,9 +57,9 @@ def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
 
 
 def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean of the fit recordings at the same time after the start, whatever is commanded.
+    """The mean of the fit recordings at the same time after the start, for any command.
 
-    A fit recording is predicted by the others. The predictor raises InputError where no other lasts as long.
+    A fit recording is predicted by the others. The predictor raises InputError if no other recording lasts as long.
     """
 
     def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
@@ -77,7 +77,8 @@ def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
                     count[:, marker] += within
         if not count.all():
             raise InputError(
-                f"no other fit recording lasts {recording.time[-1]:.4g} s, as long as this one", where=recording.name
+                f"no other fit recording lasts {recording.time[-1]:.4g} s, the length of this recording",
+                where=recording.name,
             )
         return total / count[..., None]
 
@@ -85,10 +86,9 @@ def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
 
 
 def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean of the fitted repeats of the same commands at the same time; their last pose is held where they end.
+    """The mean of the fitted repeats of the same commands at the same time; their last pose is held after their end.
 
-    Who has seen an experiment predicts its repeats so. The predictor raises InputError where no other fit recording has
-    the commands.
+    The predictor raises InputError if no other fit recording has the commands.
     """
     openings = [command_openings(source) for source in fit]
 
@@ -116,7 +116,7 @@ def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
 
 
 def with_fitted_commands(fit: Sequence[Trajectory], test: Sequence[Trajectory]) -> list[str]:
-    """Names of the test recordings whose commands were fitted, too, in the same or another recording."""
+    """Names of the test recordings whose commands were also fitted, in the same or another recording."""
     openings = [command_openings(source) for source in fit]
     return [t.name for t in test if any(same_opening(command_openings(t), begun) for begun in openings)]
 
@@ -138,11 +138,11 @@ def baseline_errors(
     Args:
         fit: recordings a fit may see.
         test: recordings no fit sees; may be empty.
-        markers: of the robot, in its order; others do not count. Those of the first recording by default.
+        markers: markers to score, in the robot's order; by default the first recording's.
         trained_on: words for the fit recordings; by default their number and length.
 
     Returns:
-        By name; empty where no marker is in all recordings.
+        By name; empty if no marker is in all recordings.
     """
     shared = [name for name in markers or fit[0].marker_names if all(name in t.marker_names for t in (*fit, *test))]
     if not shared:

@@ -32,8 +32,9 @@ def error_figure(rows: Sequence[Mapping[str, Any]], noise_floor: float | None) -
     """Errors of the last marker, the model's first, the predictors without a simulator below.
 
     Args:
-        rows: ``title``, ``own`` (is it the calibrated simulator) and errors [mm] under ``fit``, ``test`` and, where
-            recordings end in a hold, ``moving`` and ``final`` (of the test recordings; of the fit ones without any).
+        rows: ``title``, ``own`` (is it the calibrated simulator) and errors [mm] under ``fit``, ``test`` and, if
+            recordings end in a hold, ``moving`` and ``final`` (of the test recordings; of the fit recordings without
+            any).
         noise_floor: spread between repeats [mm], None without repeats.
     """
     titles = {"test": "test, over time", "fit": "fit, over time", "moving": "moving part", "final": "final pose"}
@@ -133,7 +134,9 @@ def trace_figure(trace: Sequence[Mapping[str, float]]) -> Figure:
 
 @style.styled
 def block_figure(blocks: Sequence[Mapping[str, float]]) -> Figure:
-    """Log score per row of each block of rows, given the rows before it: where it falls, the simulator fails."""
+    """Log score per row of each block of rows, given the rows before it: the simulator fails in blocks with a low
+    score.
+    """
     figure = Figure(figsize=(style.WIDTH, 2.6))
     axes = figure.subplots()
     first = np.array([block["first_row"] for block in blocks])

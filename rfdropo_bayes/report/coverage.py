@@ -1,4 +1,4 @@
-"""Do the predictive bands hold what was measured? Coverage, and the probability integral transform of every value."""
+"""Do the predictive bands contain the measurements? Coverage, and the probability integral transform of every value."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _shares(transformed: Float[np.ndarray, " n"], nominal: Sequence[float]) -> d
 
 
 def probability_transform(recording: RecordingPrediction) -> Float[np.ndarray, "time marker 3"]:
-    """Share of predictive draws below what was measured, uniform on (0, 1) if predictions are honest; NaN if masked.
+    """Share of predictive draws below the measurement, uniform on (0, 1) if predictions are honest; NaN if masked.
 
     With n draws and r of them below, (r + 1/2) / (n + 1): unbiased, and never 0 or 1.
     """
@@ -83,8 +83,9 @@ class TransformCurve(NamedTuple):
 def transform_curve(recordings: Sequence[RecordingPrediction]) -> TransformCurve | None:
     """PIT-ECDF of all usable coordinates.
 
-    Neighbouring rows err alike, so that thousands of rows may be worth few independent ones. Their number is estimated
-    series by series (one marker, one axis) from the autocorrelation of the normal scores up to its first sign change.
+    Errors of neighbouring rows are correlated, so that thousands of rows may equal few independent rows. The effective
+    number is estimated for each series (one marker, one axis) from the autocorrelation of the normal scores up to its
+    first sign change.
     """
     series = [s for r in recordings for s in np.moveaxis(probability_transform(r), 0, -1).reshape(-1, len(r.time))]
     values = np.concatenate([s[np.isfinite(s)] for s in series]) if series else np.zeros(0)

@@ -1,4 +1,4 @@
-"""What a run knows beside its posterior: the plain input of summary.json and report.html."""
+"""Facts about a run beside its posterior: the plain input of summary.json and report.html."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class RecordingFacts:
     """One recording as the data section lists it.
 
     ``masked`` counts marker positions that are left out as faults, of ``positions`` in all; ``seconds`` is its length;
-    ``first_command`` says which command was in force before the first row, and how that is known, ``left_out`` what is
-    faulty or missing.
+    ``first_command`` names the command before the first row and its evidence; ``left_out`` lists faulty or missing
+    data.
     """
 
     name: str
@@ -69,31 +69,31 @@ class RunFacts:
     """Everything in summary.json that the posterior itself does not hold.
 
     Attributes:
-        title: of the experiment.
+        title: title of the experiment.
         robot: name of its robot.
-        method: of inference.
-        engine: that simulated, with precision and discretisation in words.
-        status: "done", or "interrupted" where the budget or the user ended it early.
-        seed: of the run.
-        rollouts: used, in full-length equivalents; ``evaluations``: parameter sets tried.
-        seconds: of wall time.
+        method: inference method.
+        engine: simulator, precision and discretisation in words.
+        status: "done", or "interrupted" if the budget or the user ended it early.
+        seed: seed of the run.
+        rollouts: number of rollouts, in full-length equivalents; ``evaluations``: parameter sets tried.
+        seconds: wall time.
         log_evidence: value and standard deviation in nats (NaN: not measured); None if the method has none.
         excluded: parameter sets that got no weight, by reason.
-        cautions: what speaks against the result.
+        cautions: reasons to doubt the result.
         recordings: fit first, then test.
         model: label -> words, e.g. mechanisms, noise, fixed values, time step.
-        residuals: from `check_residuals`; empty where the method has no likelihood.
+        residuals: from `check_residuals`; empty if the method has no likelihood.
         baselines: from `baseline_errors`; empty if not computed.
-        fitted_commands: test recordings whose commands were fitted, too.
+        fitted_commands: test recordings whose commands were also fitted.
         noise_floor: noise between repeats of each marker [m]; None without repeats.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
         optimum: posterior mode; None without.
-        objects: how well the final position of a pushed object is predicted, by recording that was not fitted.
-        unseen_days: error on days that no fit has seen, with the key "sentence" for people; empty for a model without
-            days.
-        limits: sentences on what this analysis cannot see, beside those that always hold.
-        versions: of the software.
-        details: further plain values of the method.
+        objects: scores of the predicted final position of a pushed object, by unseen recording.
+        unseen_days: error in sessions that no fit has seen, with the key "sentence" for people; empty for a model
+            without sessions.
+        limits: further sentences on the limits of this analysis.
+        versions: versions of the software.
+        details: further values of the method.
         outline: of the robot, as `robots.robot_shape` makes it, for its picture.
     """
 
@@ -126,8 +126,9 @@ class RunFacts:
 
 
 def software_versions(further: Sequence[str] = ()) -> dict[str, str]:
-    """Versions of Python and of the packages that numbers depend on, ``further`` ones among them; those not installed
-    are left out."""
+    """Versions of Python and of the packages that numbers depend on, including ``further``; missing packages are left
+    out.
+    """
     versions = {"python": python_version()}
     for name in (*PACKAGES, *further):
         try:

@@ -51,10 +51,10 @@ class FirRegression:
 
 
 def fit_fir(fit: Sequence[Trajectory], groups: Sequence[Sequence[int]], *, degree: int) -> FirRegression:
-    """Train on recordings; the span of the history and the penalty are those that predict left-out parts best.
+    """Train on recordings; the span of the history and the penalty are chosen by cross-validation.
 
-    What is left out is one group of repeats at a time, or one of `BLOCKS` stretches of time where all recordings
-    share their commands.
+    One group of repeats is left out at a time, or one of `BLOCKS` stretches of time if all recordings share their
+    commands.
 
     Args:
         fit: recordings.

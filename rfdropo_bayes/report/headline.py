@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+FEW_DRAWS = 100
+"""Effective draws that central intervals need."""
+
 
 def headline(summary: Mapping[str, Any]) -> list[str]:
-    """What was fitted, how far off it is, against what, what a bound decided, and how many rollouts failed."""
+    """Fitted data, error, best baseline, parameters at a bound, and number of failed rollouts."""
     return [
         sentence
         for sentence in (
@@ -31,7 +34,13 @@ def _fitted(summary: Mapping[str, Any]) -> str:
     data = (
         f"{_count(len(recordings), synthetic.strip() + ' recording' if synthetic else 'recording')} ({seconds:.3g} s)"
     )
-    return f"{_count(len(free), 'parameter')} of {summary['robot']} were inferred from {data} with {summary['method']}."
+    effective = summary["effective_draws"]
+    worth = "" if effective is None else f"; its draws are worth {effective:.0f} independent draws"
+    few = "" if effective is None or effective >= FEW_DRAWS else f", fewer than the {FEW_DRAWS} that intervals need"
+    return (
+        f"{_count(len(free), 'parameter')} of {summary['robot']} were inferred from {data} with {summary['method']}"
+        f"{worth}{few}."
+    )
 
 
 def _errors(summary: Mapping[str, Any]) -> str:
@@ -47,20 +56,21 @@ def _errors(summary: Mapping[str, Any]) -> str:
                 parts.append(f"{value:.3g} mm {words}{_repeats(summary) if role == 'test' else ''}{split}")
     if not parts:
         return ""
-    tail = "" if summary["rmse"]["test"] else " There are no test recordings: nothing here says how well it predicts."
+    tail = "" if summary["rmse"]["test"] else " There are no test recordings: its predictions are untested."
     return f"In root mean square over time, its last marker ({marker}) is off by {', and by '.join(parts)}.{tail}"
 
 
 def _repeats(summary: Mapping[str, Any]) -> str:
-    """How many test recordings repeat commands that were fitted; empty where none does."""
+    """Phrase with the number of test recordings that repeat fitted commands; empty if none does."""
     repeated = len(summary.get("fitted_commands") or ())
     tested = sum(recording["split"] == "test" for recording in summary["recordings"])
     return f", of which {repeated} of {tested} repeat fitted commands" if repeated else ""
 
 
 def best_baseline(summary: Mapping[str, Any], role: str, marker: str | None = None) -> tuple[str, float] | None:
-    """Title and error of the best predictor that knows nothing of the robot, of one marker, or of the last one; None if
-    none was scored."""
+    """Title and error of the best predictor that knows nothing of the robot, of the given or the last marker; None if
+    none was scored.
+    """
     scored = []
     for row in summary["baselines"].values():
         errors = (row[role] or {"over_time": {}})["over_time"]

@@ -1,10 +1,10 @@
 """Which combinations of parameters the data determine, from the posterior covariance of their logarithms.
 
-The covariance of log parameters is, for a posterior that the data dominate, the inverse of their Fisher information.
-An eigenvector of it is a product of powers of parameters; a small eigenvalue means that the data determine this
-product, one that is no smaller than under the prior that they say nothing of it. Parameters that hardly correlate are
-kept apart first, so that products mix only what belongs together. A parameter that may be zero or negative has no
-logarithm to speak of: it stands by itself, in its own unit.
+The covariance of log parameters is, for a posterior that the data dominate, the inverse of their Fisher information. An
+eigenvector of it is a product of powers of parameters; a small eigenvalue means that the data determine this product,
+an eigenvalue as large as under the prior means that they do not inform it. Weakly correlated parameters are separated
+first, so that each product combines correlated parameters only. A parameter that may be zero or negative has no
+logarithm: it stands by itself, in its own unit.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Combination:
 
     Attributes:
         powers: exponent of each parameter that takes part; the largest is 1 in absolute value.
-        unit: "log" where ``sd`` is that of a logarithm, else the unit of the single parameter.
+        unit: "log" if ``sd`` refers to a logarithm, else the unit of the single parameter.
         sd: posterior standard deviation of the logarithm of the product, or of the parameter.
         prior_sd: the same under the prior; None without prior draws.
         verdict: "determined", "partly" or "free"; "unknown" without prior draws.
@@ -63,7 +63,7 @@ def identify(record: PosteriorRecord, *, names: list[str] | None = None) -> list
 
     Args:
         record: posterior, and prior draws to compare with.
-        names: parameters to look at; by default those that all recordings share.
+        names: parameters to look at; by default the parameters shared by all recordings.
     """
     chosen = [info for info in record.free if ("@" not in info.name if names is None else info.name in names)]
     varying = [info for info in chosen if np.ptp(record.flat(info.name)) > 0]
@@ -129,9 +129,9 @@ def _eigen_combinations(
 def _directions(stack: Float[np.ndarray, "parameter n"]) -> Float[np.ndarray, "parameter parameter"]:
     """Weights of the logarithms, one row per combination.
 
-    The eigenvectors of their covariance; but where one ridge dominates three parameters or more, the directions across
-    it, all determined about as well, would come out arbitrarily mixed. There they are the ratios that do not change
-    along the ridge, each against the parameter that changes most.
+    The eigenvectors of their covariance; but if one ridge dominates three parameters or more, the directions across it
+    have nearly equal variances and an arbitrary basis. In that case they are the ratios that do not change along the
+    ridge, each against the parameter that changes most.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(stack)))
     if len(values) < 3 or values[-1] < RIDGE**2 * max(values[-2], 0.0):
@@ -150,7 +150,7 @@ def _directions(stack: Float[np.ndarray, "parameter n"]) -> Float[np.ndarray, "p
 
 
 def _readable(powers: dict[str, float]) -> dict[str, float]:
-    """Largest exponent 1, the first sign positive, small ones dropped, the rest rounded to a tenth."""
+    """Largest exponent 1, the first sign positive, small exponents dropped, the rest rounded to a tenth."""
     largest = max(powers.values(), key=abs)
     kept = {n: round(p / largest, 1) for n, p in powers.items() if abs(p / largest) >= NEGLIGIBLE}
     sign = 1.0 if next(iter(kept.values())) > 0 else -1.0

@@ -27,13 +27,13 @@ CUBE_FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [
 
 
 class DrawnMotion(NamedTuple):
-    """What is drawn, in metres, in a frame whose third axis points upwards."""
+    """Geometry to draw, in metres, in a frame whose third axis points upwards."""
 
     title: str
     time: Float[np.ndarray, " time"]  # [s]
     centre: Float[np.ndarray, "time point 3"]  # line through the trunk's markers
     radius: Float[np.ndarray, " point"]
-    measured: Float[np.ndarray, "time marker 3"] | None  # recorded markers, not a number where masked
+    measured: Float[np.ndarray, "time marker 3"] | None  # recorded markers, NaN if masked
     cube: Float[np.ndarray, "time 8 3"] | None  # corners
     plate: float | None  # height
 
@@ -45,7 +45,7 @@ class DrawnMotion(NamedTuple):
 
 
 def upright(gravity: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation into a frame with z against gravity, and x along the body's axis where that is not vertical."""
+    """Rotation into a frame with z against gravity, and x along the body's axis if that is not vertical."""
     up = -np.asarray(gravity, float)
     up = up / np.linalg.norm(up) if np.any(up) else np.array([0.0, 0.0, 1.0])
     axis = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
@@ -65,7 +65,7 @@ def smooth_line(
 def tube(
     centre: Float[np.ndarray, "point 3"], radius: Float[np.ndarray, " point"]
 ) -> Float[np.ndarray, "point around 3"]:
-    """Rings around a line, each turned from the one before by the least rotation."""
+    """Rings around a line, each turned by the least rotation from its predecessor."""
     tangent = np.gradient(centre, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     side = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
@@ -154,7 +154,7 @@ def save_frames(motion: DrawnMotion, folder: Path, frames_per_second: int) -> li
 
 
 def _populate(plotter: Any, pyvista: Any, motion: DrawnMotion, row: int) -> None:
-    """Put the surfaces of one instant before a camera that stays where it is."""
+    """Put the surfaces of one instant before a fixed camera."""
     for name, points, faces in _surfaces(motion, row):
         mesh = pyvista.PolyData(points, np.insert(faces, 0, 4, axis=1).ravel())
         plotter.add_mesh(mesh, color=ACCENT if name == "cube" else POSTERIOR, smooth_shading=name == "trunk")

@@ -28,7 +28,7 @@ AXES = ("along [mm]", "across [mm]", "up [mm]")
 INSTANTS = 6
 """Instants that a still shows."""
 TICKS = 5
-"""Ticks along the longest axis in space; shorter ones have fewer, so that their labels do not meet."""
+"""Ticks along the longest axis in space; shorter axes have fewer, so that their labels do not meet."""
 GROUND = "#D9D9D9"
 MILLIMETRES = 1e3
 
@@ -72,7 +72,7 @@ def _hull(points: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "outline 2
 
 
 def _draw(motion: DrawnMotion, row: int, space: Any, flat: dict[str, Axes], colour: Any, alpha: float) -> list[Any]:
-    """Trunk, cube and measured markers at one instant; returns what was drawn."""
+    """Trunk, cube and measured markers at one instant; returns the artists."""
     centre, radius = MILLIMETRES * motion.centre[row], MILLIMETRES * motion.radius
     rings = tube(centre, radius)
     drawn: list[Any] = [space.plot_surface(*np.moveaxis(rings, 2, 0), color=colour, alpha=alpha, linewidth=0)]
@@ -112,7 +112,7 @@ def save_still(motion: DrawnMotion, path: Path) -> None:
 
 
 def save_animation(motion: DrawnMotion, path: Path, frames_per_second: int) -> None:
-    """Write an animation in real time as GIF, or as MP4 where ffmpeg is installed.
+    """Write an animation in real time as GIF, or as MP4 if ffmpeg is installed.
 
     Raises:
         InputError: an MP4 without ffmpeg.

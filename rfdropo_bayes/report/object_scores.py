@@ -1,8 +1,8 @@
-"""How well the final position of a pushed object is predicted, as a distribution, beside what its repeats know.
+"""Scores of the predicted final position of a pushed object, as a distribution, compared with its repeats.
 
 The energy score E|X - y| - E|X - X'| / 2 of a predicted distribution X and an outcome y is smallest in expectation for
-the true distribution (Gneiting and Raftery 2007, eq. 21), and the distance |x - y| where X is a point. Contact is
-chaotic, so that a point cannot be asked for. Both expectations are unbiased averages over draws, so that ensembles of
+the true distribution (Gneiting and Raftery 2007, eq. 21), and the distance |x - y| if X is a point. Contact is chaotic,
+so that no point prediction is possible. Both expectations are unbiased averages over draws, so that ensembles of
 different sizes compare (Ferro 2014).
 """
 
@@ -23,14 +23,14 @@ from rfdropo_bayes.report.scores import FINAL_ROWS, MILLIMETRES
 
 @dataclass(frozen=True)
 class ObjectScore:
-    """Of the final position of one recording's object.
+    """Scores of the final position of one recording's object.
 
     Attributes:
-        energy_score_mm: of the predictive draws.
-        error_mm: distance of their mean from where the object ended.
-        repeats_mm: energy score of the other repeats of the same commands, mean over each left out in turn; None with
-            fewer than three.
-        held_mm: distance between where it stood and where it ended, the score of who says that it stays.
+        energy_score_mm: energy score of the predictive draws.
+        error_mm: distance of their mean from the object's final position.
+        repeats_mm: energy score of the other repeats of the same commands, mean over leave-one-out; None with fewer
+            than three.
+        held_mm: distance between its first and final position, the score of predicting no motion.
     """
 
     energy_score_mm: float

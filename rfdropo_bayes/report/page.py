@@ -49,7 +49,7 @@ SECTIONS = (
 
 @dataclass(frozen=True)
 class RecordingView:
-    """Figures of one recording; ``opened`` ones are unfolded."""
+    """Figures of one recording; an ``opened`` view is unfolded."""
 
     name: str
     split: str
@@ -104,7 +104,7 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A number for people; an en dash where there is none."""
+    """A number for people; an en dash if there is none."""
     if value is None:
         return NOTHING
     if isinstance(value, bool):
@@ -178,7 +178,9 @@ def _grouped(value: float) -> str:
 
 
 def _prior_rows(record: PosteriorRecord) -> list[tuple[str, ParameterInfo]]:
-    """Name and facts of every inferred parameter; one line for those that many recordings have of a kind."""
+    """Name and facts of every inferred parameter; one line for all parameters of a kind that belong to single
+    recordings.
+    """
     kinds: dict[tuple[str, str], list[ParameterInfo]] = {}
     for info in record.free:
         kinds.setdefault((info.name.split("@")[0] if "@" in info.name else info.name, str(info.prior)), []).append(info)
@@ -189,7 +191,7 @@ def _prior_rows(record: PosteriorRecord) -> list[tuple[str, ParameterInfo]]:
 
 
 def _posterior_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The posterior table in units that read well, the same one for a parameter in all recordings."""
+    """The posterior table in units that read well, one unit per parameter for all recordings."""
     magnitude: dict[str, float] = {}
     for name, row in summary["parameters"].items():
         base = name.split("@")[0]
@@ -204,7 +206,7 @@ def _posterior_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _error_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Model first, then the predictors without a simulator; the parts are those of the test, else of the fit."""
+    """Model first, then the predictors without a simulator; errors by part are of the test, else of the fit."""
 
     def row(title: str, own: bool, errors: Mapping[str, Any]) -> dict[str, Any]:
         last = {r: list(errors[r]["over_time"].values())[-1] if errors.get(r) else None for r in ("fit", "test")}
@@ -224,7 +226,7 @@ def _error_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures of the run as a whole; those that there is nothing for are None."""
+    """Figures of the run as a whole; None for a figure without data."""
     rows = _error_rows(summary)
     floor = summary.get("noise_floor_mm")
     scored = any(row[role] is not None for row in rows for role in ("fit", "test"))
@@ -304,7 +306,7 @@ def _recording_view(
 
 
 def limits(summary: Mapping[str, Any]) -> list[str]:
-    """Sentences that hold for every run, those that hold for this one, and those the caller added."""
+    """Sentences on limits of every run and of this run, and the caller's."""
     sentences = [
         "Every interval is conditional on the simulator being right but for its parameters and the stated noise. A "
         "mechanism that is missing (friction, hysteresis, creep, a delay) is taken up by the parameters, which then "
@@ -313,7 +315,7 @@ def limits(summary: Mapping[str, Any]) -> list[str]:
         "gives the same motion. Only ratios are then known, unless a force or a mass was measured.",
     ]
     if not summary["rmse"]["test"]:
-        sentences.append("No recording was kept back: the errors are those of the data that were fitted.")
+        sentences.append("No recording was kept back: the errors are of the fitted data.")
     if not summary.get("noise_floor_mm"):
         sentences.append("No experiment was repeated, so nothing tells measurement noise from error of the model.")
     if summary["recordings"] and all(r["synthetic"] for r in summary["recordings"]):
@@ -322,7 +324,8 @@ def limits(summary: Mapping[str, Any]) -> list[str]:
     if masked:
         total = sum(r["positions"] for r in summary["recordings"])
         sentences.append(
-            f"{masked} of {total} marker positions are left out as recording faults; what happened then is unknown."
+            f"{masked} of {total} marker positions are left out as recording faults; the motion at these "
+            "times is unknown."
         )
     chains = [row.get("r_hat") for row in summary["parameters"].values()]
     if chains and all(value is None for value in chains):

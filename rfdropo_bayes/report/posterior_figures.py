@@ -22,7 +22,9 @@ RIDGE = 0.9
 
 
 def paired_names(record: PosteriorRecord) -> list[str]:
-    """Parameters that the pair plot shows: shared ones that vary, the most correlated first if there are too many."""
+    """Parameters that the pair plot shows: varying shared parameters, the most correlated first if there are too
+    many.
+    """
     names = [i.name for i in record.free if "@" not in i.name and np.ptp(record.flat(i.name)) > 0]
     if len(names) <= MOST_PAIRED:
         return names
@@ -51,7 +53,7 @@ class _Scale:
         self.limits = np.clip(limits, info.low / self.factor, info.high / self.factor)
 
     def forward(self, values: np.ndarray) -> np.ndarray:
-        """From SI values to where they lie on an even axis."""
+        """Transform SI values to the scale of the axis."""
         values = np.asarray(values) / self.factor
         return np.log(values) if self.log else values
 

@@ -10,13 +10,12 @@ import numpy as np
 
 from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.posteriors import PosteriorRecord, contradiction, contradicts
-from rfdropo_bayes.report.headline import best_baseline
+from rfdropo_bayes.report.headline import FEW_DRAWS, best_baseline
 
 BAND = "0.9"
 TIP = "tip"  # a marker of this name needs no other words
 OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
-FEW_DRAWS = 100.0  # effective ones
-CHOSEN = ("rfdropo", "adapt")  # methods whose draws are as many as were asked for, and no chain
+CHOSEN = ("rfdropo", "adapt")  # methods with a requested number of draws, and no chain
 NAMED = 3  # parameters that a sentence names
 UNMIXED = 1.1  # R-hat
 HALF = 0.5  # of a variance: beyond it, most of an error is systematic
@@ -36,8 +35,8 @@ class Safety:
     Attributes:
         verdict: "safe", "with care" or "unsafe".
         sentence: the same in words.
-        reasons: against, worst first.
-        advice: what to observe when drawing.
+        reasons: reasons against it, worst first.
+        advice: recommendations for drawing.
     """
 
     verdict: str
@@ -51,7 +50,7 @@ class Safety:
 
 
 def judge(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
-    """Judge a posterior by the numbers of its summary (without its key "randomisation")."""
+    """Rate a posterior by the numbers of its summary (without its key "randomisation")."""
     against = [*_bands(summary), *_against_baselines(summary), *_sampling(summary), *_conflicts(record)]
     slight = [*_systematic(summary), *_reservations(summary)]
     verdict = "unsafe" if against else "with care" if slight else "safe"
@@ -125,8 +124,9 @@ def _systematic(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> list[str]:
-    """Markers whose error, without its noise, is most of the best baseline's. Noise is what repeats differ by, or,
-    without repeats, the share of the squared error that does not last from row to row."""
+    """Markers whose error, without its noise, is most of the best baseline's. Noise is the spread between repeats or,
+    without repeats, the uncorrelated share of the squared error.
+    """
     floor, correlation, places = summary["noise_floor_mm"] or {}, summary["error_correlation"]["test"], []
     for marker, error in errors.items():
         best = best_baseline(summary, "test", marker)
@@ -144,7 +144,7 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
     few = [name for name, row in rows.items() if (row.get("ess_bulk") or np.inf) < FEW_DRAWS]
     if few and summary["method"] not in CHOSEN:
         named = ", ".join(few[:NAMED]) + (f" and {len(few) - NAMED} more" if len(few) > NAMED else "")
-        found.append(f"fewer than {FEW_DRAWS:.0f} effective draws of {named}")
+        found.append(f"fewer than {FEW_DRAWS} effective draws of {named}")
     apart = [name for name, row in rows.items() if (row.get("r_hat") or 1.0) > UNMIXED]
     if apart:
         found.append(f"independent runs disagree about {', '.join(apart)}")
@@ -156,7 +156,7 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _conflicts(record: PosteriorRecord) -> list[str]:
-    """Parameters whose posterior lies where the prior hardly is: the data contradict the prior, or the model."""
+    """Parameters whose posterior has little prior mass: the data contradict the prior, or the model."""
     known = [info.name for info in record.free if info.name in record.prior]
     names = [name for name in known if contradicts(record.flat(name), record.prior[name])]
     return [contradiction(names)] if names else []

@@ -1,4 +1,4 @@
-"""A replay in three dimensions of what was measured and what was simulated, drawn by the page itself, offline.
+"""A replay in three dimensions of measured and simulated motion, drawn by the page itself, offline.
 
 The page holds positions as whole tenths of a millimetre, and `templates/replay.js` draws them: turned by dragging,
 played, and moved to any instant.
@@ -24,14 +24,14 @@ MOST_RECORDINGS = 8
 
 @dataclass(frozen=True)
 class Track:
-    """One recording as it is replayed.
+    """Replay of one recording.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         role: "fit", "test" or "unseen".
         time: [s].
         markers: names, base to tip.
-        series: positions [m] by what they are, "measured" first; not a number where nothing is known.
+        series: positions [m] by label, "measured" first; NaN if unknown.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Track:
 
 
 def tracks_of(recordings: Sequence[RecordingPrediction]) -> list[Track]:
-    """Recordings of a calibration: measured, and simulated before the fit (where that is kept) and after it."""
+    """Recordings of a calibration: measured, and simulated before the fit (if kept) and after it."""
     found = []
     for recording in sorted(recordings, key=lambda r: r.split != "test")[:MOST_RECORDINGS]:
         series = {"measured": np.where(recording.mask[..., None], recording.observed, np.nan)}
@@ -54,12 +54,12 @@ def tracks_of(recordings: Sequence[RecordingPrediction]) -> list[Track]:
 
 
 def replay(tracks: Sequence[Track], outline: Mapping[str, Any] | None) -> Markup | None:
-    """What a page's script draws, as JSON that may stand inside a script element; None without recordings.
+    """Data of a page's script, as JSON that may stand inside a script element; None without recordings.
 
     Args:
-        tracks: to choose from; the first one is shown.
-        outline: of the robot, as `robots.robot_shape` makes it: where its base is, how wide it is, where gravity
-            points. Without one, markers are joined by a line, and the third axis points upwards.
+        tracks: replays to choose from; the first is shown.
+        outline: of the robot, as `robots.robot_shape` makes it: base, width and direction of gravity. Without an
+            outline, markers are joined by a line, and the third axis points upwards.
     """
     if not tracks:
         return None
@@ -86,6 +86,6 @@ def _plain(track: Track) -> dict[str, Any]:
 
 
 def _tenths(position: Float[np.ndarray, "time marker 3"]) -> list[int | None]:
-    """All numbers in one row, None where a position is unknown."""
+    """All numbers in one row, None for an unknown position."""
     flat = TENTHS * np.asarray(position, float).reshape(-1)
     return [None if not np.isfinite(value) else round(value) for value in flat.tolist()]

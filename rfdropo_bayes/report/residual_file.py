@@ -1,4 +1,4 @@
-"""What models leave of the fitted recordings, and the signals at ports, as a dataset: the content of residuals.nc."""
+"""Residuals of the fitted recordings and signals at ports, as a dataset: the content of residuals.nc."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from rfdropo_bayes.discrepancy.pipeline import Answer
 
 
 def residual_dataset(answer: Answer) -> xr.Dataset:
-    """Measured less simulated positions [m] of every group of repeats, by the base model and by the last one; mean and
-    deviation of the signal at every port where one was looked for [unit of the port]."""
+    """Measured less simulated positions [m] of every group of repeats, by the base and the final model; mean and
+    deviation of the signal at every examined port [unit of the port].
+    """
     measured, markers = answer.target.measurements, answer.problem.model.recordings.markers
     models: dict[str, Any] = {"base": (answer.target, answer.base.x), "last": (answer.target, answer.extended.x)}
     if answer.causes.steps:

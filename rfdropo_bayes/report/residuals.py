@@ -1,7 +1,7 @@
-"""Are the residuals of a fit what its noise model says: independent from row to row, and without far outliers?
+"""Do the residuals of a fit match its noise model: independent from row to row, without far outliers?
 
-Intervals are as wide as the noise model makes them. Where whitened residuals still go together for a while, a row says
-less than the model counts it for: intervals are too narrow by ``sqrt(1 + 2 sum of the autocorrelations)``, the factor
+Intervals are as wide as the noise model makes them. If whitened residuals are still correlated, a row carries less
+information than the model assumes: intervals are too narrow by ``sqrt(1 + 2 sum of the autocorrelations)``, the factor
 for the mean of a stationary series. For a first-order process of correlation 0.2 it is 1.2.
 """
 
@@ -25,18 +25,18 @@ REMEDIES = {
     "white": 'use noise = "auto", which finds how long the noise lasts',
     "student-t": 'use noise = "auto", which finds how long the noise lasts',
 }
-NO_REMEDY = "rfdropo audit can tell what the simulator misses"
+NO_REMEDY = "rfdropo audit can find the effect that the simulator lacks"
 
 
 class ResidualCheck(NamedTuple):
-    """What the residuals of one marker, or of all, look like after whitening by the noise model.
+    """Statistics of the whitened residuals of one marker, or of all.
 
     Attributes:
-        correlation: of whitened residuals with those of the row before.
+        correlation: between whitened residuals of successive rows.
         narrowing: factor by which intervals are too narrow.
-        correlated: this is more than chance and `TOO_NARROW`.
+        correlated: whether ``narrowing`` exceeds chance and `TOO_NARROW`.
         far: share of the whitened residuals beyond `FAR` deviations.
-        heavy: this is more than chance.
+        heavy: whether ``far`` exceeds chance.
         values: number of residuals.
     """
 
@@ -54,9 +54,9 @@ def check_residuals(
     """Check of each marker, and of all under the key ``all``.
 
     Args:
-        white: whitened residuals of each recording, NaN where masked.
+        white: whitened residuals of each recording, NaN if masked.
         markers: names of the markers.
-        counted: whether the fit counted rows by how long residuals last: no interval is too narrow then.
+        counted: whether the fit down-weighted rows by the residual correlation time; intervals are then wide enough.
     """
     own = {name: check([part[:, index] for part in white], counted) for index, name in enumerate(markers)}
     return {**own, "all": check([part.reshape(len(part), -1) for part in white], counted)}
@@ -99,7 +99,7 @@ def autocorrelations(series: Sequence[Float[np.ndarray, " time"]]) -> Float[np.n
 
 
 def residual_cautions(checks: Mapping[str, ResidualCheck], noise: str) -> list[Caution]:
-    """A caution where residuals are correlated beyond the noise model, and one where many are far off.
+    """Cautions on residuals that are correlated beyond the noise model, and on outliers.
 
     Args:
         checks: from `check_residuals`.
@@ -130,7 +130,7 @@ def _names(checks: Mapping[str, ResidualCheck], flag: str) -> str:
 
 
 def error_correlations(recordings: Sequence[RecordingPrediction], split: str) -> dict[str, float]:
-    """Correlation of each marker's prediction error with that of the row before, as it is, about zero."""
+    """Lag-one correlation of each marker's prediction error, about zero mean."""
     chosen = [r for r in recordings if r.split == split]
     found = {}
     for index, name in enumerate(chosen[0].marker_names if chosen else ()):

@@ -18,7 +18,7 @@ AXES = "xyz"
 
 @style.styled
 def robot_figure(outline: Mapping[str, Any]) -> Figure:
-    """Seen from the side, gravity in the picture where it points across the robot, and from the base.
+    """Seen from the side, with gravity in the picture if it points across the robot, and seen from the base.
 
     Args:
         outline: as `robots.robot_shape` makes it.
@@ -56,7 +56,7 @@ def draw_side(axes: Axes, outline: Mapping[str, Any], across: int, colours: Mapp
 
 
 def _section(axes: Axes, outline: Mapping[str, Any], colours: Mapping[str, str]) -> None:
-    """The section at the base, with the cables where they start."""
+    """The section at the base, with the starting points of the cables."""
     wide, high = MILLIMETRES * np.asarray(outline["half_width"])[0]
     angle = np.linspace(0.0, 2.0 * np.pi, 100)
     axes.fill(wide * np.cos(angle), high * np.sin(angle), color=style.PRIOR, alpha=0.25, linewidth=0)
@@ -73,7 +73,7 @@ def _section(axes: Axes, outline: Mapping[str, Any], colours: Mapping[str, str])
 
 
 def _gravity(axes: Axes, gravity: list[float], across: int, up: int) -> None:
-    """An arrow in the corner; a dot where gravity points out of the picture or into it."""
+    """An arrow in the corner; a dot if gravity points out of the picture or into it."""
     size = float(np.linalg.norm(gravity))
     if size == 0.0:
         return

@@ -31,7 +31,7 @@ def write_run(folder: Path, record: PosteriorRecord, summary: Mapping[str, Any],
 
 
 def rebuild_report(folder: Path) -> Path:
-    """Draw report.html again from what the folder holds, without computing anything anew; return its path.
+    """Draw report.html again from the folder's content, without new computation; return its path.
 
     Raises:
         InputError: if the folder lacks posterior.nc or summary.json, or one of them is damaged.

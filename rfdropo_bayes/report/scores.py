@@ -26,13 +26,13 @@ LEAST_HELD = 0.25  # of the rows
 
 @dataclass(frozen=True)
 class MeasuredPath:
-    """Where the markers of one recording were.
+    """Measured marker positions of one recording.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         time: [s].
         position: [m].
-        mask: True where ``position`` may be used.
+        mask: True for usable positions.
         marker_names: base to tip.
         repeat_group: equal numbers mark repeats of the same commands; -1 marks none.
     """
@@ -58,7 +58,7 @@ class MeasuredPath:
 
 
 def measured_paths(trajectories: Sequence[Trajectory]) -> list[MeasuredPath]:
-    """Paths of recordings, those with the same commands marked as repeats."""
+    """Paths of recordings, with recordings of the same commands marked as repeats."""
     group_of = {index: number for number, group in enumerate(group_repeats(trajectories)) for index in group}
     return [
         MeasuredPath(t.name, t.time, t.position, t.position_mask, t.marker_names, group_of[index])
@@ -68,7 +68,7 @@ def measured_paths(trajectories: Sequence[Trajectory]) -> list[MeasuredPath]:
 
 @dataclass(frozen=True)
 class RecordingErrors:
-    """Errors of the last marker in one recording [mm]; None where there is nothing to score.
+    """Errors of the last marker in one recording [mm]; None if there is nothing to score.
 
     ``rows_moving`` is the number of rows before the pose has settled, None if the recording does not end in a hold.
     """
@@ -82,11 +82,11 @@ class RecordingErrors:
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Errors pooled over recordings [mm]; None where there is nothing to score.
+    """Errors pooled over recordings [mm]; None if there is nothing to score.
 
     Attributes:
-        over_time: of each marker.
-        moving, final: of the last marker, over the recordings that end in a hold.
+        over_time: error of each marker over time.
+        moving, final: errors of the last marker, over the recordings that end in a hold.
         recordings: last marker, each recording by itself.
     """
 
@@ -97,12 +97,12 @@ class ErrorFigures:
 
     @property
     def headline(self) -> float | None:
-        """Of the last marker, over time."""
+        """Error of the last marker over time."""
         return list(self.over_time.values())[-1] if self.over_time else None
 
 
 def settled_rows(paths: Sequence[MeasuredPath]) -> list[int | None]:
-    """Row from which on the last marker of each recording stays where it ends; None if it is not held at all.
+    """First row after which the last marker of each recording stays at its final position; None without a hold.
 
     The final pose is the mean of the last `FINAL_ROWS` usable rows. The pose has settled at the first row after which
     the marker stays within `SETTLED_DISTANCE`, or `SETTLED_SHARE` of its largest distance from the final pose if that

@@ -44,7 +44,7 @@ def commands_figure(session: Trajectory) -> Figure:
 
 @styled
 def goal_figure(time: Float[np.ndarray, " row"], distance: Float[np.ndarray, " row"]) -> Figure:
-    """Distance [m] from the goal in the rows that saw what is to reach it."""
+    """Distance [m] from the goal in the rows that saw the marker or object that must reach it."""
     figure = Figure(figsize=(WIDTH, 2.4))
     axes = figure.add_subplot()
     axes.plot(time, MILLIMETRES * distance, marker="." if len(time) < 2 else None)
@@ -55,7 +55,7 @@ def goal_figure(time: Float[np.ndarray, " row"], distance: Float[np.ndarray, " r
 
 @styled
 def punctuality_figure(session: Trajectory, period: float) -> Figure:
-    """How late every cycle began, over time and in order of lateness; ``period`` [s] is that of the loop."""
+    """How late every cycle began, over time and in order of lateness; ``period`` of the loop [s]."""
     late = 1e3 * session.dataset["lateness"].to_numpy()
     figure = Figure(figsize=(WIDTH, 2.4))
     left, right = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""report.html of a motor session: how it ended, how the drives followed, how punctual it was, what to do next."""
+"""report.html of a motor session: end, tracking by the drives, punctuality, next steps."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ PLANNED = "finished"
 ROUTINE = "checked"
 """The kind of event that every drive has, whatever happens."""
 CLIPPED = 1e-9
-"""A command nearer to what was asked for, in its own unit, differs by rounding alone."""
+"""Rounding error of a command, in its own unit; larger differences mean that it was clipped."""
 REMEDIES = {
     "deadlines_missed": "Keep other work off this machine, and give the loop real-time scheduling: rfdropo doctor "
     "measures both.",
-    "markers_lost": "See whether the cameras see every marker at the place where the session ended.",
+    "markers_lost": "See whether the cameras see every marker in the final pose of the session.",
     "tension": "Compare the limit in [safety] with the tensions in the table below.",
-    "following_error": "Lower rate_limit_m_s, or see what holds the cable back.",
+    "following_error": "Lower rate_limit_m_s, or find the obstacle that holds the cable back.",
     "action_outside": "The policy met a scene that its training did not have: see the commands below.",
     "action_not_finite": "See the last rows of session.nc: a marker or the policy gave a number that is not finite.",
     "heartbeat_lost": "See the wiring, the supply and the terminating resistors of the bus.",
     "stale_status": "See the wiring, the supply and the terminating resistors of the bus.",
     "homing_failed": "Let the cables hang loose, turn each drum by hand, and home again.",
 }
-"""What to do first about the causes that end a session, by their word in summary.json."""
+"""First remedy for each cause that ends a session, by its key in summary.json."""
 
 
 class MotorSession(NamedTuple):
-    """What a session left.
+    """Files of a motor session.
 
     Attributes:
-        name: of its folder.
+        name: name of its folder.
         summary: content of summary.json.
         events: lines of log.jsonl.
         config: config.toml as text, and ``goal`` its goal [m] by axis.
-        recording: session.nc; None where a session recorded nothing, as a check does.
+        recording: session.nc; None if a session recorded nothing, as a check does.
     """
 
     name: str
@@ -132,12 +132,14 @@ def _pushes(recording: Trajectory) -> bool:
 
 
 def _judged(recording: Trajectory) -> str:
-    """What is to reach the goal, in words."""
+    """Name of the marker or object that must reach the goal."""
     return "the object" if _pushes(recording) else f"the last marker, {recording.marker_names[-1]},"
 
 
 def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float | None:
-    """Distance [mm] from the goal where the policy's time ended; the phases in which drives come to rest follow it."""
+    """Distance [mm] from the goal at the end of the policy's time; the phases in which drives come to rest follow
+    it.
+    """
     phase = recording.dataset["phase"].to_numpy()
     last = recording.time[phase == phase[0]][-1]
     time, distance = distance_to_goal(recording, goal)
@@ -145,8 +147,9 @@ def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float |
 
 
 def _held_back(recording: Trajectory) -> float:
-    """Share of the actions whose command in force is another than the command that was asked for. What drives are told
-    while they come to rest, or are homed, nobody has asked for."""
+    """Share of the actions whose executed command differs from the requested command. Commands during stopping and
+    homing are not counted.
+    """
     phase, asked = recording.dataset["phase"].to_numpy(), recording.dataset["asked_command"].to_numpy()
     row = np.minimum(np.searchsorted(recording.time, recording.command_time), len(phase) - 1)
     acting = phase[row] == phase[0]
@@ -155,16 +158,16 @@ def _held_back(recording: Trajectory) -> float:
 
 
 def session_steps(session: MotorSession) -> list[str]:
-    """What to do next, each a sentence with its ground."""
+    """Recommended next steps, each a sentence with its reason."""
     summary, recording, found = session.summary, session.recording, []
     cause, figures = summary["cause"], summary["figures"]
     if cause != PLANNED:
         found.append(REMEDIES.get(cause, "Correct the cause that is named above, and run --mode check again."))
     if figures and figures["missed"]:
-        found.append(f"{figures['missed']} cycles missed their time: rfdropo doctor says what this machine lacks.")
+        found.append(f"{figures['missed']} cycles missed their time: run rfdropo doctor to find the reason.")
     lacking = [channel for channel, guards in summary["without"].items() if guards]
     if lacking:
-        found.append(f"{', '.join(lacking)} lack guards: --mode check says which, and what that costs.")
+        found.append(f"{', '.join(lacking)} lack guards: --mode check lists them with their consequences.")
     if recording is None:
         return found or ["Nothing was recorded: go on with --mode home, shadow or run."]
     clipped = _held_back(recording)
@@ -177,6 +180,6 @@ def session_steps(session: MotorSession) -> list[str]:
         return [*found, "No drive has carried these commands out: this recording is no data. Go on with --mode run."]
     found.append(
         'The recording is data: put session.nc under fit in [data] with format = "netcdf", then rfdropo calibrate and '
-        "rfdropo audit say how this robot differs from its model."
+        "rfdropo audit find how this robot differs from its model."
     )
     return found

@@ -1,4 +1,6 @@
-"""One look for all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can tell apart."""
+"""One look for all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
+distinguish.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,7 @@ class Panel:
     Attributes:
         source: data URI.
         share: of the figure's width, in percent.
-        kind: "cell"; "legend"; "whole" where the figure has no parts.
+        kind: "cell"; "legend"; "whole" if the figure has no parts.
     """
 
     source: str
@@ -87,7 +89,7 @@ class Picture:
 
     Attributes:
         panels: from the upper left to the lower right.
-        alt: what it shows, for those who cannot see it.
+        alt: text for readers who cannot see it.
         caption: how to read it.
         width: in CSS pixels.
     """
@@ -165,7 +167,7 @@ def _inches(figure: Figure, box: Bbox) -> Bbox:
 def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
     """Axes that stand in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
 
-    None where the figure is one piece: a single column, axes outside of a grid, or a grid too fine to be taken apart.
+    None if the figure is one piece: a single column, axes outside of a grid, or a grid too fine to be taken apart.
     """
     shown = [axes for axes in figure.axes if axes.axison]
     specs = {axes: axes.get_subplotspec() for axes in shown}

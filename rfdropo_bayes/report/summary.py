@@ -34,12 +34,12 @@ class ParameterRow:
     """One line of the posterior table; physical (SI) units.
 
     Attributes:
-        name, unit, description: of the parameter.
-        mean, sd, q05, median, q95: of the draws.
+        name, unit, description: facts of the parameter.
+        mean, sd, q05, median, q95: statistics of the draws.
         at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
-        bound: which one, "low" or "high"; None if neither.
-        prior_q05, prior_q95: of the prior draws, None without them.
-        contraction: posterior over prior standard deviation, of the logarithm where the prior is logarithmic and for
+        bound: "low", "high" or None.
+        prior_q05, prior_q95: quantiles of the prior draws, None without them.
+        contraction: posterior over prior standard deviation, of the logarithm if the prior is logarithmic and for
             derived products.
         ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain.
         derived: a function of other parameters.
@@ -107,8 +107,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
     """The end of its prior, "low" or "high", that a posterior is piled up at; None if it is not.
 
-    Where the prior is logarithmic the comparison
-    is in logarithms; see `piled_at`.
+    If the prior is logarithmic, the comparison is in logarithms; see `piled_at`.
     """
     return piled_at(draws, *info.ends, logarithmic=info.logarithmic)
 
@@ -137,7 +136,7 @@ class ParameterSummary(_Open):
 
 
 class Evidence(_Open):
-    """Log evidence in nats; null where the method has none."""
+    """Log evidence in nats; null if the method has none."""
 
     value: float | None
     sd: float | None
@@ -163,8 +162,23 @@ class Summary(_Open):
     rmse: Errors
 
 
+def effective_draws(record: PosteriorRecord, details: Mapping[str, Any]) -> float | None:
+    """Number of independent draws that a posterior is worth; None for draws that are no posterior.
+
+    At most as many as there are distinct draws: a sampler that ran out of its budget repeats a few.
+    """
+    if record.log_likelihood is None:
+        return None
+    drawn = np.stack([record.flat(info.name) for info in record.free], axis=1)
+    distinct = len(np.unique(drawn, axis=0))
+    weighed = details.get("effective_draws")
+    return float(distinct if weighed is None else min(distinct, weighed))
+
+
 def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
-    """The content of summary.json, ready for JSON: what is not finite is null, its reason under ``not_available``."""
+    """The content of summary.json, ready for JSON: values that are not finite become null, with the reason under
+    ``not_available``.
+    """
     figures = model_errors(record)
     shares = coverage(record.recordings)
     summary = {
@@ -175,6 +189,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "rollouts": facts.rollouts,
         "evaluations": facts.evaluations,
         "excluded": dict(facts.excluded),
+        "effective_draws": effective_draws(record, facts.details),
         "parameters": {row.name: row.as_dict() for row in posterior_table(record)},
         "log_evidence": dict(zip(("value", "sd"), facts.log_evidence or (None, None), strict=True)),
         "rmse": {role: dict(errors.over_time) if errors else {} for role, errors in figures.items()},

@@ -1,5 +1,6 @@
-"""Figures of one recording: what was read, before any fit, beside the undeformed robot; measured against predicted over
-time; the marker's path; what is left over."""
+"""Figures of one recording: the data as read beside the undeformed robot, measured against predicted positions, the
+marker's path, and residuals.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +112,7 @@ def path_figure(recording: RecordingPrediction) -> Figure:
 
 @style.styled
 def residual_figure(recording: RecordingPrediction, settled: int | None) -> Figure:
-    """What is left of the last marker: per axis over time, its distance over time, and its memory.
+    """Residuals of the last marker: per axis over time, distance over time, and autocorrelation.
 
     Args:
         recording: measured and predicted.
@@ -203,7 +204,7 @@ def recording_figure(trajectory: Trajectory, rest: Mapping[str, Any] | None) -> 
     half = (rows + 1) // 2
     for place, across in ((grid[:half, 1], 0), (grid[half:, 1], 1)):
         _rest(figure.add_subplot(place), trajectory, rest, across)
-    figure.suptitle(f"{trajectory.name}: what was read, in the frame of the robot's base")
+    figure.suptitle(f"{trajectory.name}: data as read, in the frame of the robot's base")
     return figure
 
 

@@ -1,1 +1,1 @@
-"""What the verbs return, as objects that show themselves, draw their figures and write their files."""
+"""Results of the verbs, as objects that show themselves, draw their figures and write their files."""

@@ -1,4 +1,4 @@
-"""What an audit found, as an object that shows itself and writes its files."""
+"""Result of an audit, as an object that shows itself and writes its files."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ AUDIT, EXTENDED, REPORT, RESIDUALS = "audit.json", "extended.toml", "report.html
 
 @dataclass(frozen=True)
 class Audit:
-    """What a simulator lacks, by name.
+    """The effects that a simulator lacks, by name.
 
     Attributes:
-        content: of audit.json.
-        tables: of the experiment extended by what was adopted, as a file has them.
-        page: of the report, HTML.
-        robot: that was audited, where it was made in Python; None where the tables name it.
+        content: content of audit.json.
+        tables: experiment file with the adopted extensions, as tables.
+        page: the report as HTML.
+        robot: audited robot, if it was made in Python; None if the tables name it.
         base: folder that paths in the tables are relative to.
-        folder: that it was written to, if any.
-        shown: what its figures show; None where it was read from files.
-        answer: with its fits; None where it was read from files.
-        residuals: of the base model and of the last one, and signals at ports; None where it was read from files.
+        folder: folder with its files, if written.
+        shown: data of its figures; None if it was read from files.
+        answer: answer with its fits; None if it was read from files.
+        residuals: residuals of the base and the final model, and signals at ports; None if it was read from files.
     """
 
     content: Mapping[str, Any]
@@ -72,12 +72,12 @@ class Audit:
 
     @property
     def cautions(self) -> list[Caution]:
-        """What speaks against the answer, or its recordings."""
+        """Reasons to doubt the answer or its recordings."""
         return read_cautions(self.content["cautions"])
 
     @cached_property
     def findings(self) -> pd.DataFrame:
-        """One row per parameter of what was named: mean, 5 and 95 % quantile, unit, and how much it explains."""
+        """One row per parameter of the named effects: mean, 5 and 95 % quantile, unit, and explained share."""
         columns = ("explained_fraction", "adjusted_p", "log_bayes_factor")
         rows = [
             {"mechanism": found["mechanism"], "parameter": name, **row, **{key: found[key] for key in columns}}
@@ -94,7 +94,7 @@ class Audit:
 
     @property
     def gain(self) -> Mapping[str, Any] | None:
-        """Errors on unseen recordings without and with what was found; None where nothing was found."""
+        """Errors on unseen recordings without and with the adopted effects; None if none was adopted."""
         return self.content["gain"]
 
     @property
@@ -104,11 +104,11 @@ class Audit:
         return Model.of(spec_of(experiment, self.base, self.robot), RunSettings.of(experiment))
 
     def plot_residual(self, against: str = "time", ax: Axes | None = None) -> Axes:
-        """Draw what the base model leaves of the fitted recordings, beside what might have caused it.
+        """Draw residuals of the base model on the fitted recordings against a possible cause.
 
         Args:
             against: time, command, rate, direction (sign of the rate), position, or tension.
-            ax: that it is drawn on; axes of a new figure by default.
+            ax: axes to draw on; a new figure by default.
 
         Raises:
             InputError: no such cause. As for all figures: the audit was read from files, which do not hold them.
@@ -122,14 +122,14 @@ class Audit:
         return axes
 
     def plot_blocks(self, ax: Axes | None = None) -> Axes:
-        """Draw when each model fails: mean square of the means of blocks of rows, 1 where a model is right."""
+        """Draw when each model fails: mean square of the means of blocks of rows, 1 if a model is right."""
         axes = axes_or_new(ax)
         figures.draw_blocks(axes, self._shown())
         axes.legend()
         return axes
 
     def plot_likeness(self, ax: Axes | None = None) -> Axes:
-        """Draw how alike the candidates' signatures are: cosines, once the base parameters have done what they can."""
+        """Draw the cosines between the candidates' signatures, after projection on the base parameters."""
         axes = axes_or_new(ax)
         figures.draw_cosines(axes, self._shown())
         return axes
@@ -148,10 +148,10 @@ class Audit:
         return axes
 
     def plot_remainder(self, ax: Axes | None = None) -> Axes:
-        """Draw what the last model leaves of the last marker, with two standard deviations.
+        """Draw the final model's residual at the last marker, with two standard deviations.
 
         Raises:
-            InputError: it leaves nothing but noise.
+            InputError: the residual is noise only.
         """
         if self._shown().remainder is None:
             raise InputError("the last model leaves nothing but noise", where="audit", remedy="draw another figure")

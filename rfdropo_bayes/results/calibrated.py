@@ -1,4 +1,4 @@
-"""What a calibration found, as an object that shows itself, draws its figures and writes its files."""
+"""Result of a calibration, as an object that shows itself, draws its figures and writes its files."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ LABELS = 0.18  # share of the axes that labels beside and below a pair plot take
 
 @dataclass(frozen=True)
 class Calibration:
-    """A posterior with its predictions, and what is to be said of it.
+    """A posterior with its predictions, and its summary.
 
     Attributes:
         record: draws and predictions as plain arrays.
-        content: of summary.json.
+        content: content of summary.json.
         config: the experiment as TOML.
-        model: that was fitted; None where it was read from files and cannot be made again from them.
-        folder: that it was written to, if any.
+        model: fitted model; None if it cannot be rebuilt from files.
+        folder: folder with its files, if written.
     """
 
     record: PosteriorRecord
@@ -58,7 +58,7 @@ class Calibration:
 
     @classmethod
     def of_posterior(cls, folder: Path, model: Model) -> Calibration:
-        """The posterior in a folder with the model that was fitted, and nothing else said of it.
+        """The posterior in a folder with the model that was fitted, and no further content.
 
         Raises:
             InputError: no posterior there, or a damaged one.
@@ -77,7 +77,7 @@ class Calibration:
 
     @property
     def cautions(self) -> list[Caution]:
-        """What speaks against the draws."""
+        """Reasons to doubt the draws."""
         return read_cautions(self.content.get("cautions", []))
 
     @property
@@ -92,7 +92,7 @@ class Calibration:
 
     @property
     def log_evidence(self) -> tuple[float | None, float | None]:
-        """Value and standard deviation [nats]; None where the method has none."""
+        """Value and standard deviation [nats]; None if the method has none."""
         found = self.content["log_evidence"]
         return found["value"], found["sd"]
 
@@ -146,10 +146,10 @@ class Calibration:
         """Draw one coordinate of one marker over time: measured, with its 50 % and 90 % predictive bands.
 
         Args:
-            recording: name or number of the recording, fitted ones first.
+            recording: name or number of the recording, fitted recordings first.
             marker: name or number of the marker; the last by default.
-            axis: ``"x"``, ``"y"`` or ``"z"``; the one along which it moves most by default.
-            ax: that it is drawn on.
+            axis: ``"x"``, ``"y"`` or ``"z"``; the axis of largest motion by default.
+            ax: axes to draw on.
 
         Raises:
             InputError: no such recording, marker or axis.
@@ -208,7 +208,7 @@ class Calibration:
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """The axes that were given, or those of a new figure."""
+    """The given axes, or the axes of a new figure."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt

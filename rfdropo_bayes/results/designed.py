@@ -17,10 +17,10 @@ COMMANDS, DESIGN = "next_commands.csv", "design.json"
 
 @dataclass(frozen=True, repr=False)
 class Design:
-    """The commands to record next, and what they will decide.
+    """The commands to record next, and the question they decide.
 
     Attributes:
-        content: of design.json.
+        content: content of design.json.
         commands: the proposal, a column for the time and one for each channel, as the recordings have them.
     """
 
@@ -29,7 +29,7 @@ class Design:
 
     @property
     def sentence(self) -> str:
-        """What to record, and what it will tell."""
+        """The recommended recording and its expected result."""
         return str(self.content["sentence"])
 
     def save(self, folder: Path | str) -> Path:

@@ -1,4 +1,4 @@
-"""What earlier runs wrote, as the objects that the functions return."""
+"""Results of earlier runs, as the objects that the functions return."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def load(folder: Path | str, model: Model | None = None) -> Calibration | Audit:
     """Read the folder of a calibration or of an audit.
 
     Args:
-        folder: that the run wrote.
-        model: that was calibrated, for predictions; that of the folder's config.toml by default. No file describes a
-            black box, or a mechanism, that was made in Python.
+        folder: folder of the run.
+        model: that was calibrated, for predictions; by default rebuilt from the folder's config.toml. No file describes
+            a black box, or a mechanism, that was made in Python.
 
     Raises:
         InputError: the folder holds neither, or a damaged file.

@@ -9,12 +9,12 @@ from rfdropo_bayes.tables import nearest
 
 
 def entry_number(given: str | int, names: Sequence[str], what: str) -> int:
-    """The number of an entry, from 0 on, that a name or a number (negative ones from the end) stands for.
+    """The number of an entry, from 0 on, for a name or a number (negative numbers count from the end).
 
     Args:
         given: name or number.
-        names: of all entries.
-        what: an entry is, such as "marker".
+        names: names of all entries.
+        what: kind of entry, such as "marker".
 
     Raises:
         InputError: no such entry.

@@ -1,4 +1,4 @@
-"""What a prediction says, as an object that shows itself, draws its bands and writes its files."""
+"""Result of a prediction, as an object that shows itself, draws its bands and writes its files."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ OBJECT = "object"
 
 @dataclass(frozen=True, repr=False)
 class Prediction:
-    """What a calibrated simulator expects of commands that were never run.
+    """Prediction of a calibrated simulator for commands that were never run.
 
     Attributes:
-        bands: mean and 5, 25, 75 and 95 % quantiles [m] of what would be measured, (time, marker, axis).
-        drawn: the same as draws.
-        group: that the commands were taken to belong to.
-        group_fitted: whether the posterior has values of it; None where nothing differs between groups.
-        cautions: what speaks against the prediction.
-        unseen: what is known of the error on a day that no fit has seen; empty for other days.
+        bands: mean and 5, 25, 75 and 95 % quantiles [m] of the predicted measurement, (time, marker, axis).
+        drawn: draws of the predicted measurement.
+        group: assumed group of the commands.
+        group_fitted: whether the posterior has values of the group; None if groups share all parameters.
+        cautions: reasons to doubt the prediction.
+        unseen: facts on the error in a session that no fit has seen; empty for other sessions.
     """
 
     bands: xr.Dataset

@@ -12,9 +12,9 @@ from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 
 def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:
-    """x^(-1/4), x^(-1/2) and x, less their values at the reference ratio, where x = 1 - 2 nu.
+    """x^(-1/4), x^(-1/2) and x, less their values at the reference ratio, with x = 1 - 2 nu.
 
-    Together they follow the bending stiffness of necks, locking ones too, within 3 % from nu = 0.1 to 0.499.
+    Together they follow the bending stiffness of necks, also of locking necks, within 3 % from nu = 0.1 to 0.499.
     """
     here, there = 1.0 - 2.0 * poisson_ratio, 1.0 - 2.0 * reference
     return here**-0.25 - there**-0.25, here**-0.5 - there**-0.5, here - there
@@ -30,9 +30,9 @@ class PointMass(RobotTable):
 class Body(RobotTable):
     """A body of layers along z, from the clamp (first station) to the tip; each is one element of a rod or several.
 
-    A layer's section is effective: the profile is what makes the layer's ends move as those of the real body do under
-    unit moments, force and torque, whatever its true shape in between. Poisson's ratio acts on shear and torsion alone,
-    unless ``poisson_stiffening`` says more: wide vertebrae keep a neck from contracting, and linear tetrahedra lock.
+    A layer's section is effective: the profile makes the layer's ends move like the real body's under unit moments,
+    force and torque, for any true shape in between. Poisson's ratio acts on shear and torsion alone, unless
+    ``poisson_stiffening`` says more: wide vertebrae keep a neck from contracting, and linear tetrahedra lock.
     """
 
     station_m: tuple[float, ...] = Field(
@@ -70,7 +70,7 @@ class Body(RobotTable):
         "robots.body.poisson_terms; empty if it does not",
     )
     volume_m3: Positive = Field(
-        description="volume of the whole body, clamped part included: what the trunk mass is divided by",
+        description="volume of the whole body, clamped part included; the density is the trunk mass over this volume",
     )
     point_masses: tuple[PointMass, ...] = Field(default=(), description="rigid parts on top of the body's own mass")
 

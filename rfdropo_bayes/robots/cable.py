@@ -17,14 +17,14 @@ UNITS = {"displacement": "m", "tension": "N"}
 class Cable(RobotTable):
     """A cable that runs at one azimuth, parallel to the axis or tapering towards it.
 
-    It starts at the anchor, a point fixed to the base, and passes the guides on to the last one, where it ends.
+    It starts at the anchor, a point fixed to the base, and passes the guides to its end at the last guide.
     """
 
     name: Name = Field(description="unique among the robot's cables")
-    azimuth_deg: float = Field(description="where it runs, from +x towards +y")
+    azimuth_deg: float = Field(description="azimuth of the cable, from +x towards +y")
     anchor_z_m: float = Field(description="axial coordinate of the anchor, a point fixed to the base")
     anchor_radius_m: Positive = Field(description="distance of the anchor from the axis")
-    anchor_azimuth_deg: float | None = Field(default=None, description="azimuth of the anchor, where it differs")
+    anchor_azimuth_deg: float | None = Field(default=None, description="azimuth of the anchor, if it differs")
     guide_z_m: tuple[float, ...] = Field(
         min_length=1,
         description="axial coordinates of the guides in the undeformed body; the cable ends at the last",
@@ -64,23 +64,23 @@ class Cable(RobotTable):
 
     @property
     def unit(self) -> str:
-        """Of what drives it."""
+        """Unit of its drive: a displacement or a tension."""
         return UNITS[self.drive]
 
     @property
     def limit(self) -> Pair:
-        """Least and greatest of what drives it [m or N]."""
+        """Least and greatest drive of the cable [m or N]."""
         given = getattr(self, LIMITS[self.drive])
         assert given is not None
         return given
 
     def anchor(self) -> Float[np.ndarray, "3"]:
-        """Where the cable leaves the base [m]."""
+        """Point at which the cable leaves the base [m]."""
         azimuth = self.azimuth_deg if self.anchor_azimuth_deg is None else self.anchor_azimuth_deg
         return _points(azimuth, self.anchor_radius_m, self.anchor_z_m)[0]
 
     def guides(self) -> Float[np.ndarray, "guide 3"]:
-        """Guide points in the undeformed body [m], the last is where the cable ends."""
+        """Guide points in the undeformed body [m], the cable ends at the last."""
         return _points(self.azimuth_deg, self.guide_radius_m, self.guide_z_m)
 
 
@@ -91,7 +91,7 @@ def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[
 
 
 class Channels(RobotTable):
-    """How commands become what drives cables: ``radius * gain @ command``."""
+    """Map from commands to the drives of cables: ``radius * gain @ command``."""
 
     names: tuple[Name, ...] = Field(
         min_length=1,
@@ -103,7 +103,7 @@ class Channels(RobotTable):
     )
     radius_parameter: Name | None = Field(
         default=None,
-        description="parameter [m] that turns an angle [rad] into a length; absent where commands are lengths",
+        description="parameter [m] that turns an angle [rad] into a length; absent if commands are lengths",
     )
 
     @model_validator(mode="after")

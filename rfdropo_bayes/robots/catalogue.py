@@ -1,4 +1,4 @@
-"""Robot files by name: those that come with the package, or any path."""
+"""Robot files by name: bundled robots, or any path."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rfdropo_bayes.tables import read_toml
 
 PACKAGE = Path(__file__).resolve().parents[1]
 FOLDERS = (PACKAGE / "models" / "robots", PACKAGE.parent / "models" / "robots")
-"""Where robot files lie: inside an installed package, and beside it in a clone."""
+"""Folders of robot files: inside an installed package, and beside it in a clone."""
 
 
 def known_robots() -> dict[str, Path]:
@@ -22,7 +22,7 @@ def known_robots() -> dict[str, Path]:
 
 
 def robot_tables(path: Path) -> dict[str, Any]:
-    """Tables of a robot file, with those of the robots it is based on, and its body as a section profile.
+    """Tables of a robot file, merged with its base robots, and its body as a section profile.
 
     Raises:
         InputError: an unreadable file, an unknown base, or shapes that make no body.
@@ -34,7 +34,7 @@ def robot_tables(path: Path) -> dict[str, Any]:
 
 
 def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Tables of a robot file; those it has itself replace those of the robot that it names as its ``base``."""
+    """Tables of a robot file; its own tables replace the tables of its ``base``."""
     try:
         table = read_toml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:

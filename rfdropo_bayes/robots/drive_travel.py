@@ -1,4 +1,4 @@
-"""What the owner knows of the drives: limits of travel, where counters start, and what happens to commands beyond."""
+"""Known properties of the drives: limits of travel, start of the counters, and effect of commands beyond the limits."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Values = float | tuple[float, ...]
 
 
 class DriveTravel(RobotTable):
-    """How drives answer commands: limits, start and size of their counters, of some cables in some recordings.
+    """Limits, start and size of drive counters, for some cables in some recordings.
 
-    Numbers are those of the drive's counter, one for all of the table's cables or one for each.
+    Numbers are counts, one for all cables of the table or one per cable.
     """
 
     cables: Literal["all"] | tuple[str, ...] = Field(
@@ -44,10 +44,10 @@ class DriveTravel(RobotTable):
     )
     count_size: float = Field(
         default=1.0,
-        description="pull per count [m or rad, as the commands]; negative where the counter falls as a cable is pulled",
+        description="pull per count [m or rad, as the commands]; negative if the counter falls as a cable is pulled",
     )
     beyond: Literal["lost", "kept", "clipped"] = Field(
-        description='what happens to a command beyond a limit: "lost", the drive ignores all of it; "clipped", it goes '
+        description='effect of a command beyond a limit: "lost", the drive ignores all of it; "clipped", it goes '
         'to the limit and forgets the rest; "kept", it waits at the limit until the commands come back',
     )
 
@@ -71,7 +71,7 @@ class DriveTravel(RobotTable):
         return self
 
     def _each(self, name: str, count: int) -> Float[np.ndarray, " cable"]:
-        """Values of one key for each cable; infinite where no limit is given, not a number without a start."""
+        """Values of one key for each cable; infinite without a limit, NaN without a start."""
         value = getattr(self, name)
         return np.broadcast_to(np.asarray(_NUMBERS[name] if value is None else value, float), (count,))
 
@@ -81,10 +81,10 @@ class DriveTravel(RobotTable):
         return group in patterns or any(fnmatchcase(whole(recording), pattern) for pattern in patterns)
 
     def columns(self, channels: Sequence[str]) -> list[int]:
-        """Where its cables are among the command channels.
+        """Indices of its cables among the command channels.
 
         Raises:
-            InputError: a cable that is none of them.
+            InputError: a cable that is no channel.
         """
         named = channels if self.cables == "all" else self.cables
         for name in named:
@@ -98,7 +98,7 @@ _NUMBERS = {"low": -np.inf, "high": np.inf, "start": np.nan}
 
 @dataclass(frozen=True)
 class Travel:
-    """Limits of every channel in one recording, as commands [m or rad], and what happens beyond them."""
+    """Limits of every channel in one recording, as commands [m or rad], and their effect on commands."""
 
     low: Float[np.ndarray, " channel"]
     high: Float[np.ndarray, " channel"]
@@ -108,7 +108,7 @@ class Travel:
     def follow(
         self, initial: Float[np.ndarray, " channel"], command: Float[np.ndarray, "command channel"]
     ) -> Float[np.ndarray, "command channel"]:
-        """Commands as the drives take them, given those that were sent, cumulative [m or rad]."""
+        """Commands after the limits of the drives, from sent commands, cumulative [m or rad]."""
         forgotten, before = np.zeros_like(initial, float), np.asarray(initial, float)
         taken = np.empty_like(command, dtype=float)
         for row, sent in enumerate(np.asarray(command, float)):
@@ -122,11 +122,11 @@ class Travel:
         before: Float[np.ndarray, "*lane channel"],
         sent: Float[np.ndarray, "*lane channel"],
     ) -> tuple[Float[np.ndarray, "*lane channel"], Float[np.ndarray, "*lane channel"]]:
-        """All that has been forgotten after a command, and where the drives take it.
+        """The sum of forgotten motion after a command, and the command after the limits.
 
         Args:
-            forgotten: of the commands before.
-            before: where the drives took the last of them.
+            forgotten: sum of forgotten motion before.
+            before: last command after the limits.
             sent: the command, cumulative.
         """
         asked = sent - forgotten
@@ -143,14 +143,14 @@ def travel_in(
     initial: Float[np.ndarray, " channel"],
     group: str = "",
 ) -> Travel | None:
-    """What is stated of the drives in one recording; None if nothing is.
+    """Stated limits of the drives in one recording; None if nothing is stated.
 
     Args:
-        tables: of a robot and its experiment.
+        tables: tables of a robot and its experiment.
         channels: names of the command channels.
         recording: name of the recording.
         initial: command before its first row [m or rad].
-        group: that it belongs to.
+        group: group of the recording.
 
     Raises:
         InputError: an unknown cable, two tables that state the travel of one cable, or a recording that begins outside.
@@ -187,10 +187,10 @@ def travel_in(
 def unstated_travel(
     tables: Sequence[DriveTravel], channels: Sequence[str], belonging: Mapping[str, str]
 ) -> list[Caution]:
-    """A caution where the travel of cables is stated for other recordings, and for some of these is not.
+    """A caution if the travel of cables is stated for other recordings, but not for some of these.
 
     Args:
-        tables: of a robot and its experiment.
+        tables: tables of a robot and its experiment.
         channels: names of the command channels.
         belonging: the group of each recording.
     """

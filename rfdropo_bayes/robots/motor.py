@@ -1,4 +1,4 @@
-"""Motors that wind the cables: from length to counts, from torque to tension, and what a motor may do."""
+"""Motors that wind the cables: from length to counts, from torque to tension, and the limits of a motor."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _LEAST_LIMIT = 10.0  # [per mille]: drives tell and limit torque in whole per mi
 class Motor(RobotTable):
     """The drive of one command channel: a motor with encoder, gear and drum, and its limits.
 
-    Lengths are cable wound up by the drum [m], pull > 0, from where homing put zero. Counts rise with the length where
+    Lengths are cable wound up by the drum [m], pull > 0, from the zero of homing. Counts rise with the length if
     ``sign`` is +1.
     """
 
     channel: Name = Field(description="command channel that it drives")
     node: int = Field(ge=1, le=127, description="CANopen node of the drive")
     axis: int = Field(default=1, ge=1, le=8, description="axis of that node, for drives of several motors")
-    sign: int = Field(description="+1 where counts rise as the cable is pulled, else -1")
+    sign: int = Field(description="+1 if counts rise as the cable is pulled, else -1")
     drum_radius_m: Positive = Field(description="radius at which the cable is wound")
     gear: Positive = Field(description="turns of the motor per turn of the drum")
     counts_per_turn: Positive = Field(description="counts of the encoder per turn of the motor")

@@ -13,20 +13,21 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, body_tables, section_profile
 
 SILICONE = 1070.0
-"""Density [kg/m3] where no mass is given: that of most silicone rubbers."""
+"""Density [kg/m3] if no mass is given; typical of silicone rubbers."""
 GRAVITY = 9.81
 DIRECTIONS = {f"{sign}{axis}": (sign, "xyz".index(axis)) for sign in "+-" for axis in "xyz"}
 SHAPES = ("cylinder", "cone", "tube", "disks")
 CABLES_AT = 0.75
-"""Distance of cables from the axis over the body's radius, where it is not given."""
+"""Distance of cables from the axis over the body's radius, if it is not given."""
 DISKS = 10
 """Disks of a body if their number is not given, or the next number that shares out over the segments."""
 LEAST_GUIDES, GUIDES_PER_SEGMENT = 8, 4
-"""Heights of guides, and layers of a body that does not taper: their elements are within .2 % of the limit where four
-cables bend a silicone arm by up to 1.5 rad, .6 % where it is five times softer. A cone with a tip of .6 of its base's
-radius has twice as many (.6 %), at .3 four times (.4 % up to half a radian)."""
+"""Heights of guides, and layers of a body that does not taper: their elements are within .2 % of the limit if four
+cables bend a silicone arm by up to 1.5 rad, and .6 % for a body five times softer. A cone with a tip of .6 of its
+base's radius has twice this number (.6 %), and at .3 four times this number (.4 % up to half a radian).
+"""
 KNOWN, ASSUMED = 0.3, 1.0
-"""Standard deviation of the logarithm in the prior of what was given, and of what was taken as a default."""
+"""Standard deviation of the logarithm in the prior of a given value, and of a default."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +35,19 @@ class RobotOutline:
     """Answers that make a robot; lengths in m, in the frame of the base: z along the body, away from the clamp.
 
     Attributes:
-        name: of the robot and of its file.
-        length, radius: of the body, the latter at its base.
+        name: name of the robot and of its file.
+        length, radius: length of the body, and radius at its base.
         markers: heights along the axis by name.
         shape: "cylinder", "cone" (with ``tip_radius``), "tube" (with ``inner_radius``), or "disks" on a backbone.
-        segments: each has cables of its own, which end where it ends.
-        cables: of each segment, evenly around it.
+        segments: number of segments, each with cables that end at its end.
+        cables: number of cables per segment, evenly around it.
         cable_radius: distance of the cables from the axis at the base; they follow the taper.
-        pairs: opposite cables share a motor: what one pulls in, the other lets out.
+        pairs: opposite cables share a motor: one cable is wound as the other is released.
         command_unit: "m" of cable or "rad" of a motor, whose spool then has ``spool_radius``.
-        gravity: direction in which things fall, such as "+z" for a robot that hangs.
-        mass: [kg]; None for silicone of that volume.
-        young_modulus: [Pa].
-        assumed: names of those above that were not given but taken as defaults.
+        gravity: direction of gravity, such as "+z" for a robot that hangs.
+        mass: mass of the body [kg]; None for silicone of its volume.
+        young_modulus: Young's modulus [Pa].
+        assumed: names of attributes that have default values.
     """
 
     name: str
@@ -72,7 +73,7 @@ class RobotOutline:
     def __post_init__(self) -> None:
         where = "robot outline"
         if self.gravity not in DIRECTIONS:
-            remedy = f"one of {', '.join(DIRECTIONS)}: where things fall, z being away from the clamp"
+            remedy = f"one of {', '.join(DIRECTIONS)}: the direction of gravity, with z away from the clamp"
             raise InputError(f"gravity = {self.gravity!r} is no direction", where=where, remedy=remedy)
         if self.command_unit not in ("m", "rad"):
             remedy = '"m" of cable or "rad" of a motor; recordings in mm or deg are converted when they are read'
@@ -96,7 +97,7 @@ class RobotOutline:
 
     @property
     def section(self) -> Cylinder | Cone | Tube | Disks:
-        """The body's shape; layers end where segments and guides do."""
+        """The body's shape; layers end at the ends of segments and at guides."""
         tip = self.radius if self.tip_radius is None else self.tip_radius
         layers = self.levels * max(1, int(np.ceil(self.radius / tip - 1e-9)))
         if self.shape == "cone":
@@ -125,7 +126,7 @@ class RobotOutline:
         return self.segments * max(GUIDES_PER_SEGMENT, -(-LEAST_GUIDES // self.segments))
 
     def guide_heights(self) -> np.ndarray:
-        """Where cables are guided: in the middle of the disks, or evenly along the body, up to its tip."""
+        """Heights of the cable guides: in the middle of the disks, or evenly along the body, up to its tip."""
         if self.shape != "disks":
             return self.length * np.arange(1, self.levels + 1) / self.levels
         station = np.array(section_profile([self.section]).station_m)
@@ -140,7 +141,7 @@ class RobotOutline:
         return [f"s{s + 1}_{word}_{k + 1}" for s in range(self.segments) for k in range(count)]
 
     def cable_names(self) -> list[str]:
-        """Of all segments, base to tip."""
+        """Names of the cables of all segments, base to tip."""
         if self.segments == 1:
             return [f"cable_{k + 1}" for k in range(self.cables)]
         return [f"s{s + 1}_cable_{k + 1}" for s in range(self.segments) for k in range(self.cables)]
@@ -177,7 +178,7 @@ def _head(o: RobotOutline) -> list[str]:
     section = o.section.model_dump()
     return [
         "# Written by rfdropo init; docs/reference/robot.md has every key. SI units, in the frame of the base: z along",
-        "# the undeformed body, away from the clamp. What is marked ASSUMED was not given: measure it, or let it be",
+        "# the undeformed body, away from the clamp. Values marked ASSUMED are defaults: measure them, or let them be",
         "# inferred.",
         f'name = "{o.name}"',
         f'description = "{o.segments} segment{"s" if o.segments > 1 else ""}, {o.segments * o.cables} cables"',
@@ -208,7 +209,7 @@ def _channels(o: RobotOutline) -> list[str]:
         column = segment * half + cable % half if o.pairs else row
         gain[row, column] = -1.0 if o.pairs and cable >= half else 1.0
     lines = [
-        "# Cable displacement = gain @ command, times the spool's radius where commands are angles; pull > 0.",
+        "# Cable displacement = gain @ command, times the spool's radius if commands are angles; pull > 0.",
         "[channels]",
         f"names = {_toml(names)}",
         "gain = [",
@@ -224,7 +225,7 @@ def _cables(o: RobotOutline) -> list[str]:
     at_base = CABLES_AT * o.radius if o.cable_radius is None else o.cable_radius
     radius = at_base * (1.0 + (tip / o.radius - 1.0) * heights / o.length)
     lines = [
-        "# Cables at their azimuth, from +x towards +y, through guides up to where they end."
+        "# Cables at their azimuth, from +x towards +y, through guides up to their ends."
         + _mark(o, "cables", "cable_radius")
     ]
     names = o.cable_names()
@@ -248,7 +249,7 @@ def _cables(o: RobotOutline) -> list[str]:
 
 
 def _markers(o: RobotOutline) -> list[str]:
-    lines = ["# Measured points where they lie in the undeformed body: x, y, z." + _mark(o, "markers")]
+    lines = ["# Measured points in the undeformed body: x, y, z." + _mark(o, "markers")]
     for name, height in o.markers.items():
         lines += ["[[markers]]", f'name = "{name}"', f"point_m = [0.0, 0.0, {height:.6g}]", ""]
     return lines
@@ -291,17 +292,18 @@ def _parameters(o: RobotOutline) -> list[str]:
         prior = log_normal("spool_radius", o.spool_radius)
         bounds = (o.spool_radius / 10.0, o.spool_radius * 10.0)
         add("spool_radius", "m", o.spool_radius, bounds, prior, "cable wound up per angle of the motor")
-    prior = 'distribution = "Normal", loc = 0.0, scale = 0.001'
-    add("initial_displacement", "m", 0.0, (-0.05, 0.05), prior, "cable displacement at zero command")
-    prior = 'distribution = "Normal", loc = 0.0, scale = 0.005'
+    prior = f'distribution = "Normal", loc = 0.0, scale = {0.005 * o.length:.6g}'
+    half = 0.5 * o.length
+    add("initial_displacement", "m", 0.0, (-half, half), prior, "cable displacement at zero command")
+    prior = f'distribution = "Normal", loc = 0.0, scale = {0.025 * o.length:.6g}'
     for axis in "xyz":
         words = f"shift of the measured positions along {axis}"
-        add(f"offset_{axis}", "m", 0.0, (-1.0, 1.0), prior, words)
+        add(f"offset_{axis}", "m", 0.0, (-5.0 * o.length, 5.0 * o.length), prior, words)
     return lines
 
 
 def _mark(o: RobotOutline, *names: str) -> str:
-    """A comment behind what was not given."""
+    """A comment that marks default values."""
     also = {"trunk_mass": "mass"}
     missing = [name for name in names if name in o.assumed or also.get(name) in o.assumed]
     return f"  # ASSUMED: {', '.join(missing)}" if missing else ""

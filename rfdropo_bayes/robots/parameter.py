@@ -17,16 +17,18 @@ ARGUMENTS = {
     "Uniform": ("low", "high"),
     "LogUniform": ("low", "high"),
 }
-"""Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is that of the logarithm."""
+"""Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is the deviation of the
+logarithm.
+"""
 ENDS = {"TruncatedNormal": ("low", "high")}
-"""Arguments that may be left out: where a normal ends, beside the hard bounds."""
+"""Optional arguments: the ends of a truncated normal inside the hard bounds."""
 
 
 class Parameter(RobotTable):
     """A physical parameter."""
 
     unit: str = Field(description='SI unit, "-" if it has none')
-    nominal: float = Field(description="value used where the parameter is not inferred")
+    nominal: float = Field(description="value used if the parameter is fixed")
     low: float = Field(description="lower hard bound, below which the model has no meaning")
     high: float = Field(description="upper hard bound")
     prior: dict[str, Any] = Field(

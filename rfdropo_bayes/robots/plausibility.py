@@ -1,6 +1,6 @@
-"""Numbers of a robot's description that no soft robot has: in another unit, such as millimetres for metres.
+"""Implausible numbers in a robot's description, such as millimetres given as metres.
 
-Bounds are far beyond what is built: they catch factors of a thousand, not bad guesses.
+Bounds are far beyond existing robots: they catch factors of a thousand, not bad guesses.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from rfdropo_bayes.robots.robot import Robot
 
 ASIDE = 20.0
-"""Lengths of the body that its anchors, half widths and spools stay within. Those of the robots at hand reach 0.08 of
-it; millimetres given as metres are fifty times the length or more."""
+"""Largest plausible anchor radius, half width or spool radius, in body lengths. The bundled robots reach 0.08 of it;
+millimetres given as metres are fifty times the length or more.
+"""
 LONGEST, SHORTEST = 20.0, 1e-3  # [m], of a body
 STRONGEST = 100.0  # [m/s2], ten times the Earth's gravity; that in mm/s2 is a hundred times as much
 SLOWEST = 1.0  # [s], of a time step
@@ -24,7 +25,7 @@ MODULI = 10.0, 1e13  # [Pa]: softer than any gel, and stiffer than diamond
 
 
 def implausible(robot: Robot) -> str | None:
-    """What cannot be in the unit that the file has it in; None where all may be."""
+    """Description of a value in an implausible unit; None if all are plausible."""
     station, half = np.array(robot.body.station_m), np.array(robot.body.half_width_m)
     length = float(station[-1] - station[0])
     if not SHORTEST <= length <= LONGEST:
@@ -48,12 +49,12 @@ def implausible(robot: Robot) -> str | None:
 
 
 def implausible_values(robot: Robot, ranges: Mapping[str, tuple[float, float]]) -> str | None:
-    """A mass or stiffness of the body that no soft robot has; None where all may be.
+    """Description of an implausible mass or stiffness of the body; None if all are plausible.
 
     Args:
-        robot: whose body has them.
-        ranges: least and largest likely value of each parameter [SI], by name; only a range that lies beyond the
-            plausible values as a whole is one.
+        robot: robot with this body.
+        ranges: least and largest likely value of each parameter [SI], by name; a range is implausible only if it lies
+            entirely outside the plausible values.
     """
     for name, (low, high) in ranges.items():
         if name == "trunk_mass" and (found := _beyond(robot.density(low), robot.density(high), DENSITIES)):
@@ -68,7 +69,7 @@ def implausible_values(robot: Robot, ranges: Mapping[str, tuple[float, float]]) 
 
 
 def _beyond(low: float, high: float, ends: tuple[float, float]) -> float | None:
-    """The end of a range that is nearest to the plausible values, where none of the range is among them."""
+    """The end of a range nearest to the plausible values, if the range is entirely outside them; None otherwise."""
     if high < ends[0]:
         return float(high)
     return float(low) if low > ends[1] else None

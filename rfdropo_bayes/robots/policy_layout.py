@@ -1,7 +1,7 @@
-"""What a policy sees and what it does, in which order and in which units: shared by training and by motors.
+"""Observations and actions of a policy, their order and units: shared by training and deployment.
 
-Environments build their observations from a layout, an exported policy carries it in its metadata, and a deployment
-refuses a policy whose layout is not that of the robot in front of it. No JAX, no PyTorch.
+Environments build their observations from a layout, and an exported policy carries it in its metadata. A deployment
+refuses a policy whose layout does not match the robot. No JAX, no PyTorch.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class ObservationPart:
     """A named piece of the observation.
 
     Attributes:
-        name: what it is, e.g. ``"markers"``, ``"goal"``, ``"commands"``.
-        size: how many numbers it has.
+        name: name of the quantity, e.g. ``"markers"``, ``"goal"``, ``"commands"``.
+        size: number of values.
         unit: their SI unit, "-" if they have none.
     """
 
@@ -50,10 +50,10 @@ class PolicyLayout:
         period_s: time from one action to the next [s].
         observation: parts of the observation, in order.
         channels: command channels that it moves, in order.
-        unit: of the commands: "m" of cable, "rad" of a motor, "N" of tension; of a black box also
-            "N m" or "-".
-        kind: "discrete" actions are rows of ``moves``; a "continuous" one is a number from -1 to 1 for every channel.
-        moves: what an action adds to the commands [unit]: (action, channel) if discrete; if continuous, one row, the
+        unit: unit of the commands: "m" of cable, "rad" of a motor, "N" of tension; of a black box also "N m" or "-".
+        kind: "discrete" actions are rows of ``moves``; a "continuous" action is a number from -1 to 1 for every
+            channel.
+        moves: change of the commands by an action [unit]: (action, channel) if discrete; if continuous, one row, the
             change at 1.
         low, high: limits of each channel's command [unit].
     """
@@ -85,7 +85,7 @@ class PolicyLayout:
 
     @property
     def history(self) -> int:
-        """How many actions an observation shows, the last one included."""
+        """Number of past actions in an observation, including the last."""
         sizes = {part.name: part.size for part in self.observation}
         return 1 + sizes.get(EARLIER_COMMANDS, 0) // len(self.channels)
 
@@ -111,10 +111,10 @@ class PolicyLayout:
     def change(
         self, action: Int[np.ndarray, "*lane"] | Float[np.ndarray, "*lane channel"]
     ) -> Float[np.ndarray, "*lane channel"]:
-        """What an action adds to the commands [unit]; continuous actions beyond -1 and 1 count as these.
+        """Change of the commands by an action [unit]; continuous actions are clipped to -1 and 1.
 
         Raises:
-            InputError: a discrete action that is no whole number from 0 on, or too large a one.
+            InputError: a discrete action that is not an integer in the range of ``moves``.
         """
         moves = np.asarray(self.moves)
         if self.kind == "discrete":
@@ -134,7 +134,7 @@ class PolicyLayout:
 
     @classmethod
     def from_json(cls, text: str, *, where: str) -> PolicyLayout:
-        """The layout that `to_json` wrote; InputError with ``where`` it was found if it is none."""
+        """The layout that `to_json` wrote; InputError for any other text; ``where`` names its source."""
         try:
             table: dict[str, Any] = json.loads(text)
             table["observation"] = tuple(ObservationPart(**part) for part in table["observation"])
@@ -167,12 +167,12 @@ class PolicyLayout:
 
 
 class Earlier:
-    """Commands and movements of earlier actions, the latest first, as many as an observation shows.
+    """Commands and movements of earlier actions, the latest first, for the observation.
 
     Args:
-        count: actions before the last one; may be 0.
+        count: number of actions before the last; may be 0.
         lanes: robots side by side.
-        channels, moved: how many numbers a command and a movement have.
+        channels, moved: sizes of a command and of a displacement vector.
     """
 
     def __init__(self, count: int, lanes: int, channels: int, moved: int) -> None:

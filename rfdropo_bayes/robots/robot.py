@@ -50,10 +50,10 @@ class CommandTiming(RobotTable):
 
 
 class Marker(RobotTable):
-    """A measured point of the body, given where it lies in the undeformed body."""
+    """A measured point of the body, given by its position in the undeformed body."""
 
     name: Name = Field(description="name, as in the recordings")
-    point_m: Vector = Field(description="where it lies in the undeformed body: x, y, z")
+    point_m: Vector = Field(description="position in the undeformed body: x, y, z")
 
 
 class OrientedSection(RobotTable):
@@ -74,7 +74,7 @@ class PushScene(RobotTable):
     contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
     parameters: dict[Name, Parameter] = Field(
         description="of the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
-        "turn about the vertical [rad] from where the edges are parallel to the axes",
+        "turn about the vertical [rad], zero if the edges are parallel to the axes",
     )
 
     @model_validator(mode="after")
@@ -112,10 +112,10 @@ class Robot(RobotTable):
     orientations: tuple[OrientedSection, ...] = Field(default=(), description="sections whose orientation is measured")
     push: PushScene | None = Field(default=None, description="object on a plate, if the robot has one")
     motors: tuple[Motor, ...] = Field(
-        default=(), description="drives of the channels, in their order; none where the robot is only recorded"
+        default=(), description="drives of the channels, in their order; none if the robot is only recorded"
     )
     drives: tuple[DriveTravel, ...] = Field(
-        default=(), description="what is known of the drives: limits of travel, and what happens to commands beyond"
+        default=(), description="known limits of travel of the drives, and the effect of commands beyond them"
     )
     parameters: dict[Name, Parameter] = Field(description="physical parameters with bounds and default priors, by name")
     _groups: Patterns = PrivateAttr(default_factory=dict)
@@ -132,7 +132,7 @@ class Robot(RobotTable):
             if cable.unit != ("m" if self.command.unit == "rad" else self.command.unit):
                 raise ValueError(f"{cable.name} is driven in {cable.unit}, and commands are in {self.command.unit}")
         if (self.command.unit == "rad") != (self.channels.radius_parameter is not None):
-            raise ValueError("channels.radius_parameter is needed for commands in rad, and only for those")
+            raise ValueError("channels.radius_parameter is needed for commands in rad, and allowed only for them")
         masses = [mass.parameter for mass in self.body.point_masses]
         radius = [self.channels.radius_parameter] if self.channels.radius_parameter else []
         zeros = [ZEROS] if self.initial_displacement_names else []
@@ -146,7 +146,7 @@ class Robot(RobotTable):
             if name not in self.parameters:
                 raise ValueError(f"the parameter {name!r} has no table [parameters.{name}]")
         if self.parameters["poisson_ratio"].high > 0.499:
-            raise ValueError("poisson_ratio may not exceed 0.499, where the material is incompressible")
+            raise ValueError("poisson_ratio may not exceed 0.499, the limit of incompressible material")
         if self.parameters["trunk_mass"].low <= 0 or any(self.parameters[name].low < 0 for name in masses):
             raise ValueError("the bounds of a mass let it be negative, or the trunk massless")
         if found := implausible(self):
@@ -200,8 +200,8 @@ class Robot(RobotTable):
             name_or_path: name of a robot that comes with the package, or path of a TOML file.
 
         Raises:
-            InputError: an unknown robot (the known ones are listed), an unreadable file, or a description that does not
-                hold together.
+            InputError: an unknown robot (the known robots are listed), an unreadable file, or a description that does
+                not hold together.
         """
         path = find_robot_file(name_or_path)
         return parse_table(cls, robot_tables(path), where=str(path))
@@ -220,11 +220,11 @@ class Robot(RobotTable):
                 ``inner_radius``), or "disks" on a backbone of ``inner_radius`` (``disks`` of ``disk_thickness``).
                 ``segments``, each with its own ``cables`` evenly around it, at ``cable_radius`` from the axis at the
                 base; with ``pairs`` opposite cables share a motor. ``command_unit``: "m" of cable or "rad" of a motor
-                with ``spool_radius``. ``gravity``: where things fall, "+z" for a robot that hangs. ``mass`` [kg], that
-                of silicone by default; ``young_modulus`` [Pa].
+                with ``spool_radius``. ``gravity``: its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone
+                by default; ``young_modulus`` [Pa].
 
         Raises:
-            InputError: an unknown answer, one that is missing, or answers that make no robot.
+            InputError: an unknown answer, a missing answer, or answers that make no robot.
         """
         see_keywords(answers, RobotOutline, "outline", without=("assumed",))
         outlined = RobotOutline(**answers, assumed=not_given(answers))
@@ -251,12 +251,12 @@ class Robot(RobotTable):
         return found
 
     def travel(self, recording: str, initial: Float[np.ndarray, " channel"]) -> Travel | None:
-        """What is stated of the drives in a recording that begins at this command [m or rad]; see `travel_in`."""
+        """Stated limits of the drives in a recording that begins at this command [m or rad]; see `travel_in`."""
         group = group_of(recording, self._groups)
         return travel_in(self.drives, self.channel_names, recording, initial, group)
 
     def unstated(self, recordings: Iterable[str]) -> list[Caution]:
-        """A caution where the travel of drives is stated for other recordings only; see `unstated_travel`."""
+        """A caution if the travel of drives is stated for other recordings only; see `unstated_travel`."""
         belonging = {name: group_of(name, self._groups) for name in map(whole, recordings)}
         return unstated_travel(self.drives, self.channel_names, belonging)
 
@@ -310,7 +310,7 @@ class Robot(RobotTable):
         return np.array([marker.point_m for marker in self.markers])
 
     def anchors(self) -> Float[np.ndarray, "cable 3"]:
-        """Points fixed to the base where the cables start [m]."""
+        """Points fixed to the base from which the cables start [m]."""
         return np.stack([cable.anchor() for cable in self.cables])
 
     def guides(self) -> list[Float[np.ndarray, "guide 3"]]:
@@ -319,17 +319,17 @@ class Robot(RobotTable):
 
     @property
     def length(self) -> float:
-        """Of the body along its axis [m]."""
+        """Length of the body along its axis [m]."""
         return float(self.body.station_m[-1] - self.body.station_m[0])
 
     def drive_limits(self) -> Float[np.ndarray, "cable 2"]:
-        """Least and greatest of what drives each cable: displacement [m], pull > 0, or tension [N]."""
+        """Least and greatest drive of each cable: displacement [m], pull > 0, or tension [N]."""
         return np.array([cable.limit for cable in self.cables])
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
         """Least and greatest command of each channel [m or rad] at nominal parameters.
 
-        A cable may be released as far as it may be pulled, or to its own limit where that is nearer: a policy could
+        A cable may be released as far as it may be pulled, or to its own limit if that is nearer: a policy could
         otherwise pay out slack that takes hundreds of actions to wind up again.
         """
         limits = self.drive_limits()
@@ -364,7 +364,7 @@ class Robot(RobotTable):
         return gain if radius is None else parameters.get(radius, self.parameters[radius].nominal) * gain
 
     def parameter_table(self) -> dict[str, Parameter]:
-        """Every base parameter by name, with those given per cable written out."""
+        """Every base parameter by name, with parameters per cable written out."""
         table: dict[str, Parameter] = {}
         for name, parameter in self.parameters.items():
             if parameter.each == "cable":

@@ -1,8 +1,8 @@
-"""Section profiles from shapes: cylinders, cones, hollow tubes and disks on a backbone, one after the other along z.
+"""Section profiles from shapes: cylinders, cones, hollow tubes and disks on a backbone, in sequence along z.
 
-A robot file may state shapes in the place of a section profile, as ``[[body.section]]``. Within a layer compliances
-add up along z, as do masses: stiffnesses are harmonic means over the layer, masses are arithmetic ones. Both are
-integrals of rational functions of z, taken by the rule of Gauss and Legendre.
+A robot file may state shapes in the place of a section profile, as ``[[body.section]]``. Within a layer compliances add
+up along z, as do masses: stiffnesses are harmonic means over the layer, masses are arithmetic means. Both are integrals
+of rational functions of z, taken by the rule of Gauss and Legendre.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Tube(RobotTable):
 
 
 class Disks(RobotTable):
-    """Disks stacked on a backbone, the last one at the end towards the tip; each layer is a disk or bare backbone."""
+    """Disks stacked on a backbone, the last disk at the end towards the tip; each layer is a disk or bare backbone."""
 
     shape: Literal["disks"] = Field(default="disks", description="what this section is")
     length_m: Positive = Field(description="length along z")
@@ -115,8 +115,8 @@ class Disks(RobotTable):
     radius_m: Positive = Field(description="radius of the disks")
     thickness_m: Positive = Field(description="thickness of a disk")
     backbone_radius_m: Positive = Field(description="radius of the backbone between the disks")
-    modulus_ratio: Positive = Field(default=1.0, description="Young's modulus of the disks over that of the backbone")
-    density_ratio: Positive = Field(default=1.0, description="density of the disks over that of the backbone")
+    modulus_ratio: Positive = Field(default=1.0, description="Young's modulus of the disks over the backbone's")
+    density_ratio: Positive = Field(default=1.0, description="density of the disks over the backbone's")
 
     @model_validator(mode="after")
     def _fits(self) -> Disks:
@@ -155,9 +155,9 @@ class SectionedBody(RobotTable):
     )
 
     def body(self) -> Body:
-        """The section profile of the shapes; the first section is clamped where it begins, at z = 0.
+        """The section profile of the shapes; the first section is clamped at its start, z = 0.
 
-        Where sections meet, the wider one's radius holds.
+        The larger radius holds at the joint of two sections.
         """
         profiles = [section.profile() for section in self.section]
         thickness, area, moment, mass_area, mass_moment = (

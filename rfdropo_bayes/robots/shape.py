@@ -1,4 +1,4 @@
-"""What a robot looks like at rest, as plain numbers for a picture."""
+"""Shape of a robot at rest, as plain numbers for a picture."""
 
 from __future__ import annotations
 

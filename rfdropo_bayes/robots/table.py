@@ -1,4 +1,4 @@
-"""What every table of a robot file has in common: no unknown keys, no infinities, unchangeable once read."""
+"""Base class of the tables of a robot file: no unknown keys, no infinities, immutable."""
 
 from __future__ import annotations
 

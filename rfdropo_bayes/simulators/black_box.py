@@ -34,45 +34,46 @@ STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "-": 1.0}
 SMALLEST_SHARE = 1e-3  # of its range: least size that perturbations of a parameter are relative to
 PROBED_ROWS = 3
 ACTION = 0.05
-"""Of the range of commands, what one action of a policy moves them by unless it is said. Twenty actions go from end to
-end; for a cable of the paper's trunk it is eight."""
+"""Default change of a command by one action of a policy, as a share of the range of commands. Twenty actions cross the
+range; eight do for a cable of the paper's trunk.
+"""
 
 Batch = Mapping[str, Float[np.ndarray, " n"]]
 
 
 @dataclass(frozen=True)
 class BlackBox:
-    """A simulator of one's own; mechanisms of actuation and sensing act around it.
+    """A user's simulator; mechanisms of actuation and sensing act around it.
 
     ``function(parameters, command)`` gets a dictionary of numbers and an array (row, channel). Row 0 of the command is
     in force before the first step; row k is reached at the end of step k. It returns the marker positions [m] of the
-    same rows, (row, marker, 3); or a dictionary with ``position`` and, where ``cables`` are named, ``tension`` [N],
-    (row, cable). With ``batched`` it gets arrays (n,) and (n, row, channel) and returns (n, row, marker, 3). A list of
-    words in its place is a command line; `ProcessSimulation` says what that process reads and writes.
+    same rows, (row, marker, 3); or a dictionary with ``position`` and, if ``cables`` are named, ``tension`` [N], (row,
+    cable). With ``batched`` it gets arrays (n,) and (n, row, channel) and returns (n, row, marker, 3). A list of words
+    in place of the function is a command line; `ProcessSimulation` has its protocol.
 
     A rollout that raises, or returns a number that is not finite, counts as diverged. The same arguments must give the
     same answer. Derivatives are central differences.
 
     Args:
-        function: what simulates.
+        function: function that simulates.
         parameters: by name, each a `Parameter` or its fields. ``low`` and ``high`` must be there; ``unit`` is "-",
-            ``nominal`` the middle and ``prior`` uniform between the bounds where they are left out.
+            ``nominal`` the middle and ``prior`` uniform between the bounds by default.
         markers, channels, cables: names of the markers, of the command channels, and of the cables with a tension.
-        time_step: between rows of the command [s].
+        time_step: time between rows of the command [s].
         command_unit: "m" of cable, "rad" of a motor, "N", "N m", or "-" for a unit of its own.
-        name: of the simulator, for reports.
+        name: name of the simulator in reports.
         batched: whether the function takes many parameter sets at once.
-        lanes: parameter sets that it is given at once.
-        one_shape: whether a function that takes many gets arrays of one shape: ``lanes`` sets each time, some of them
-            again, and whole commands. One that JAX compiles is then compiled once for recordings of one length.
-        difference: relative step of derivatives; larger where the motion is rough on small scales.
-        stroke: size of usual commands, in their unit; those of cables and motors are known.
-        limits: least and greatest command of each channel, which a policy keeps; none by default.
-        families: parameters that are not inferred unless they have a prior, and the quantity of which each is the value
-            at one place: an audit asks whether these differ from their nominal values.
+        lanes: number of parameter sets per call.
+        one_shape: whether a batched function always gets arrays of the same shape: ``lanes`` sets, padded by repeats,
+            and whole commands. JAX then compiles it once for recordings of equal length.
+        difference: relative step of derivatives; larger if the motion is rough on small scales.
+        stroke: size of usual commands, in their unit; known for cables and motors.
+        limits: least and greatest command of each channel for policies; none by default.
+        families: parameters that are not inferred unless they have a prior, each with the quantity of which it is a
+            local value; an audit tests whether they differ from their nominal values.
 
     Raises:
-        InputError: a parameter that is not described well, no marker or channel, or a time step that is not positive.
+        InputError: an invalid description of a parameter, no marker or channel, or a time step that is not positive.
     """
 
     function: Callable[..., Any] | Sequence[str]
@@ -138,7 +139,7 @@ class BlackBox:
         """Nobody knows it."""
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
-        """That pull [m] where commands are lengths, else `ACTION` of each range.
+        """The pull [m] itself if commands are lengths, else `ACTION` of each range.
 
         Raises:
             InputError: a channel without limits.
@@ -170,7 +171,7 @@ class BlackBox:
 
     @cached_property
     def simulate(self) -> Callable[[Batch, np.ndarray], list[Any]]:
-        """Simulate a batch: what the function returned for each parameter set; None where it raised."""
+        """Simulate a batch: the function's result for each parameter set; None if it raised."""
         own = self.function
         function: Any = own if callable(own) else ProcessSimulation(tuple(own), self.time_step)
 
@@ -202,7 +203,7 @@ class BlackBox:
     def answers(
         self, values: Batch, commands: Float[np.ndarray, "n row channel"], rows: Int[np.ndarray, " few"]
     ) -> list[dict[str, np.ndarray]]:
-        """What a function of many parameter sets returns for some rows of a batch, at most `lanes` with `one_shape`."""
+        """Results of a batched function for some rows of a batch, at most `lanes` with `one_shape`."""
         taken = np.resize(rows, self.lanes) if self.one_shape else rows
         function: Any = self.function
         found = function({name: column[taken] for name, column in values.items()}, commands[taken])
@@ -212,13 +213,14 @@ class BlackBox:
 
     @property
     def engine(self) -> str:
-        """What computes the motion: what a function says of itself in an attribute ``engine``."""
+        """Name of the engine: the function's attribute ``engine`` if it has one."""
         return getattr(self.function, "engine", "function") if callable(self.function) else "process"
 
     @property
     def digest(self) -> str:
-        """Digest of the source, as far as it can be read, and of the parameters; of what a function tells of itself in
-        an attribute ``digest``."""
+        """Digest of the source, as far as it can be read, and of the parameters; and of the function's attribute
+        ``digest``.
+        """
         try:
             source = getattr(self.function, "digest", None)
             source = (
@@ -243,7 +245,7 @@ def _parameter(name: str, table: Parameter | Mapping[str, Any]) -> Parameter:
 
 
 class Moved(NamedTuple):
-    """What a rollout returned, one row per row of the command."""
+    """Result of a rollout, one row per row of the command."""
 
     position: Float[Any, "row marker 3"]
     tension: Float[Any, "row cable"]
@@ -255,8 +257,8 @@ class BlackBoxSimulator(ExtendedSimulator):
     """A `BlackBox` behind the `Simulator` protocol.
 
     Attributes:
-        box: what simulates.
-        mechanisms: extensions of actuation and sensing, applied in the order given within each stage.
+        box: the simulator.
+        mechanisms: extensions of actuation and sensing, applied in the given order within each stage.
 
     Raises:
         InputError: a mechanism that acts on a body.
@@ -274,12 +276,12 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @property
     def robot(self) -> BlackBox:
-        """What stands in the robot's place."""
+        """The box, in the robot's place."""
         return self.box
 
     @property
     def time_step(self) -> float:  # type: ignore[override]
-        """That of the box."""
+        """Time step of the box."""
         return self.box.time_step
 
     @property
@@ -294,7 +296,7 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of the box, then those of the mechanisms."""
+        """Parameters of the box, then of the mechanisms."""
         return self.box.specs + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
 
     @property
@@ -310,7 +312,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         }
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
-        """Places one after the other along z: nobody knows where an undeformed black box has its markers."""
+        """Places in sequence along z: the marker positions of an undeformed black box are unknown."""
         return np.arange(1.0, len(self.marker_names) + 1.0)[:, None] * np.array([0.0, 0.0, LENGTH])
 
     def commands(
@@ -331,7 +333,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         return found
 
     def _probe(self, command: Float[np.ndarray, "row channel"]) -> None:
-        """Raise InputError where the function does not do what a box's function must."""
+        """Raise InputError if the function violates the contract of a box."""
         values = {spec.name: spec.nominal for spec in self.box.specs}
         remedy = "return positions (row, marker, 3) [m]; see BlackBox"
         try:
@@ -361,7 +363,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         return position, np.asarray(parts.get("tension", none), dtype=float)
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
-        """Simulate from the initial state to the last observation, or so many time steps.
+        """Simulate from the initial state to the last observation, or ``steps`` time steps.
 
         Raises:
             InputError: a name that is not a parameter of this simulator.
@@ -396,7 +398,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         return begin(count)
 
     def session(self, lanes: int, period: float) -> Session:
-        """So many lanes that are commanded one control period [s] at a time; see `Session`."""
+        """A session of ``lanes`` lanes, commanded once per control ``period`` [s]; see `Session`."""
         return Session(self, lanes, period)
 
     @cached_property
@@ -423,7 +425,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         return one_callback(self._rolled, shapes, inputs, limit)
 
     def _rolled(self, inputs: tuple[Batch, Float[np.ndarray, "n row channel"]], steps: int) -> Moved:
-        """Rollouts of a batch; those that failed are zero."""
+        """Rollouts of a batch; zero for failed rollouts."""
         values, command = inputs[0], inputs[1] if self.box.one_shape else inputs[1][:, : steps + 1]
         count, rows = command.shape[:2]
         position = np.zeros((count, rows, len(self.marker_names), 3))
@@ -437,16 +439,16 @@ class BlackBoxSimulator(ExtendedSimulator):
 
 
 class ProcessSimulation:
-    """A process that is started once and simulates one line after the other.
+    """A process that is started once and simulates a line at a time.
 
-    It reads ``{"parameters": {name: number}, "command": [[...], ...], "time_step": s}`` and answers with
-    ``{"position": [[[x, y, z], ...], ...]}``, in metres and one entry per row of the command, perhaps with
-    ``"tension": [[...], ...]``. An answer ``{"error": "..."}`` says that these parameters cannot be simulated. What the
-    process writes to stderr stays visible.
+    It reads ``{"parameters": {name: number}, "command": [[...], ...], "time_step": s}`` and answers with ``{"position":
+    [[[x, y, z], ...], ...]}``, in metres and one entry per row of the command, perhaps with ``"tension": [[...],
+    ...]``. An answer ``{"error": "..."}`` says that these parameters cannot be simulated. The process's stderr stays
+    visible.
 
     Args:
         words: command line.
-        time_step: between rows of the command [s].
+        time_step: time between rows of the command [s].
     """
 
     def __init__(self, words: Sequence[str], time_step: float) -> None:

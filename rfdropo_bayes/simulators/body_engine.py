@@ -1,8 +1,8 @@
-"""What computes the motion of a body, and of a cube that it pushes: a rod in JAX or compiled by Numba, a mesh by Numba.
+"""Engines for the motion of a body, and of a cube that it pushes: a rod in JAX or compiled by Numba, a mesh by Numba.
 
-For a rod both give the same numbers. JAX is differentiable and runs on whatever device it finds; Numba fills the lanes
-and threads of a CPU with rollouts, one call out of a traced program for a whole batch, and its derivatives are
-differences. A rod may also be at rest in every row: an equilibrium found from the one before, without time or damping.
+For a rod both give the same numbers. JAX is differentiable and runs on any device; Numba fills the lanes and threads of
+a CPU with rollouts, one call out of a traced program for a whole batch, and its derivatives are differences. A rod may
+also be at rest in every row: an equilibrium found from the row before, without time or damping.
 """
 
 from __future__ import annotations
@@ -72,8 +72,9 @@ CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 FRICTION = 0.1
 """Size of a coefficient of friction."""
 LOAD_PLACES = (0.3, 0.65, 1.0)
-"""Shares of a body's length at which forces may act: more places cannot be told apart, as forces at neighbouring ones
-move the markers alike (.95 of one is another's at .06 and .2 m of an arm of .2 m)."""
+"""Shares of a body's length at which forces may act: more places are not distinguishable, as forces at neighbouring
+places move the markers similarly (cosine .95 at .06 and .2 m of an arm of .2 m).
+"""
 BODY_SIGNALS = BodySignals(np.float64(0.1), np.float64(0.1), np.float64(0.1), np.float64(ACCELERATION))  # type: ignore[arg-type]
 """Sizes of signals that act on a body [N, -, -, m/s2]."""
 
@@ -91,13 +92,13 @@ class EngineBody(Protocol):
 
 
 class Backend(NamedTuple):
-    """What the arithmetic runs on.
+    """Backend of the arithmetic.
 
     Attributes:
         name: "numba" or "jax".
-        precision: of all arithmetic of "numba"; that of "jax" is double.
-        threads: of "numba"; None for all processors.
-        one_sided, difference: how derivatives of "numba" are taken, see `with_differences`.
+        precision: precision of "numba"; "jax" uses double precision.
+        threads: threads of "numba"; None for all processors.
+        one_sided, difference: settings of derivatives of "numba", see `with_differences`.
     """
 
     name: Literal["numba", "jax"] = "numba"
@@ -115,7 +116,7 @@ class CubeInputs(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a rollout is computed from."""
+    """Inputs of a rollout."""
 
     material: Material | TetrahedralMaterial
     start: Float[Array, " cable"]  # displacements before the first step [m]
@@ -129,13 +130,13 @@ class Engine:
     """The motion of a body under given cable displacements, with or without a cube.
 
     Attributes:
-        body: what moves.
-        time_step: of the simulation [s].
-        backend: what computes.
+        body: the moving body.
+        time_step: time step of the simulation [s].
+        backend: backend of the arithmetic.
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of a rod.
-        scene: what the body pushes a cube on; None for a body that touches nothing.
+        scene: geometry on which the body pushes a cube; None for a body that touches nothing.
         integrator: how a time step is taken, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
-            row, an equilibrium found from the one before.
+            row, an equilibrium found from the row before.
     """
 
     body: EngineBody
@@ -195,7 +196,7 @@ class Engine:
         return 512 if self.is_rod else 64
 
     def describe(self) -> dict[str, object]:
-        """Name, precision, device and, where it is not implicit Euler, integrator, for the record."""
+        """Name, precision, device and the integrator if it is not implicit Euler, for the record."""
         steps = {} if self.integrator == "euler" else {"integrator": self.integrator}
         if self.backend.name == "jax":
             return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform, **steps}

@@ -30,7 +30,7 @@ TOUCHING = 0.001
 
 
 class LaneStart(NamedTuple):
-    """What lanes start from."""
+    """Start of lanes."""
 
     material: Any  # fem.Material; of a black box its parameters by name
     start: Float[Any, "*row cable"]  # displacements that the initial state belongs to [m]
@@ -39,15 +39,17 @@ class LaneStart(NamedTuple):
 
 
 class BodyLanes(Protocol):
-    """The bodies of a session's lanes; their `Motion` is where they are, without an axis of rows, and the largest
-    tensions on the way there."""
+    """The bodies of a session's lanes; their `Motion` is the present state, without an axis of rows, with the largest
+    tensions of the period.
+    """
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """Start some lanes anew, with one entry per row; returns the motion of these rows."""
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """Take steps to the cable displacements [m] at their ends, under what acts on the body in each step; those that
-        carry no loads are given none."""
+        """Take steps to the cable displacements [m] at their ends, under the loads of each step; lanes without loads
+        get None.
+        """
 
     def save(self) -> Float[np.ndarray, "lane values"]:
         """A copy of the state, one row a lane."""
@@ -57,7 +59,7 @@ class BodyLanes(Protocol):
 
 
 def body_lanes(engine: Engine, count: int) -> BodyLanes:
-    """Bodies for so many lanes.
+    """Bodies for ``count`` lanes.
 
     Raises:
         InputError: an engine whose body is no rod.
@@ -71,8 +73,8 @@ def body_lanes(engine: Engine, count: int) -> BodyLanes:
 class LanesBeforeCube:
     """Bodies that start clear of cube and plate: see `BodyLanes`.
 
-    The equilibrium of a body knows of neither, and a body that overlaps the cube would throw it away. Where it does,
-    the unbalanced force of the start counts as infinite.
+    The equilibrium of a body ignores both, and a body that overlaps the cube would throw it away. The unbalanced force
+    of such a start counts as infinite.
     """
 
     def __init__(
@@ -94,7 +96,8 @@ class LanesBeforeCube:
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
         found = self._bodies.reset(rows, given)
-        spread = np.zeros(self._count, int)  # all lanes are computed, so that one program serves any number of rows
+        # all lanes are computed, so that the same program serves any number of rows
+        spread = np.zeros(self._count, int)
         spread[rows] = np.arange(len(rows))
         spheres = found.position[:, self._shown :]
         gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (given.cube, spheres))))[rows]
@@ -162,7 +165,7 @@ class ReferenceLanes:
         self._lanes: _Lane | None = None
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`. All lanes are computed, so that one program serves any number of rows."""
+        """See `BodyLanes`. All lanes are computed, so that the same program serves any number of rows."""
         spread = np.zeros(self._count, int)
         spread[rows] = np.arange(len(rows))
         fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[spread], given))

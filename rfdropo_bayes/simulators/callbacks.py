@@ -15,13 +15,13 @@ Output = TypeVar("Output")
 def one_callback(roll: Callable[[Any, int], Output], shapes: Output, inputs: Any, limit: Array) -> Output:
     """Outputs of rollouts, from a traced program that ``vmap`` may have given any batch axes.
 
-    Padding of a batch, and perturbations of what acts after the body, ask for the same rollout again and again: each
+    Padding of a batch, and perturbations of parameters after the body, ask for the same rollout again and again: each
     is computed once.
 
     Args:
-        roll: rollouts of inputs with one batch axis, up to so many steps; it may leave out rows after the last one.
-        shapes: of one rollout's outputs; those with axes have one of rows first. Rows left out are zero.
-        inputs: of one rollout.
+        roll: rollouts of inputs with one batch axis, up to a number of steps; later rows may be missing.
+        shapes: shapes of one rollout's outputs; arrays have rows as their first axis. Missing rows are zero.
+        inputs: inputs of one rollout.
         limit: steps to compute.
     """
 

@@ -12,13 +12,13 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cable_drive import animated_commands
 
 FEW_STEPS = 60_000  # ten minutes in steps of 10 ms: simulated however few the rows are, with a gigabyte or two
-MOST_STEPS_PER_ROW = 200.0  # beyond these: two seconds a row in steps of 10 ms, where cameras see ten rows a second
+MOST_STEPS_PER_ROW = 200.0  # beyond these: two seconds a row in steps of 10 ms, whereas cameras see ten rows a second
 UNITS = {
     1e3: '"ms" taken for "s", "us" for "ms" or "ns" for "us"',
     1e6: '"us" taken for "s" or "ns" for "ms"',
     1e9: '"ns" taken for "s"',
 }
-"""Units of time by how much finer they are than the one they are taken for."""
+"""Units of time, by the factor by which they are finer than the assumed unit."""
 
 
 class Commands(NamedTuple):
@@ -28,9 +28,9 @@ class Commands(NamedTuple):
         initial: command in force before the first step, to which the initial state belongs [m or rad].
         step: command reached at the end of each time step [m or rad].
         sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
-            comes later where commands from before it are known.
+            comes later if earlier commands are known.
         sample_fraction: how far into the following step the observation lies, in [0, 1).
-        signals: that act at the ports of the simulator besides (`ports.PortSignals`); None where nothing does.
+        signals: further signals at the ports of the simulator (`ports.PortSignals`); None without signals.
     """
 
     initial: Float[Array, "*batch channel"]
@@ -58,13 +58,13 @@ def commands_on_grid(
 
     ``value[k]`` is in force from ``time[k]`` on; a change is carried out linearly over ``ramp`` seconds (a moving
     average of the piecewise-constant signal, so that overlapping changes add up), ``dead_time`` seconds late. The clock
-    starts at the first observation, or as many whole steps before it as it takes to begin with the first command.
+    starts at the first observation, or at the whole step before it that includes the first command.
 
     Args:
-        time: when each command was given [s], increasing.
+        time: time of each command [s], increasing.
         value: commands, cumulative [m or rad].
         initial: command in force before ``time[0]``.
-        observation_time: when the state was observed [s], increasing.
+        observation_time: times of the observations [s], increasing.
 
     Raises:
         InputError: times that are not finite or decrease, shapes that do not fit, or many more steps than rows.
@@ -127,7 +127,7 @@ def animated_on_grid(
 
 
 def _check_steps(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> None:
-    """Raise an InputError where the clocks ask for many more steps than rows, before any of them takes memory."""
+    """Raise an InputError if the clocks require many more steps than rows, before memory is allocated."""
     start = min(observation_time[0], time[0]) if len(time) else observation_time[0]
     span, rows = float(observation_time[-1] - start), len(observation_time)
     steps = span / time_step
@@ -148,7 +148,7 @@ def _check_steps(time: Float[np.ndarray, " command"], observation_time: np.ndarr
 
 
 def _finer_unit(interval: float) -> str:
-    """What to do where rows are so many seconds apart that they hardly are."""
+    """Remedy for an implausible interval between rows."""
     finer = [factor for factor in UNITS if interval / factor < 1.0]  # rows come more often than once in a second
     factor = finer[0] if finer else max(UNITS)
     return (
@@ -158,7 +158,7 @@ def _finer_unit(interval: float) -> str:
 
 
 def _steps_before(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> int:
-    """Steps from the first command to the first observation, where that comes later."""
+    """Steps from the first command to the first observation, if that comes later."""
     earlier = observation_time[0] - time[0] if len(time) else 0.0
     return max(0, int(np.ceil(earlier / time_step - 1e-6)))
 
@@ -173,7 +173,7 @@ def _ramped(
     """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
     given = np.concatenate([[-np.inf], time])
     held = np.vstack([initial, value])
-    # Commands older than the first one in force count as carried out, so one more or less makes no difference.
+    # Commands before the first command in force count as carried out, so one more or less makes no difference.
     first = np.maximum(np.searchsorted(given, at - ramp, side="right") - 2, 0)
     last = np.searchsorted(given, at, side="right")
     window = np.minimum(first[:, None] + np.arange(np.max(last - first, initial=0) + 1), len(given) - 1)
@@ -186,14 +186,14 @@ def carried_out(
     at: Float[np.ndarray, "*step"],
     ramp: float,
 ) -> Float[np.ndarray, "*step channel"]:
-    """Where a drive stands that carries out every change linearly over ``ramp`` seconds.
+    """Position of a drive that carries out every change linearly over ``ramp`` seconds.
 
     Args:
-        given: when the last commands before each of ``at`` were given [s], in order; a command may stand twice, and
-            later ones do not count. The first one must have been carried out.
-        value: of these commands, cumulative [m or rad].
+        given: times of the last commands before each of ``at`` [s], in order; repeated and later commands have no
+            effect. The first command must be completed.
+        value: values of these commands, cumulative [m or rad].
         at: times [s].
-        ramp: 0 carries a command out at once: one given at the start of a step acts during it.
+        ramp: 0 carries a command out at once: a command given at the start of a step acts during it.
     """
     reached = value[..., 0, :]
     for k in range(1, given.shape[-1]):
@@ -210,7 +210,8 @@ def carried_out(
 def stack_commands(sequences: Sequence[Commands]) -> Commands:
     """Pad command sequences to one length and stack them along a leading axis.
 
-    A shorter sequence holds its last command; the padded observations repeat its last one, and the caller masks them.
+    A shorter sequence holds its last command; the padded observations repeat its last observation, and the caller masks
+    them.
     """
     steps = max(len(item.step) for item in sequences)
     rows = max(len(item.sample_step) for item in sequences)

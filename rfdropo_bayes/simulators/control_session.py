@@ -49,9 +49,10 @@ class _Drives(NamedTuple):
     """State of the drives of a lane between two steps."""
 
     cables: tuple[Any, ...]  # memory of every mechanism between command and cables
-    encoders: tuple[Any, ...]  # and of those that an encoder shows, again: other mechanisms may stand between them
+    encoders: tuple[Any, ...]  # and mechanisms that an encoder shows, again: other mechanisms may lie between them
     wound: Wound
-    signals: tuple[Any, ...]  # memory of what acts on the body or on the markers by what reaches the cables
+    # memory of mechanisms that act on the body or on the markers depending on the commands at the cables
+    signals: tuple[Any, ...]
 
 
 class _Past(NamedTuple):
@@ -63,17 +64,17 @@ class _Past(NamedTuple):
 
 
 class Session:
-    """Lanes of one robot that are commanded one control period at a time.
+    """Lanes of one robot, commanded once per control period.
 
     Args:
-        simulator: whose rollouts the lanes are.
-        lanes: how many.
+        simulator: simulator of the lanes.
+        lanes: number of lanes.
         period: control period [s], a whole number of time steps.
-        recording: as whose drives those of the lanes answer commands, where what is known of them differs between
-            recordings; what holds for all recordings by default.
+        recording: recording whose drive limits apply, if they differ between recordings; by default the limits of all
+            recordings.
 
     Raises:
-        InputError: a period that is none, or a mechanism that is not written by steps.
+        InputError: an invalid period, or a mechanism without a stepwise form.
     """
 
     def __init__(self, simulator: Any, lanes: int, period: float, recording: str = "") -> None:
@@ -124,19 +125,19 @@ class Session:
         *,
         command: Float[np.ndarray, "row channel"] | None = None,
     ) -> Observation:
-        """Start some lanes anew; the others stay where they are.
+        """Start some lanes anew; the others continue.
 
         Args:
             rows: lanes.
-            parameters: values by name, one per row or one for all of them; those left out are nominal.
-            command: in force before the start, to which the initial state belongs [m or rad]; zero by default.
+            parameters: values by name, one per row or one for all of them; missing values are nominal.
+            command: command before the start, to which the initial state belongs [m or rad]; zero by default.
 
         Returns:
             The first observation of these rows.
 
         Raises:
-            InputError: no such lane or parameter, a value outside its hard bounds, one that a mechanism cannot
-                carry out by steps, or a command outside the travel of the drives.
+            InputError: no such lane or parameter, a value outside its hard bounds, a value that a mechanism cannot
+                apply stepwise, or a command outside the travel of the drives.
         """
         rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         if rows.size == 0 or rows.min() < 0 or rows.max() >= self.lanes or len(set(rows.tolist())) < len(rows):
@@ -163,7 +164,7 @@ class Session:
         """Let all lanes run for one control period with these commands [m or rad], in force from its start.
 
         Returns:
-            What is observed at the end of the period.
+            The observation at the end of the period.
 
         Raises:
             InputError: lanes that were never reset, or commands of another shape or that are not finite.
@@ -249,7 +250,9 @@ class Session:
                 raise InputError(
                     f"{mechanism.name} does not step: {why}",
                     where="a session",
-                    remedy="train without it; laws at cables and on the body, and laws on what is measured, do step",
+                    remedy=(
+                        "train without it; laws at cables and on the body, and laws on measurements, support sessions"
+                    ),
                 )
         for mechanism in mechanisms:
             remembers = isinstance(mechanism, ActuationMechanism | TimedSensingMechanism)
@@ -286,7 +289,7 @@ class Session:
         return jax.jit(jax.vmap(of_table))
 
     def _sent(self, commands: Float[np.ndarray, "lane channel"]) -> Float[np.ndarray, "lane step channel"]:
-        """What the drives carry out in every step of the period, ramps and dead time included."""
+        """Commands carried out by the drives in every step of the period, ramps and dead time included."""
         past, time_step, (ramp, dead_time) = self._past, self.simulator.time_step, self.simulator.command_timing
         if self._travel is not None:
             self._forgotten, commands = self._travel.advance(self._forgotten, past.value[:, -1], commands)
@@ -298,25 +301,25 @@ class Session:
 
     @property
     def _drive_chains(self) -> tuple[list[Any], list[Any]]:
-        """Mechanisms between command and cables, and those of them that an encoder shows."""
+        """Mechanisms between command and cables, and the mechanisms visible to an encoder."""
         chain = [m for m in self.simulator.mechanisms if isinstance(m, ActuationMechanism)]
         return chain, [m for m in chain if inside_drive(m)]
 
     @property
     def _signalling(self) -> list[Any]:
-        """Mechanisms that act on the body, or on the markers by what is commanded."""
+        """Mechanisms that act on the body, or on the markers depending on commands."""
         kinds = PushingMechanism | CommandedSensingMechanism
         return [m for m in self.simulator.mechanisms if isinstance(m, kinds)]
 
     def _loads(self, signals: Float[Array, "row signal"]) -> BodySignals | None:
-        """What acts on the body under the signals of the mechanisms of `_signalling`; None for nothing."""
+        """Loads on the body from the signals of the mechanisms of `_signalling`; None without loads."""
         acts = [(m.carried, w) for m, w in zip(self._signalling, signals.T, strict=True) if hasattr(m, "push")]
         found = [carried(w) for carried, w in acts]
         return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
 
     @cached_property
     def _first_drives(self) -> Any:
-        """Drives of all lanes before the first step, given the command before it, where encoders stand, and signals."""
+        """Drives of all lanes before the first step, given the command before it, encoder positions, and signals."""
         chains, interval = self._drive_chains, self.simulator.time_step
 
         def through(chain: list[Any], values: Values, held: Array) -> tuple[tuple, Array]:
@@ -341,8 +344,9 @@ class Session:
 
     @cached_property
     def _move_drives(self) -> Any:
-        """Drives of all lanes after a period, cable displacements [m] in its steps, where encoders stand, the last
-        signals, and what acts on the body in the steps."""
+        """Drives of all lanes after a period, cable displacements [m] in its steps, encoder positions, the last
+        signals, and loads on the body in the steps.
+        """
         chains, time_step = self._drive_chains, self.simulator.time_step
 
         def through(chain: list[Any], values: Values, memory: tuple[Any, ...], sent: Array) -> tuple[tuple, Array]:
@@ -369,7 +373,7 @@ class Session:
 
     @cached_property
     def _bodies_of(self) -> Any:
-        """What the bodies of all lanes start from."""
+        """Start of the bodies of all lanes."""
 
         def of(values: Values, wound: Wound, signals: Float[Array, " signal"]) -> LaneStart:
             return self.simulator.lane_start(values, wound)._replace(loads=self._loads(signals[None]))

@@ -1,4 +1,4 @@
-"""What every simulator that mechanisms may extend has: drives before what moves, and measurement after it."""
+"""Base of simulators with mechanisms: drives before the moving body, and measurement after it."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class ExtendedSimulator:
     """Base of simulators whose mechanisms act on the commands before the motion and on its measurement.
 
     Attributes:
-        robot: what moves; it names markers, cables and command channels.
-        mechanisms: extensions, applied in the order given within each stage.
-        time_step: of the simulation [s].
+        robot: moving robot; it names markers, cables and command channels.
+        mechanisms: extensions, applied in the given order within each stage.
+        time_step: time step of the simulation [s].
     """
 
     robot: Any
@@ -66,7 +66,7 @@ class ExtendedSimulator:
 
     @property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Every parameter that may be given to ``rollout``, those of the mechanisms last."""
+        """Every parameter that may be given to ``rollout``, the mechanisms' last."""
         raise NotImplementedError
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
@@ -76,12 +76,12 @@ class ExtendedSimulator:
     def taken(
         self, recording: str, initial: Float[np.ndarray, " channel"], value: Float[np.ndarray, "command channel"]
     ) -> Float[np.ndarray, "command channel"]:
-        """The commands of a recording as the drives take them, given those that were sent [m or rad]."""
+        """Commands of a recording after the drives' limits, from sent commands [m or rad]."""
         return value
 
     @property
     def integrator(self) -> str | None:
-        """How time steps are taken, where that is ours to choose."""
+        """Integrator of time steps; None if the simulator has its own."""
         return None
 
     @property
@@ -90,23 +90,25 @@ class ExtendedSimulator:
         return 0.0, 0.0
 
     def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:
-        """Within which limits the drives follow commands that begin with this one, in a recording; None: any."""
+        """Limits of the drives for commands that begin with ``command`` in a recording; None without limits."""
         return None
 
     def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
-        """The drives before the first step, where this command has reached them."""
+        """The drives before the first step, settled at this command."""
         return Wound(initial, initial)
 
     def wind(self, values: Values, drives: Wound, sent: Float[Array, " channel"]) -> tuple[Wound, Float[Array, " in"]]:
-        """The drives at the end of a step, and what moves the body then, given the command that reached them."""
+        """The drives at the end of a step, and the resulting input of the body, from the command that reached the
+        drives.
+        """
         return Wound(sent, sent), sent
 
     def lane_start(self, values: Values, drives: Wound) -> Any:
-        """What a lane of a session starts from; see `body_lanes.LaneStart`."""
+        """Start of a lane of a session; see `body_lanes.LaneStart`."""
         raise NotImplementedError
 
     def begin_lanes(self, count: int) -> Any:
-        """So many bodies that go on from where they were left; see `body_lanes.BodyLanes`."""
+        """Bodies that continue from their state; see `body_lanes.BodyLanes`."""
         raise NotImplementedError
 
     @property
@@ -115,11 +117,11 @@ class ExtendedSimulator:
         return Result.DIVERGED
 
     def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """Positions as they are measured [m], given those in the frame of the base."""
+        """Measured positions [m], from positions in the base frame."""
         return position
 
     def complete(self, parameters: Values) -> dict[str, Array]:
-        """All values by name; those left out are nominal.
+        """All values by name; missing values are nominal.
 
         Raises:
             InputError: a name that is not a parameter of this simulator, or a process in which JAX cannot compute.
@@ -144,9 +146,9 @@ class ExtendedSimulator:
         return initial, command
 
     def driven(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "time channel"]:
-        """Where the drives stand at the observation times, in the unit of the commands.
+        """Positions of the drives at the observation times, in the unit of the commands.
 
-        Limits of the cables' displacements are no part of it. Whoever does not look at it pays nothing under ``jit``.
+        Limits of cable displacements are not included. Unused results cost nothing under ``jit``.
         """
         initial, command = self.actuated(values, commands, time_step, drives_only=True)
         return sample(jnp.concatenate([initial[None], command]), commands)
@@ -156,8 +158,8 @@ class ExtendedSimulator:
     ) -> Int[Array, ""] | None:
         """Time steps to simulate so that all rows within the first ``steps`` are measured as in a whole rollout.
 
-        Mechanisms of sensing may look at later rows, as cameras on a clock that is late do. How far is found from what
-        they make of positions that are unknown from some row on.
+        Mechanisms of sensing may look at later rows, as cameras with a late clock do. The look-ahead is found from
+        their response to positions that are NaN from some row on.
         """
         ahead = TimedSensingMechanism | CommandedSensingMechanism
         if steps is None or not any(isinstance(mechanism, ahead) for mechanism in self.mechanisms):
@@ -182,7 +184,7 @@ class ExtendedSimulator:
         return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
 
     def meanwhile(self, values: Values, commands: Commands) -> Meanwhile | None:
-        """What reaches the cables, where a mechanism of sensing asks for it."""
+        """Commands at the cables, if a mechanism of sensing needs them."""
         if not any(isinstance(mechanism, CommandedSensingMechanism) for mechanism in self.mechanisms):
             return None
         initial, command = self.actuated(values, commands, self.time_step)
@@ -195,8 +197,9 @@ class ExtendedSimulator:
         time: Float[Array, " time"],
         meanwhile: Meanwhile | None = None,
     ) -> Float[Array, "time marker 3"]:
-        """Marker positions as they are measured [m], given the true ones, when they are seen [s], and what `meanwhile`
-        says."""
+        """Measured marker positions [m], from true positions, times of observation [s], and the result of
+        `meanwhile`.
+        """
         for mechanism in self.mechanisms:
             if isinstance(mechanism, SensingMechanism):
                 position = mechanism.sense(values, position)

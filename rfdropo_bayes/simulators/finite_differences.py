@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 Inputs = TypeVar("Inputs")
 Output = TypeVar("Output")
 
-# Relative perturbation of a central difference. Its error is of second order in it, that of rounding (1e-13 m and
+# Relative perturbation of a central difference. Its error is of second order in it; the rounding error (1e-13 m and
 # 1e-5 m of the positions) is divided by it: near the cube root of the precision both are small.
 DIFFERENCE = {"float64": 1e-5, "float32": 1e-2}
-FORWARD = 1e-7  # of a one-sided difference, in double precision: its error is of first order in it
-# Sizes that perturbations are relative to, where a value may be zero: [m] of cable, [kg], [m/s2], [1/s], [s].
+FORWARD = 1e-7  # of a forward difference, in double precision: its error is of first order in it
+# Sizes that perturbations are relative to, if a value may be zero: [m] of cable, [kg], [m/s2], [1/s], [s].
 LENGTH, MASS, ACCELERATION, MASS_DAMPING, STIFFNESS_DAMPING = 0.005, 0.1, 9.81, 1.0, 0.01
 
 
@@ -31,13 +31,13 @@ def with_differences(
     """``call(inputs, limit)`` with derivatives with respect to the inputs.
 
     Args:
-        call: the rollout; of its outputs, those in double precision have derivatives.
-        sizes: the size of every input, that a perturbation is relative to.
-        precision: of the engine, a key of `DIFFERENCE`.
-        one_sided: one rollout per direction beside that of the value, good to 1e-5 where motion is smooth and 1e-3
-            elsewhere; in double precision only.
-        difference: relative perturbation of a central difference, where `DIFFERENCE` is not to be taken, as motion is
-            rough on that scale; see `usable_difference`.
+        call: the rollout; outputs in double precision have derivatives.
+        sizes: size of every input, the unit of perturbations.
+        precision: precision of the engine, a key of `DIFFERENCE`.
+        one_sided: one rollout per direction in addition to the value's, accurate to 1e-5 for smooth motion and 1e-3
+            otherwise; in double precision only.
+        difference: relative perturbation of a central difference, if motion is too rough for `DIFFERENCE`; see
+            `usable_difference`.
     """
     forward = one_sided and precision == "float64" and difference is None
     width = difference or DIFFERENCE[precision]
@@ -68,20 +68,20 @@ def with_differences(
 
 LADDER = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 AGREE = 0.5  # share by which slopes over two successive steps of the ladder may differ
-# Slopes of a motion that bends, as where a cable goes slack, differ between steps and stay of one size (on the paper's
-# trunk within a tenth of it); those of a motion that jitters grow as steps shrink.
+# Slopes of a motion with kinks, as with a slack cable, differ between steps but keep their size (within a tenth on the
+# paper's trunk); slopes of a jittering motion grow as steps shrink.
 JITTER = 3.0
 
 
 def usable_difference(slope: Callable[[float], Float[np.ndarray, "..."]]) -> float:
-    """Smallest step of `LADDER` from which on slopes agree; the largest one where none do.
+    """Smallest step of `LADDER` from which on slopes agree; the largest step if none agree.
 
-    A motion can be rough: smooth on the smallest scales, with slopes there that are thousands of times those of the
-    changes that matter (a body of tetrahedra that jitters). Rounding is rough, too. A motion that bends is not: where
-    slopes over the smallest step are no larger than others, they are right.
+    A motion can be rough: smooth on the smallest scales, with slopes thousands of times the relevant slopes (a
+    jittering body of tetrahedra). Rounding is also rough. A curved motion is not: slopes over the smallest step are
+    right if they are no larger than others.
 
     Args:
-        slope: secant over one step to each side, of all outputs along all directions of interest.
+        slope: secants over a step to each side, of all outputs along all directions.
     """
     chosen = LADDER[-1]
     larger = slope(chosen)
@@ -96,7 +96,7 @@ def usable_difference(slope: Callable[[float], Float[np.ndarray, "..."]]) -> flo
 
 
 def _relative_size(sizes: Inputs, directions: Inputs) -> Float[Array, ""]:
-    """Largest component of a direction in units of what it changes; one for a direction that changes nothing."""
+    """Largest component of a direction in units of its inputs' sizes; 1 for a zero direction."""
     ratios = jax.tree.map(lambda d, s: jnp.max(jnp.abs(d) / s, initial=0.0), directions, sizes)
     largest = jnp.max(jnp.stack(jax.tree.leaves(ratios)))
     return jnp.where(largest > 0.0, largest, 1.0)

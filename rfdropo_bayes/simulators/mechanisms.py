@@ -1,4 +1,4 @@
-"""The places where a model extension may act on a rollout; a simulator calls only what these protocols name.
+"""Interfaces of model extensions that act on a rollout; a simulator calls only their members.
 
 A mechanism is nested: at its null value (the nominal value of its parameters) the extended simulator is the base
 simulator exactly. The library of mechanisms lives one room above.
@@ -36,13 +36,13 @@ class Mechanism(Protocol):
     Attributes:
         name: registry name.
         stage: one of `STAGES`, in the order in which they act on a rollout.
-        parameters: its parameters; the nominal value of each is its null value, except of those with a ``grid``. A
-            null value that is a bound makes the effect one-sided.
+        parameters: its parameters; the nominal value of each is its null value, except for parameters with a ``grid``.
+            A null value that is a bound makes the effect one-sided.
         cause: one line on the physical cause.
-        remedy: one line on what a lab would do about it.
+        remedy: one line on the remedy in a laboratory.
 
-    Three more may be left out, where a mechanism runs everywhere: ``bodies``, ``engines`` and ``motions``, those of
-    `BODIES`, `ENGINES` and `MOTIONS` on which it runs.
+    Three more are optional: ``bodies``, ``engines`` and ``motions``, the members of `BODIES`, `ENGINES` and `MOTIONS`
+    that it supports; all by default.
     """
 
     name: str
@@ -56,16 +56,16 @@ class Mechanism(Protocol):
 class ActuationMechanism(Mechanism, Protocol):
     """Acts on the command before it becomes a cable displacement.
 
-    It may have an attribute ``inside_drive``, True if it is not said: whether an encoder on the motor shows the effect.
-    What happens behind the motor, in gears, spools and cables, has ``inside_drive = False``. It may have a method
-    ``settle(values, held)``: what it makes of a command that was held long before the first step. Without one, that is
-    the command itself. The initial state of the body, and the ``initial`` of the next mechanism, belong to it.
+    It may have an attribute ``inside_drive``, True by default: whether an encoder on the motor shows the effect.
+    Effects behind the motor, in gears, spools and cables, have ``inside_drive = False``. It may have a method
+    ``settle(values, held)``: its output for a command that was held long before the first step, by default the command
+    itself. The initial state of the body, and the ``initial`` of the next mechanism, belong to it.
     """
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
-        """Return the command that reaches the cables at the end of each step, given the one that was sent."""
+        """Return the command that reaches the cables at the end of each step, from the sent command."""
 
 
 @runtime_checkable
@@ -73,34 +73,34 @@ class BodyMechanism(Mechanism, Protocol):
     """Acts on the body's material, masses and gravity."""
 
     def embody(self, values: Values, material: Any, body: Any) -> Any:
-        """Return the material (`fem.Material`) of the extended body (`fem.Rod`), given that of the base."""
+        """Return the material (`fem.Material`) of the extended body (`fem.Rod`), from the base material."""
 
 
 @runtime_checkable
 class SensingMechanism(Mechanism, Protocol):
-    """Acts on what is measured of the body's motion."""
+    """Acts on measurements of the body's motion."""
 
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
-        """Return the measured marker positions [m], given the true ones."""
+        """Return the measured marker positions [m], from the true positions."""
 
 
 @runtime_checkable
 class TimedSensingMechanism(Mechanism, Protocol):
-    """Acts on what is measured, with a memory or a clock of its own."""
+    """Acts on measurements, with a memory or a clock of its own."""
 
     def sense_over_time(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
-        """Return the measured marker positions [m], given the true ones and when they are seen [s]."""
+        """Return the measured marker positions [m], from the true positions and their times of observation [s]."""
 
 
 class Meanwhile(NamedTuple):
-    """What reaches the cables during a rollout.
+    """Commands at the cables during a rollout.
 
     Attributes:
         levels: commands before the first step and at the end of every step [m or rad].
-        commands: which of the steps are observed.
-        time_step: [s].
+        commands: commands, with the observed steps.
+        time_step: time step [s].
     """
 
     levels: Float[Array, "row channel"]
@@ -110,7 +110,7 @@ class Meanwhile(NamedTuple):
 
 @runtime_checkable
 class CommandedSensingMechanism(Mechanism, Protocol):
-    """Acts on what is measured, in a way that depends on what is commanded meanwhile."""
+    """Acts on measurements, depending on the commands."""
 
     def sense_with_commands(
         self,
@@ -119,13 +119,14 @@ class CommandedSensingMechanism(Mechanism, Protocol):
         time: Float[Array, " time"],
         meanwhile: Meanwhile,
     ) -> Float[Array, "time marker 3"]:
-        """Return the measured marker positions [m], given the true ones, when they are seen [s], and what reaches the
-        cables meanwhile."""
+        """Return the measured marker positions [m], from the true positions, their times of observation [s], and the
+        commands at the cables.
+        """
 
 
 @runtime_checkable
 class PushingMechanism(Mechanism, Protocol):
-    """Acts on a rod from step to step, by time, by what is commanded, and by how the body moves."""
+    """Acts on a rod from step to step, by time, by commands, and by the body's motion."""
 
     @property
     def follows_motion(self) -> bool:
@@ -138,24 +139,25 @@ class PushingMechanism(Mechanism, Protocol):
         path: Float[Array, "row 3"] | None,
         time_step: float,
     ) -> BodySignals:
-        """Return what acts on the body; row 0 is before the first step.
+        """Return the loads on the body; row 0 is before the first step.
 
         Args:
             values: parameters by name.
-            command: that reaches the cables.
-            path: of the last marker in the frame of the base [m]; None for what acts whatever the motion.
-            time_step: [s].
+            command: command at the cables.
+            path: path of the last marker in the base frame [m]; None for the part independent of motion.
+            time_step: time step [s].
         """
 
 
 @runtime_checkable
 class SignallingMechanism(Mechanism, Protocol):
-    """A mechanism that acts on the body, or on what is measured by what is commanded, as a session needs it: one signal
-    w(t) that is written as a step. Its steps give what its form for whole rollouts gives."""
+    """A mechanism for sessions that acts on the body, or on measurements depending on commands, by a signal w(t)
+    computed step by step. Its steps give the same result as its form for whole rollouts.
+    """
 
     @property
     def whole_only(self) -> str:
-        """Why no session carries it; empty where one does."""
+        """Reason why sessions do not support it; empty if they do."""
 
     def signal_before(self, values: Values, first: Float[Array, " channel"]) -> tuple[Any, Float[Array, ""]]:
         """Memory and signal before the first step, given the command that reaches the cables then."""
@@ -166,24 +168,25 @@ class SignallingMechanism(Mechanism, Protocol):
         """Memory and signal at the end of a step [s], given the command that has reached the cables."""
 
     def carried(self, w: Float[Array, " row"], *seen: Any) -> Any:
-        """What acts on the body under a signal; of what is measured the positions of the markers [m], given ``seen``,
-        those without it (row, marker, 3), and when they are seen [s]."""
+        """Loads on the body under a signal; for sensing the marker positions [m], from ``seen``: positions without the
+        signal (row, marker, 3) and their times [s].
+        """
 
 
 @runtime_checkable
 class SteppedMechanism(Mechanism, Protocol):
-    """A mechanism of actuation or sensing that can also act step by step, as a session needs it.
+    """A mechanism of actuation or sensing that can also act step by step in a session.
 
     For a mechanism of actuation a step is one of time, ``now`` is the time step [s], and ``first`` the command before
-    the first step. For one of sensing a step is one observation, ``now`` its time [s], and ``first`` the first
-    observation of the markers [m]; it is shown too. Its steps give what its form for whole rollouts gives.
+    the first step. For a mechanism of sensing a step is one observation, ``now`` its time [s], and ``first`` the first
+    observation of the markers [m]; it is also shown. Its steps give the same result as its form for whole rollouts.
     """
 
     def begin(self, values: Values, first: Array, interval: float) -> Any:
         """Memory before the first step; ``interval`` [s] is the time between steps."""
 
     def advance(self, values: Values, memory: Any, given: Array, now: Any) -> tuple[Any, Array]:
-        """Memory after a step, and what the mechanism makes of what it is given."""
+        """Memory after a step, and the mechanism's output for its input."""
 
 
 class SteppedActuation:
@@ -202,7 +205,7 @@ class SteppedActuation:
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
-        """Return the command that reaches the cables at the end of each step, given the one that was sent."""
+        """Return the command that reaches the cables at the end of each step, from the sent command."""
         memory = self.begin(values, jnp.asarray(initial, command.dtype), time_step)
         return jax.lax.scan(lambda kept, sent: self.advance(values, kept, sent, time_step), memory, command)[1]
 
@@ -211,7 +214,7 @@ class MemorylessActuation:
     """Base of mechanisms of actuation that look at nothing but the command of the moment."""
 
     def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
-        """Return the command that reaches the cables, given the one that was sent."""
+        """Return the command that reaches the cables, from the sent command."""
         raise NotImplementedError
 
     def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
@@ -231,18 +234,18 @@ class MemorylessActuation:
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
-        """Return the command that reaches the cables at the end of each step, given the one that was sent."""
+        """Return the command that reaches the cables at the end of each step, from the sent command."""
         return self.reach(values, command)
 
 
 def settled(mechanism: Mechanism, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
-    """What a mechanism of actuation makes of a command that was held long before the first step."""
+    """Output of a mechanism of actuation for a command that was held long before the first step."""
     settle = getattr(mechanism, "settle", None)
     return held if settle is None else settle(values, held)
 
 
 def inside_drive(mechanism: Mechanism) -> bool:
-    """Whether an encoder on the motor shows what a mechanism of actuation does."""
+    """Whether an encoder on the motor shows the effect of a mechanism of actuation."""
     return bool(getattr(mechanism, "inside_drive", True))
 
 
@@ -262,7 +265,7 @@ def motions_of(mechanism: Mechanism | type) -> tuple[str, ...]:
 
 
 def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0]) -> str | None:
-    """Why a mechanism does not run on a body, on an engine or in a motion; None where it runs."""
+    """Why a mechanism does not run on a body, on an engine or in a motion; None if it runs."""
     if body == BLACK_BOX:
         return None if mechanism.stage in ("actuation", "sensing") else f"it acts on the {mechanism.stage}, inside"
     if body not in bodies_of(mechanism):

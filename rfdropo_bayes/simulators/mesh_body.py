@@ -38,7 +38,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 SAME_HEIGHT = 1e-5
-"""[m] A marker so near the height of guides is their mean, where markers are means of guides."""
+"""[m] A marker within this distance of the height of guides is their mean, if markers are means of guides."""
 
 
 class TetrahedraTable(BaseModel):
@@ -51,7 +51,7 @@ class TetrahedraTable(BaseModel):
     clamp_height: float = Field(description="nodes at or below this height are held [m]")
     frames: Literal["polar", "edges"] = Field(
         default="polar",
-        description="what turns with an element: the rotation nearest to its deformation, or axes along its edges "
+        description="frame of an element: the rotation nearest to its deformation, or axes along its edges "
         '(SOFA\'s "large")',
     )
     masses: Literal["equal", "volume"] = Field(
@@ -65,7 +65,9 @@ class TetrahedraTable(BaseModel):
     )
     drive_rate: Annotated[float, Field(gt=0.0)] | None = Field(
         default=None,
-        description='how far the imposed displacement may be from the one last measured [m per step]; for "sofa"',
+        description=(
+            'how far the imposed displacement may be from the last measured displacement [m per step]; for "sofa"'
+        ),
     )
     marker_cables: tuple[str, ...] = Field(
         default=(),
@@ -148,7 +150,9 @@ def _markers(
 
 
 def _station_share(body: TetrahedralBody, station: Float[np.ndarray, " stations"]) -> np.ndarray:
-    """A mass at a station rests where the edges of the mesh pass the station's plane: its centre is at that height."""
+    """Distribution of a mass at a station to nodes: on the mesh edges that cross the station's plane, with its centre
+    at that height.
+    """
     pairs = np.array([(a, b) for a in range(4) for b in range(a + 1, 4)])
     edge = np.unique(np.sort(body.element[:, pairs].reshape(-1, 2), axis=1), axis=0)
     height = body.rest[edge, 2]
@@ -166,11 +170,11 @@ def _station_share(body: TetrahedralBody, station: Float[np.ndarray, " stations"
 class MeshTrunkSimulator(RobotSimulator):
     """A trunk of tetrahedra with mechanisms, behind the `Simulator` protocol, started undeformed.
 
-    Mechanisms of the body see the robot's layers and stations; what they do to
-    a layer holds for the elements in it, and a mass at a station rests on the section at its height.
+    Mechanisms of the body see the robot's layers and stations; their effect on a layer applies to its elements, and a
+    mass at a station rests on the section at its height.
 
     Attributes:
-        options: how the mesh is simulated; for the others see `RobotSimulator`.
+        options: settings of the mesh; for the others see `RobotSimulator`.
     """
 
     robot: Robot
@@ -204,10 +208,10 @@ class MeshTrunkSimulator(RobotSimulator):
         return self.material(values), jnp.zeros_like(displacement[0]), displacement
 
     def balance_of(self, inputs: tuple[TetrahedralMaterial, Array, Array], cube: CubeInputs | None) -> Balance:
-        """See `RobotSimulator`; the energies are those of the body.
+        """See `RobotSimulator`; the energies are of the body.
 
         Raises:
-            InputError: another integrator than implicit Euler, whose states alone tell the velocities.
+            InputError: another integrator than implicit Euler, whose states alone determine the velocities.
         """
         if self.engine.integrator != "euler":
             raise InputError(
@@ -221,7 +225,7 @@ class MeshTrunkSimulator(RobotSimulator):
         return tetrahedral_balance(self.assembly.system, inputs[0], motion.position, motion.tension, self.time_step)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:
-        """Commanded cable displacements [m] at the end of every step; SOFA's limits are those of the engine."""
+        """Commanded cable displacements [m] at the end of every step; SOFA's limits belong to the engine."""
         if self.options.drives == "robot":
             return self.wound(values, commands, self.time_step)[1]
         command = self.actuated(values, commands, self.time_step)[1]

@@ -1,4 +1,4 @@
-"""What a simulator says of each of its parameters: name, unit, hard bounds, nominal value, default prior."""
+"""Description of a simulator's parameter: name, unit, hard bounds, nominal value, default prior."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ class ParameterSpec(NamedTuple):
     """One physical parameter of a simulator, of a mechanism or of a noise model.
 
     Attributes:
-        name: as used in experiment files, posteriors and reports.
+        name: name used in experiment files, posteriors and reports.
         unit: SI unit, "-" if it has none.
         low, high: hard bounds, outside which the model has no meaning.
-        nominal: value used where the parameter is not inferred; a mechanism's null value.
+        nominal: value used if the parameter is fixed; a mechanism's null value.
         prior: default prior as a table, e.g. ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``.
         description: one line on its physical meaning.
         grid: values to try, for a mechanism's parameter that has no effect while the others are null (a time constant,
             the place of a wall): its derivative is zero there, so it cannot be screened. Empty for all others.
-        family: the quantity of which this is the value at one place, where a simulator asks for it to be a candidate of
-            audits; empty for all others.
+        family: the quantity of which this is a local value, if a simulator offers it as a candidate of audits; empty
+            for all others.
     """
 
     name: str
@@ -37,7 +37,7 @@ class ParameterSpec(NamedTuple):
 
 
 def specs_of(table: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:
-    """What robots, and black boxes, say of their parameters (`robots.parameter.Parameter`, by name)."""
+    """Specifications of the parameters of robots and black boxes (`robots.parameter.Parameter`, by name)."""
     return tuple(
         ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description) for name, p in table.items()
     )

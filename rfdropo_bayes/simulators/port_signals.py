@@ -1,8 +1,8 @@
-"""Ports: the places where something may act on a rollout beside its commands and its parameters, as signals over time.
+"""Ports: the places at which signals over time may act on a rollout, beside its commands and its parameters.
 
-A port of actuation changes what reaches the cables, one of the body what acts on it. Signals that are absent cost
-nothing; signals of zeros change nothing. What is measured has ports, too, but these are maps of simulated markers and
-need no rollout (see `mechanisms.laws`).
+A port of actuation changes the commands at the cables, a port of the body its loads. Signals that are absent cost
+nothing; signals of zeros change nothing. Measurements also have ports, but these are maps of simulated markers and need
+no rollout (see `mechanisms.laws`).
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 
 
 class BodySignals(NamedTuple):
-    """What acts on a rod from step to step, see `fem.section_loads`; forces at the engine's stations."""
+    """Loads on a rod that change from step to step, see `fem.section_loads`; forces at the engine's stations."""
 
     force: Float[Array, "*batch row place 3"]  # [N]
     stiffness: Float[Array, "*batch row"]  # logarithm of a factor
-    damping: Float[Array, "*batch row"]  # likewise, of both of Rayleigh's coefficients
+    damping: Float[Array, "*batch row"]  # logarithm of a factor on both of Rayleigh's coefficients
     gravity: Float[Array, "*batch row 3"]  # added to gravity [m/s2]
 
 
@@ -26,8 +26,8 @@ class PortSignals(NamedTuple):
 
     Attributes:
         command: added to the commands that reach the cables [m or rad].
-        delay: by which commands reach the cables later [s].
-        body: what acts on the body; None where nothing does.
+        delay: delay of commands at the cables [s].
+        body: loads on the body; None without loads.
     """
 
     command: Float[Array, "*batch row channel"]
@@ -41,7 +41,7 @@ def reached(
     command: Float[Array, "step channel"],
     time_step: float,
 ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
-    """Commands that reach the cables before the first step and at the end of each, given those without signals."""
+    """Commands that reach the cables before the first step and at the end of each, from commands without signals."""
     import jax.numpy as jnp
 
     late = read_late(jnp.concatenate([initial[None], command]), signals.delay / time_step) + signals.command
@@ -49,12 +49,12 @@ def reached(
 
 
 def read_late(levels: Float[Array, "row channel"], late: Float[Array, " row"]) -> Float[Array, "row channel"]:
-    """Levels so many rows earlier, linearly between rows; beyond the ends they stand still."""
+    """Levels ``late`` rows earlier, linear between rows, constant beyond the ends."""
     import jax.numpy as jnp
 
     last = len(levels) - 1
     at = jnp.arange(len(levels)) - late
-    # Rows at whole numbers count as the later end of an interval: without a delay its slope is that of the past.
+    # Whole rows count as the later end of an interval: without a delay its slope is the past interval's.
     after = jnp.clip(jnp.ceil(at), 0, last).astype(int)
     weight = jnp.where((at > 0) & (at <= last), after - at, 0.0)[:, None]
     newer = levels[after]

@@ -1,4 +1,4 @@
-"""The one call shape every simulator has: parameters and commands in, an observation and a result code out."""
+"""The interface of every simulator: parameters and commands in, an observation and a result code out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Result(IntEnum):
 
     @property
     def remedy(self) -> str:
-        """What a user can do about it."""
+        """Remedy for the user."""
         return _REMEDIES[self]
 
 
@@ -34,24 +34,24 @@ _REMEDIES = {
     Result.CABLE_LIMIT: "the cables could not reach their commanded lengths: check limits and initial displacements",
     Result.CONTACT_NOT_CONVERGED: "shorten the time step: the contacts of a step were not solved",
     Result.NOT_IN_EQUILIBRIUM: "the initial pose was not found, or overlaps the cube: check gravity, stiffness, "
-    "initial displacements and where the cube stands",
+    "initial displacements and the cube's position",
 }
 
 
 class Observation(NamedTuple):
-    """What a rollout shows at the observation times, in the frame of the robot's base.
+    """Observation of a rollout at the observation times, in the frame of the robot's base.
 
     Attributes:
         position: marker positions [m].
         tension: cable tensions [N].
         object_pose: position [m] and unit quaternion (x, y, z, w) of the object; None if the scene has none.
         status: a `Result` value.
-        motor_angle: where the drives stand: the command after delay, lag and whatever else happens inside the drives,
-            before the transmission to the cables, in the unit of the commands [rad or m]; None if it is not told.
+        motor_angle: drive positions: the command after all effects inside the drives, such as delay and lag, before the
+            transmission to the cables, in the unit of the commands [rad or m]; None if unknown.
         orientation: of the robot's `orientations`, unit quaternions (x, y, z, w) from the base's axes to the section's;
-            None if it is not told.
+            None if unknown.
         peak: of a session, the largest tension of each cable at the time steps of the last control period [N]; None if
-            it is not told. In 64 pushes of models/policies/push it was up to 3.3 times what the periods' ends show.
+            unknown. In 64 pushes of models/policies/push it was up to 3.3 times the tension at the periods' ends.
     """
 
     position: Float[Array, "time marker 3"]
@@ -73,7 +73,7 @@ class Simulator(Protocol):
 
     @property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Every parameter that may be given to ``rollout``; those left out take their nominal value."""
+        """Every parameter that may be given to ``rollout``; missing parameters take their nominal value."""
 
     @property
     def marker_names(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What simulators of a cable-driven robot share, whatever body they compute: parameters, drives and measurement."""
+"""Common base of simulators of a cable-driven robot with any body: parameters, drives and measurement."""
 
 from __future__ import annotations
 
@@ -38,20 +38,24 @@ from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 PASSES = 2
-"""Rollouts after which laws that follow the motion are given the motion that they make: with two, a pull and a
-softening are within 5 % of what they do after eight."""
+"""Number of fixed-point iterations for laws that depend on the motion: after two, a pull and a softening are within 5 %
+of their effect after eight.
+"""
 DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
 """Parameters that a body at rest does not have."""
 SOFT = 1e4
-"""[m/N] Compliance between a cable and a drive that holds its tension: what a length of 1 m changes is 0.1 mN."""
+"""[m/N] Compliance between a cable and a drive that holds its tension: a length of 1 m changes the tension by 0.1
+mN.
+"""
 DYNAMIC = 'set motion = "dynamic" under [simulator]'
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
 
 
 def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "*batch"]:
-    """How rollouts ended; ``unsolved`` is the code of those whose constraints were not all solved, ``arrays`` NumPy or
-    its likeness in JAX."""
+    """Result codes of rollouts; ``unsolved`` is the code for unsolved constraints, ``arrays`` is ``numpy`` or
+    ``jax.numpy``.
+    """
     cases = motion.diverged, motion.imbalance > EQUILIBRIUM_TOLERANCE, ~motion.converged
     codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, unsolved
     return arrays.select(cases, [int(code) for code in codes], int(Result.OK))
@@ -65,7 +69,7 @@ def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time sec
     beside = beside - jnp.sum(beside * x, axis=-1, keepdims=True) * x
     y = beside / jnp.linalg.norm(beside, axis=-1, keepdims=True)
     z = jnp.cross(x, y)
-    # Four ways to write the quaternion, each good where its own component is large.
+    # Four formulas for the quaternion, each accurate if its own component is large.
     a, e, i = x[..., 0], y[..., 1], z[..., 2]
     p, q, r = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
     u, v, w = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]
@@ -87,14 +91,14 @@ class RobotSimulator(ExtendedSimulator):
     """Base of simulators that move a robot's body by cables, alone or with a cube on a plate before it.
 
     Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
-    mechanisms, and cube -> markers -> sensing mechanisms -> observation. A cube starts at rest where it is put.
+    mechanisms, and cube -> markers -> sensing mechanisms -> observation. A cube starts at rest at its given pose.
 
     Attributes:
-        robot: what is simulated.
-        engine: what computes the motion of the body, and of a cube where it has a scene.
+        robot: simulated robot.
+        engine: engine of the motion of the body, and of a cube if it has a scene.
         assembly: the discretised robot that the engine was made for.
-        mechanisms: extensions, applied in the order given within each stage.
-        time_step: of the simulation [s].
+        mechanisms: extensions, applied in the given order within each stage.
+        time_step: time step of the simulation [s].
     """
 
     robot: Robot
@@ -121,7 +125,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def shown(self) -> int:
-        """Points of the engine that are markers; those after them tell orientations of sections."""
+        """Number of engine points that are markers; later points give orientations of sections."""
         return len(self.robot.markers)
 
     @property
@@ -131,7 +135,9 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def at_rest(self) -> bool:
-        """Whether every observation shows an equilibrium, found from the one before: no time step, no damping."""
+        """Whether every observation shows an equilibrium, found from the observation before: no time step, no
+        damping.
+        """
         return self.engine.at_rest
 
     @property
@@ -140,7 +146,7 @@ class RobotSimulator(ExtendedSimulator):
         raise NotImplementedError
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Any, Array, Array]:
-        """What the engine moves the body by: material, and cable displacements before the first and at each step."""
+        """Inputs of the engine: material, and cable displacements before the first and at each step."""
         raise NotImplementedError
 
     def material(self, values: Values) -> Any:
@@ -163,7 +169,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def lanes(self) -> int:
-        """How many rollouts the simulator likes to be given at once: as many as its engine."""
+        """Preferred number of rollouts per call, from the engine."""
         return self.engine.lanes
 
     def with_backend(self, backend: Backend) -> Self:
@@ -197,10 +203,10 @@ class RobotSimulator(ExtendedSimulator):
     def taken(
         self, recording: str, initial: Float[np.ndarray, " channel"], value: Float[np.ndarray, "command channel"]
     ) -> Float[np.ndarray, "command channel"]:
-        """See `ExtendedSimulator.taken`; what happens to commands beyond the travel is stated by the robot.
+        """See `ExtendedSimulator.taken`; the robot states the effect of commands beyond the travel.
 
         Raises:
-            InputError: what is stated of the drives does not fit the recording; see `robots.travel_in`.
+            InputError: the stated limits of drives do not fit the recording; see `robots.travel_in`.
         """
         travel = self.robot.travel(recording, initial)
         return value if travel is None else travel.follow(initial, value)
@@ -209,10 +215,10 @@ class RobotSimulator(ExtendedSimulator):
         """Simulate from the initial state to the last observation.
 
         Args:
-            parameters: values by name; those left out are nominal.
-            commands: from `commands`.
-            steps: simulate only so many time steps, and those that mechanisms of sensing look ahead; rows beyond hold
-                no meaning. None simulates all and is differentiable in reverse mode.
+            parameters: values by name; missing values are nominal.
+            commands: see `commands`.
+            steps: number of time steps, extended by the look-ahead of mechanisms of sensing; later rows are
+                meaningless. None simulates all and is differentiable in reverse mode.
 
         Raises:
             InputError: a name that is not a parameter of this simulator.
@@ -227,8 +233,9 @@ class RobotSimulator(ExtendedSimulator):
         return self.observation(values, commands, self._motion(values, commands, steps, loads), self.unsolved)
 
     def path(self, parameters: Values, commands: Commands) -> Float[Array, "row 3"]:
-        """Where the last marker is before the first step and at the end of each [m], in the frame of the base, without
-        laws that follow the motion."""
+        """Path of the last marker before the first step and at the end of each [m], in the base frame, without laws
+        that depend on the motion.
+        """
         values = self.complete(parameters)
         return self._path(self._motion(values, commands, None, self.loads(values, commands)), commands)
 
@@ -247,8 +254,9 @@ class RobotSimulator(ExtendedSimulator):
         return self.engine.motion(material, start, displacement, steps, cube, loads)
 
     def _path(self, motion: Motion, commands: Commands) -> Float[Array, "row 3"]:
-        """Where the last marker is before the first step and at the end of each [m]; between observations of a body at
-        rest on the way from one to the next."""
+        """Path of the last marker before the first step and at the end of each [m]; linear between observations of a
+        body at rest.
+        """
         tip = motion.position[:, self.shown - 1]
         if not self.at_rest:
             return tip
@@ -263,16 +271,16 @@ class RobotSimulator(ExtendedSimulator):
     def loads(
         self, values: Values, commands: Commands, path: Float[Array, "row 3"] | None = None
     ) -> BodySignals | None:
-        """What acts on the body from step to step: signals that come with the commands, and mechanisms; None for
-        nothing.
+        """Loads on the body from step to step: signals of the commands, and mechanisms; None without loads.
 
         Args:
-            values: of all parameters.
-            commands: from `commands`.
-            path: of the last marker in the frame of the base [m], for laws that follow it; they do nothing without.
+            values: values of all parameters.
+            commands: see `commands`.
+            path: path of the last marker in the base frame [m], for laws that depend on it; without it they are
+                inactive.
 
         Raises:
-            InputError: mechanisms that do, on another body than a rod without a cube.
+            InputError: such mechanisms on another body than a rod without a cube.
         """
         pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
         found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
@@ -291,9 +299,9 @@ class RobotSimulator(ExtendedSimulator):
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.
 
-        Always in double precision; with another integrator than implicit Euler by the reference engine, whatever the
-        backend, as states alone do not tell what the stages of a step did. Mechanisms of sensing have no part in it; a
-        rollout that diverged says so only in `rollout`.
+        Always in double precision; with another integrator than implicit Euler always by the reference engine, as
+        states alone do not determine the stages of a step. Mechanisms of sensing have no effect; only `rollout` reports
+        divergence.
 
         Raises:
             InputError: a name that is not a parameter of this simulator, cables with friction, or a mesh with another
@@ -301,10 +309,10 @@ class RobotSimulator(ExtendedSimulator):
         """
         values = self.complete(parameters)
         if self.at_rest:
-            raise InputError("forces and energies are those of a motion", where="balance", remedy=DYNAMIC)
+            raise InputError("forces and energies need a dynamic motion", where="balance", remedy=DYNAMIC)
         if self.loads(values, commands) is not None:
             raise InputError(
-                "forces and energies are not available where laws act on the body",
+                "forces and energies are not available with laws that act on the body",
                 where="balance",
                 remedy="leave them out of [[model.laws]]",
             )
@@ -321,7 +329,7 @@ class RobotSimulator(ExtendedSimulator):
         """Material of a rod, body mechanisms included.
 
         Raises:
-            InputError: a mechanism that acts on rods or on motion only, where the body is none or at rest.
+            InputError: a mechanism that acts on rods or on motion only, on another body or a body at rest.
         """
         material = Material(
             young_modulus=values["young_modulus"],
@@ -349,17 +357,17 @@ class RobotSimulator(ExtendedSimulator):
         return material
 
     def with_object_at(self, values: Mapping[str, Any], pose: Float[Any, "7"]) -> dict[str, Any]:
-        """Values with the cube where it was measured, less the offset of the measuring frame, standing on the plate.
+        """Values with the cube at its measured pose, less the offset of the measuring frame, standing on the plate.
 
         Args:
-            values: of one rollout, or of many (arrays of one shape); what is left out is nominal.
+            values: of one rollout, or of many (arrays of one shape); missing values are nominal.
             pose: measured centre [m] and unit quaternion (x, y, z, w).
         """
         known = {spec.name: spec.nominal for spec in self.parameters} | dict(values)
         return {**values, **cube_at_measured(self.robot, known, pose)}
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
-        """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
+        """Observation of a motion; ``unsolved`` is the code of a rollout with unsolved constraints."""
         points, at, shown = self._seen(motion.position, commands), observed_at(commands, self.time_step), self.shown
         true = points[:, :shown]
         position = self.measured(values, true, at, self.meanwhile(values, commands))
@@ -374,8 +382,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of the robot, those of the mechanisms, then those of the cube; of a body at rest without
-        damping."""
+        """Parameters of the robot, of the mechanisms, and of the cube; without damping for a body at rest."""
         base = specs_of(self.robot.parameter_table())
         base = tuple(spec for spec in base if not (self.at_rest and spec.name in DAMPING))
         extended = base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
@@ -383,7 +390,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @cached_property
     def content_sha256(self) -> str:
-        """Digest of the robot's description and of the mechanisms' code: what their names do not tell."""
+        """Digest of the robot's description and of the mechanisms' code, which their names do not determine."""
         return hashlib.sha256(self.robot.model_dump_json().encode() + code_of(self.mechanisms)).hexdigest()
 
     @property
@@ -410,7 +417,7 @@ class RobotSimulator(ExtendedSimulator):
         return self.exerted(values, start.level), levels
 
     def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
-        """The drives before the first step, where this command [m or rad] has reached them."""
+        """The drives before the first step, settled at this command [m or rad]."""
         limits = self.robot.drive_limits()
         level = self.robot.channel_matrix(values) @ initial
         return Wound(jnp.clip(level, limits[:, 0], limits[:, 1]), jnp.asarray(initial, float))

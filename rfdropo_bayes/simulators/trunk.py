@@ -73,7 +73,7 @@ class TrunkSimulator(RobotSimulator):
 
     @property
     def time_step(self) -> float:  # type: ignore[override]
-        """That of the discretisation."""
+        """Time step of the discretisation."""
         return self.discretisation.time_step
 
     @property
@@ -82,7 +82,7 @@ class TrunkSimulator(RobotSimulator):
         return {"body": "rod", "elements": self.assembly.system.body.elements}
 
     def session(self, lanes: int, period: float) -> Session:
-        """So many trunks that are commanded one control period [s] at a time; see `Session`."""
+        """A session of ``lanes`` trunks, commanded once per control ``period`` [s]; see `Session`."""
         return Session(self, lanes, period)
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Material, Array, Array]:
@@ -90,7 +90,7 @@ class TrunkSimulator(RobotSimulator):
         return self.material(values), *self.wound(values, commands, self.time_step)
 
     def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
-        """See `RobotSimulator`; the energies are those of the body."""
+        """See `RobotSimulator`; the energies are of the body."""
         system, engine = self.assembly.system, self.engine
         material, start, displacement = inputs
         prepared, state, _ = engine.initial(material, start)

@@ -1,4 +1,4 @@
-"""Models and calibrations as a call of a verb is given them, or an error that says how to make one."""
+"""Checks of the models and calibrations given to a verb."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rfdropo_bayes.runtime import refuse_lost_threads
 
 
 def given_model(given: Any, where: str) -> Model:
-    """A model.
+    """The argument, if it is a model.
 
     Args:
-        given: what a caller took for a model.
-        where: the verb that was called.
+        given: argument of the caller.
+        where: name of the verb.
 
     Raises:
-        InputError: something else was given, or JAX cannot compute in this process.
+        InputError: the argument is no model, or JAX cannot compute in this process.
     """
     refuse_lost_threads()
     if isinstance(given, Model):
@@ -41,5 +41,5 @@ def given_fit(given: Any, where: str) -> Calibration:
     if isinstance(given, Calibration):
         return given
     named = f"{str(given)!r}" if isinstance(given, str | Path) else f"a {type(given).__name__}"
-    remedy = "rb.calibrate returns one, rb.load(folder) reads that of an earlier run"
+    remedy = "rb.calibrate returns one, rb.load(folder) reads the calibration of an earlier run"
     raise InputError(f"{named} is no calibration", where=where, remedy=remedy)

@@ -23,7 +23,7 @@ from rfdropo_bayes.inference.methods import make_config, method_named, method_of
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.assembly import integrator_of
-from rfdropo_bayes.model.experiment import InferenceTable
+from rfdropo_bayes.model.experiment import ROLLOUTS, InferenceTable
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
@@ -61,10 +61,10 @@ from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_model
+from rfdropo_bayes.verbs.budget import MOST_DRAWS, budget_within, rollout_seconds, timing_key
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
-PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
@@ -108,13 +108,18 @@ def calibrate(
     table = model.settings.inference
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
-    problem = model.problem(runs, earlier_draws(fit, name))
+    problem, draws = model.problem(runs, earlier_draws(fit, name)), MOST_DRAWS
+    if method is None and table.minutes is not None:
+        per_set = rollout_seconds(problem, timing_key(chosen))
+        fitted, tested = (sum(len(run.time) for run in part) for part in (runs, test))
+        budget = budget_within(table.minutes, per_set, (fitted + tested) / fitted)
+        config, draws = dataclasses.replace(config, rollouts=budget.rollouts), budget.draws
     said = {"method": name, **options_table(config)}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
         {"seed": seed, "inference": None if method is None else said},
     )
-    work = partial(_fit, Fitting(model, problem, config, runs, test, chosen))
+    work = partial(_fit, Fitting(model, problem, config, runs, test, chosen, draws))
     if out is None:
         return work(None, describe(tables), resume=False, show=show)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
@@ -135,11 +140,12 @@ class Fitting(NamedTuple):
     runs: Sequence[Trajectory]
     test: Sequence[Trajectory]
     seed: int
+    draws: int = MOST_DRAWS  # whose predictions are kept
 
 
 def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: bool | None) -> Calibration:
     """Run the method; ``text`` is the experiment as TOML, ``out`` the folder for log and checkpoints."""
-    model, problem, config, runs, test, seed = asked
+    model, problem, config, runs, test, seed, _ = asked
     method = method_of(config)
     key, predicting = jax.random.split(jax.random.key(seed))
     log, kept = (None, None) if out is None else (out / LOG, out / CHECKPOINTS)
@@ -187,7 +193,7 @@ def inference_options(table: InferenceTable) -> dict[str, Any]:
     """Options of the method; the budget is among them where the method takes one."""
     options = table.options
     fields = {field.name for field in dataclasses.fields(method_named(table.method).config)}
-    return {**options, "rollouts": table.rollouts} if "rollouts" in fields else options
+    return {**options, "rollouts": table.rollouts or ROLLOUTS} if "rollouts" in fields else options
 
 
 def record_posterior(
@@ -206,7 +212,7 @@ def record_posterior(
     say_step(f"the fit is done: predicting the fitted recordings ({len(asked.runs)})", show=show)
     rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
-    values = thin(result.draws, PREDICTIVE_DRAWS)
+    values = thin(result.draws, asked.draws)
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
     fitted = list(problem.model.recordings.names)
@@ -262,7 +268,7 @@ def _unseen_days(
     posterior."""
     if left is None or not method_named(result.method).posterior:
         return None
-    draws = thin(result.draws, PREDICTIVE_DRAWS)
+    draws = thin(result.draws, asked.draws)
     optimum = result.optimum or {}
     if set(draws) <= set(optimum):
         draws = {name: np.full(2, optimum[name]) for name in draws}

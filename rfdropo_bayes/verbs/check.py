@@ -29,7 +29,7 @@ from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
-from rfdropo_bayes.model.experiment import AuditTable, Experiment, load_experiment
+from rfdropo_bayes.model.experiment import ROLLOUTS, AuditTable, Experiment, InferenceTable, load_experiment
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
@@ -338,11 +338,18 @@ def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
         found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
 
 
+def _budget(table: InferenceTable) -> str:
+    """The budget of a fit in words."""
+    if table.minutes is not None:
+        return f"as many rollouts as {table.minutes:g} min hold"
+    return f"{table.rollouts or ROLLOUTS} rollouts"
+
+
 def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
     """What is inferred, and how; a model that cannot be built is a problem."""
     method, named = experiment.inference.method, experiment.model.mechanisms
     _try(found, lambda: make_config(method, inference_options(experiment.inference)))
-    found.lines.append(("method", f"{method}, {experiment.inference.rollouts} rollouts, seed {experiment.seed}"))
+    found.lines.append(("method", f"{method}, {_budget(experiment.inference)}, seed {experiment.seed}"))
     found.lines.append(("mechanisms", ", ".join(named) or "none"))
     spec = _try(found, lambda: spec_of(experiment, folder))
     if spec is not None:

@@ -1,4 +1,4 @@
-"""What the columns of a recording are, guessed from their names and sizes, for a first experiment file to look over."""
+"""Guess of a recording's columns from their names and sizes, for a first experiment file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MEASURED = re.compile(
     r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
 )
 SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)
-"""Where any columns are called so, they alone are commands."""
+"""If any columns match, only they are commands."""
 COMMAND = re.compile(
     r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
     re.IGNORECASE,
@@ -63,7 +63,7 @@ DERIVED = re.compile(r"(?<![a-z])[vwq][_. ]?\*", re.IGNORECASE)
 """The same under a single letter: velocities and quaternions, if there are positions beside them."""
 RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
 BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
-"""Solved poses of bodies: where there are any, the markers that they were solved from are not used as well."""
+"""Solved poses of bodies: if there are any, the underlying markers are not used."""
 MARKER = re.compile(r"^Marker\.(?!Unlabeled)", re.IGNORECASE)
 """Markers that Motive measured and somebody named."""
 STRUCTURE = re.compile(
@@ -83,22 +83,22 @@ class Guess(NamedTuple):
     """Columns of a file, by their part.
 
     Attributes:
-        time, time_unit: column and unit of times, "s" where they are dates; None without one.
+        time, time_unit: column and unit of times, "s" for dates; None without times.
         commands, command_unit: columns and unit of the commands.
         positions, position_unit: columns of x, y and z of each marker, and their unit.
-        markers: a name for each marker, made of its columns'; numbered where they tell none.
-        tensions, motor_angles: columns of measured forces and angles, as many as commands; else empty.
-        motor_angle_unit: of the latter.
-        counts_per_turn: of the spool, where a unit is "counts".
-        left: columns that are nothing of these.
-        format: of the file, one of `mapped_formats.MAPPED`.
-        command_time, command_time_unit: column and unit of the commands' own times; None without one.
-        units: of columns in other units than command_unit or position_unit.
-        names, command_names: of all columns of files without names, as they were given.
-        sample_time: time from row to row [s], as it was given; None for rows with times, or without any.
-        evidence: why a unit was guessed, by its key in [data.columns]; no entry for a unit that the file tells.
-        start: where each marker is first seen, as the file has it.
-        sent: commands of the first rows; seen: positions of the markers in the first rows, both as the file has them.
+        markers: a name for each marker, made of its columns'; numbered if the columns have no names.
+        tensions, motor_angles: columns of measured forces and angles, one per command; else empty.
+        motor_angle_unit: unit of motor angles.
+        counts_per_turn: counts per turn of the spool, if a unit is "counts".
+        left: other columns.
+        format: format of the file, one of `mapped_formats.MAPPED`.
+        command_time, command_time_unit: column and unit of the commands' own times; None without them.
+        units: units of columns other than command_unit or position_unit.
+        names, command_names: given names of all columns, for files without names.
+        sample_time: given time from row to row [s]; None for rows with times, or without any.
+        evidence: why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file.
+        start: first seen position of each marker, in the file's frame and unit.
+        sent: commands of the first rows; seen: marker positions in the first rows, both in the file's units.
     """
 
     time: str | None
@@ -137,12 +137,12 @@ def guess_columns(
     names: Sequence[str] | None = None,
     command_names: Sequence[str] | None = None,
 ) -> Guess:
-    """Guess what the columns of a recording are.
+    """Guess the meaning of a recording's columns.
 
     Args:
         path: a CSV, an export of Motive's, a bag, a LeRobotDataset, or a file of arrays.
-        sent: a CSV with the commands, where they have a file of their own.
-        names: of the columns of a CSV without names; command_names: the same for the commands' file.
+        sent: a CSV with the commands, if they have a separate file.
+        names: column names of a CSV without names; command_names: the same for the commands' file.
 
     Raises:
         InputError: a file that cannot be read, or in which no positions or commands are found.
@@ -202,7 +202,7 @@ def guess_columns(
 
 
 def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[str], list[str], list[str]]:
-    """Columns in x, y and z of each marker, of forces, of measured angles, and those that may be commands."""
+    """Columns in x, y and z of each marker, of forces, of measured angles, and possible commands."""
     places = _array_triples(columns) if format in named_arrays.FORMATS else _triples(columns)
     rest = [name for name in columns if SENT.search(name) or not any(name in triple for triple in places.values())]
     tensions = [name for name in rest if FORCE.search(name)]
@@ -236,7 +236,7 @@ def _measured_angles(whole: CsvTable, table: pd.DataFrame, angles: list[str], se
 def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers: Sequence[str]) -> list[str] | None:
     """Names for the columns of a file without names: times, commands, and x, y and z of each marker.
 
-    None if the columns are not as many.
+    None if the number of columns does not match.
 
     Args:
         rows: the cells of its first rows.
@@ -266,7 +266,7 @@ def lost_positions(recordings: list[Path], guess: Guess) -> dict[str, int]:
 
 
 def _measured(format: str, path: Path, names: Sequence[str] | None) -> tuple[CsvTable, str | None]:
-    """The table of a recording, and the unit of lengths where the file tells it."""
+    """The table of a recording, and the unit of lengths if the file states it."""
     if format == rosbag.FORMAT:
         return CsvTable.of_frame(side_by_side(rosbag.read_streams(path)), str(path), ()), "m"
     if format == lerobot.FORMAT:
@@ -288,7 +288,7 @@ def _clock_of(table: CsvTable) -> str | None:
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Those of the columns in x, y and z that are places of markers."""
+    """The triples of columns in x, y and z that are marker positions."""
     places = {
         common: names for common, names in triples.items() if not (NO_PLACE.search(common) or SENT.search(common))
     }
@@ -300,7 +300,7 @@ def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
 
 
 def _commands(table: pd.DataFrame, names: list[str], *, any_name: bool) -> list[str]:
-    """Those of the columns that are commands; where none is called so, all of them in files of one's own."""
+    """Columns of commands; if no name matches, all columns in files of a user's own format."""
     told = [name for name in names if SENT.search(name)]
     names = told or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
     turns = {name for four in _quaternions(table, names) for name in four}
@@ -337,7 +337,7 @@ def names_of(positions: list[list[str]]) -> list[str]:
 
 
 def _triples(names: list[str]) -> dict[str, list[str]]:
-    """Columns that differ in one letter, x, y or z: what they have in common, and the three in this order."""
+    """Columns that differ in one letter, x, y or z: their common name, and the three in this order."""
     found: dict[str, dict[str, str]] = {}
     for name in names:
         for match in AXIS.finditer(name):
@@ -362,7 +362,7 @@ def _array_triples(names: list[str]) -> dict[str, list[str]]:
 
 
 def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list[str]:
-    """Names that robot files allow, made of what the columns of each marker have in common, without some words."""
+    """Names that robot files allow, made of the common name of each marker's columns, without some words."""
     names = []
     for number, common in enumerate(commons, start=1):
         words = [word for word in WORD.findall(common) if word not in UNITS]
@@ -380,7 +380,7 @@ def _holds_times(table: CsvTable, name: str) -> bool:
 
 
 def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
-    """How long a recording lasts [s]; zero where that is not known."""
+    """Length of a recording [s]; zero if unknown."""
     if time is None or time not in table:
         return 0.0
     stamps = table.stamps(time, unit)

@@ -1,4 +1,4 @@
-"""Units of columns: those that names or a line of units tell, else those that sizes suggest, with the evidence."""
+"""Units of columns: from names or a line of units, else guessed from sizes, with the evidence."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ NOT_TOLD, NOT_WHOLE = 2.0, 4.0
 RESTING = 3e-3
 """Share of the largest coordinate: markers that spread by less rest, and show the rate of noise."""
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
-"""A soft arm moves by less than so many metres, and its drives turn by less than so many radians."""
+"""Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
 METRES_UP_TO = 0.2
 """No cable of a soft arm is pulled by more metres."""
 
@@ -126,13 +126,13 @@ def length_unit(values: pd.DataFrame) -> Unit:
 
 
 def unit_of_places(start: Float[np.ndarray, "marker 3"], heights: Mapping[str, float]) -> Unit | None:
-    """The unit in which markers are as far apart, or a single marker as far from the base, as on the robot.
+    """The unit in which distances between markers, or of a single marker from the base, match the robot.
 
     None if no unit brings them near.
 
     Args:
-        start: where each marker is first seen, in the unit that is looked for.
-        heights: of the same markers on the robot [m], in their order.
+        start: first seen position of each marker, in the unknown unit.
+        heights: heights of the same markers on the robot [m], in their order.
     """
     names, height = list(heights), np.array(list(heights.values()))
     i, j = int(np.argmin(height)), int(np.argmax(height))
@@ -228,7 +228,7 @@ def _rate(places: np.ndarray | None) -> float:
 
 
 def _likeliest(interval: float, decimals: bool, rate: float) -> str:
-    """The unit in which time between rows and rate of motion are most like those of soft robots.
+    """The unit in which time between rows and rate of motion are most plausible for soft robots.
 
     Motion that would be faster than any soft robot's rules a unit out: rows between which markers go to and fro are
     poses at rest, seconds apart.

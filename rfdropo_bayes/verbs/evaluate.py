@@ -47,7 +47,7 @@ from rfdropo_bayes.verbs.train import POLICY
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
 SCHEMA_VERSION = 1
 OF_EPISODES = ("task", "goals", "start", "actions", "observation", "period", "noise", "tension_limit")
-"""Keys of [training] that say what an episode is, whatever is simulated."""
+"""Keys of [training] that define an episode, for any simulator."""
 
 
 @with_keys_of(TrainingTable)
@@ -67,25 +67,25 @@ def evaluate(
     """Play exported policies on the same episodes of a model.
 
     Args:
-        model: that is simulated.
-        fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws.
-        policies: policy.onnx, or folders that hold one; named after their folders, with those above
-            where two folders are called the same.
+        model: simulated model.
+        fit: a calibration, or its folder, whose posterior provides the episodes' parameters.
+        policies: policy.onnx, or folders that hold one; named after their folders, with parent folders if two names are
+            equal.
         out: folder to write to: evaluation.json, evaluation.md, episodes.csv, success.png, and a GIF of each policy's
             median episode.
-        episodes: of each policy.
+        episodes: number for each policy.
         lanes: episodes that are simulated at once.
-        seed: of the cases.
+        seed: seed of the cases.
         film: whether to draw the animations.
-        overwrite: start anew whatever ``out`` holds.
-        keys: of an experiment file's [training], such as the task. Of an experiment without that table they
-            are those of the first policy's training.
+        overwrite: replace an earlier run in ``out``.
+        keys: keys of an experiment file's [training], such as the task. Without that table they are taken from the
+            first policy's training.
 
     Returns:
         the content of evaluation.json.
 
     Raises:
-        InputError: bad input, a policy for another layout, or one that is given twice.
+        InputError: bad input, a policy for another layout, or a policy given twice.
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for one at least")
@@ -124,7 +124,7 @@ def evaluate(
 
 
 def _task_of(policies: Sequence[Path]) -> dict[str, Any]:
-    """What an episode is in the training of the first policy; nothing if its folder does not say."""
+    """Definition of an episode in the training of the first policy; empty if its folder lacks it."""
     first = policies[0] if policies[0].is_dir() else policies[0].parent
     if not (first / CONFIG).is_file():
         return {}
@@ -132,8 +132,9 @@ def _task_of(policies: Sequence[Path]) -> dict[str, Any]:
 
 
 def _drop_limit(inherited: dict[str, Any]) -> list[str]:
-    """Take the limit on tension out of what a training says of episodes, for a model that tells no tensions: a
-    sentence about it, or none if there was no limit."""
+    """Remove the tension limit from a training's definition of episodes, for a model without tensions. Returns a
+    sentence about it, or none without a limit.
+    """
     limit = inherited.pop("tension_limit", None)
     if limit is None:
         return []
@@ -149,7 +150,7 @@ def _episodes_for(
     table: TrainingTable,
     name: str,
 ) -> Episodes:
-    """Lanes that show a policy what it was trained to see."""
+    """Episodes with the observations that a policy was trained on."""
     settings = Settings(
         actions=layout.kind,
         observed=observed_of(layout, len(simulator.marker_names)),
@@ -175,7 +176,7 @@ def _otherwise_trained(policies: Mapping[str, ExportedPolicy], integrator: str) 
 
 
 def _names(policies: Sequence[Path]) -> list[str]:
-    """Names of policies: of their folders, with as many folders above as it takes to tell them apart."""
+    """Names of policies: their folders, with enough parent folders to be distinct."""
     places = [p if p.is_dir() else (p.parent if p.stem == "policy" else p.with_suffix("")) for p in policies]
     parts = [place.resolve().parts for place in places]
     if len(set(parts)) < len(parts):
@@ -208,7 +209,7 @@ def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed:
 
 
 def _millimetres(distance: float) -> float | None:
-    """None where simulations failed, which is no distance."""
+    """A distance in millimetres; None after a failed simulation."""
     return 1e3 * distance if np.isfinite(distance) else None
 
 

@@ -20,17 +20,10 @@ from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_te
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
+from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, rows_to_fit
 from rfdropo_bayes.verbs.placement import frame_lines
 from rfdropo_bayes.verbs.slow_motion import slow_motion
 from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
-
-PRIORS = (
-    ("young_modulus", "how stiff"),
-    ("trunk_mass", "how heavy: weigh it, and state it under [[model.weighed]]"),
-    ("rayleigh_stiffness", "how damped"),
-    ("spool_radius", "cable wound up per angle"),
-)
-
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
@@ -141,7 +134,8 @@ def write_first_files(
     Args:
         folder: to write to; it is made.
         outline: the robot.
-        recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset.
+        recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset, and the
+            last third of the rows of one that stands alone.
         commands: the file of commands of each, where they have any.
         guess: what their columns are, see `of_robot`; None without recordings, when random commands are simulated.
 
@@ -156,8 +150,9 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
 
-    def write(data: list[str], slow: str | None = None) -> Experiment:
-        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(outline, guess, rests=slow is not None)]
+    def write(data: list[str], slow: str | None = None, first: Trajectory | None = None) -> Experiment:
+        rests = slow is not None
+        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(made, guess, first, rests=rests)]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
@@ -176,9 +171,9 @@ def write_first_files(
     )
     plain = write(tables())
     first = _first_recording(plain, folder)
-    frame, slow = _frame(plain, made, guess), None if first is None else slow_motion(made, first)
-    if frame or slow:
-        write(tables(frame=frame), slow)
+    if first is not None:
+        slow, rows = slow_motion(made, first), rows_to_fit(first) if len(recordings) == 1 else None
+        write(tables(frame=_frame(plain, made, guess), rows=rows), slow, first)
     return robot, experiment
 
 
@@ -215,17 +210,25 @@ def _head(name: str) -> list[str]:
     ]
 
 
-def _entries(folder: Path, recordings: list[Path], commands: list[Path], guess: Guess) -> list[str]:
-    """The recordings as entries of fit and test."""
-    names = [quoted(os.path.relpath(path, folder)) for path in recordings]
+def _entries(
+    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, rows: tuple[list[int], list[int]] | None
+) -> list[str]:
+    """The recordings as entries of fit and test; one that stands alone twice if its rows are divided."""
+    entries: list[dict[str, Any]] = [{"observations": os.path.relpath(path, folder)} for path in recordings]
     if commands:
-        sent = [quoted(os.path.relpath(path, folder)) for path in commands]
-        return [f"{{observations = {name}, commands = {file}}}" for name, file in zip(names, sent, strict=True)]
-    if guess.format == lerobot.FORMAT and len(names) == 1:
+        sent = [os.path.relpath(path, folder) for path in commands]
+        entries = [{**entry, "commands": file} for entry, file in zip(entries, sent, strict=True)]
+    elif guess.format == lerobot.FORMAT and len(entries) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
         parts = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
-        return [f"{{observations = {names[0]}, episodes = {part}}}" for part in parts]
-    return names
+        entries = [{**entries[0], "episodes": part} for part in parts]
+    if rows is not None and len(entries) == 1:
+        entries = [{**entries[0], "rows": part} for part in rows]
+    tables = [", ".join(f"{key} = {quoted(value)}" for key, value in entry.items()) for entry in entries]
+    return [
+        quoted(entry["observations"]) if len(entry) == 1 else f"{{{text}}}"
+        for entry, text in zip(entries, tables, strict=True)
+    ]
 
 
 def assumed_of_columns(guess: Guess) -> list[str]:
@@ -249,13 +252,14 @@ def data_tables(
     gravity: str = "",
     frame: Sequence[str] = (),
     cables: Sequence[str] = (),
+    rows: tuple[list[int], list[int]] | None = None,
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
     ``frame`` are the lines of axes and origin, where the first row tells them; ``cables`` the robot's, one for each
-    command, if tensions of them were measured.
+    command, if tensions of them were measured; ``rows`` those to fit and to test of a recording that stands alone.
     """
-    entries = _entries(folder, recordings, commands, guess)
+    entries = _entries(folder, recordings, commands, guess, rows)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
     lost = lost_positions(recordings, guess)
     counted = f" ({', '.join(f'{name}: {count} empty cells' for name, count in lost.items())})" if lost else ""
@@ -366,25 +370,33 @@ def _simulator(slow: str | None) -> list[str]:
     ]
 
 
-def _model(outline: RobotOutline, guess: Guess | None, *, rests: bool) -> list[str]:
-    absent = {"spool_radius"} if outline.command_unit != "rad" else set()
-    absent |= {"rayleigh_stiffness"} if rests else set()
-    wanted = [(name, why) for name, why in PRIORS if name not in absent]
-    uses = []
-    if guess is not None and guess.tensions:
-        uses.append("tension = true          # forces are data: they fix the scale of stiffness and mass")
-    if guess is not None and guess.motor_angles and outline.command_unit == "rad":
+def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests: bool) -> list[str]:
+    """The tables [model] and [inference]."""
+    mechanisms, tensions = installed_mechanisms(robot), guess is not None and bool(guess.tensions)
+    wanted = ["young_modulus = {}  # over the body's weight: how stiff it is"]
+    if tensions:
+        wanted.append("trunk_mass = {}  # weigh it, and state it under [[model.weighed]]")
+    if robot.command_unit == "rad":
+        wanted.append("spool_radius = {}  # cable wound up per angle")
+    if not rests:
+        wanted.append("rayleigh_stiffness = {}  # damping")
+    uses = ["tension = true          # forces are data: they fix the scale of stiffness and mass"] if tensions else []
+    if guess is not None and guess.motor_angles and robot.command_unit == "rad":
         uses.append("motor_angle = true      # so are measured motor angles")
     return [
         "[model]",
-        "mechanisms = []         # effects on top of the base simulator: rfdropo mechanisms lists them",
+        "# The measuring frame and the drives as they are installed; rfdropo mechanisms lists further effects.",
+        f"mechanisms = {quoted(mechanisms)}",
+        'noise = "white"         # laplace finds how many rows an error lasts, and counts rows by it',
         *uses,
         "",
-        "[model.priors]          # what to infer; {} asks for the robot file's prior",
-        *(f"{name} = {{}}  # {why}" for name, why in wanted),
+        "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
+        *wanted,
+        *installed_priors(robot, first),
         "",
         "[inference]",
-        'method = "smc"          # rfdropo methods lists them',
-        "rollouts = 20000        # the budget",
+        'method = "laplace"      # rfdropo methods lists them',
+        *(["blocks = 1              # rows at rest do not depend on the rows before them"] if rests else []),
+        "minutes = 3             # that calibrate may take on the machine where it runs, its report included",
         "",
     ]

@@ -22,7 +22,7 @@ from rfdropo_bayes.verbs.column_units import ANGLES
 from rfdropo_bayes.verbs.init import data_tables, quoted, with_given
 
 OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}
-"""Units that a recording may have of what a simulator takes in each of these."""
+"""Units of commands in recordings, for each unit of a simulator."""
 
 
 def write_model_experiment(
@@ -31,14 +31,14 @@ def write_model_experiment(
     """Write ``experiment.toml`` for a model's file, and read it back.
 
     Args:
-        model: file of the model, which stays where it is.
+        model: file of the model, which is not moved.
         folder: to write to; it is made.
-        recordings: files to fit; of several, the last one is for testing.
-        commands: the file of commands of each, where they have any.
-        guess: what their columns are; None without recordings.
+        recordings: files to fit; the last of several is for testing.
+        commands: the file of commands of each, if they have any.
+        guess: guess of their columns; None without recordings.
 
     Returns:
-        the file, and what of it was assumed.
+        the file, and its assumptions.
 
     Raises:
         InputError: a model that cannot be read, more markers or commands than it has, or a file that is there already.
@@ -72,7 +72,7 @@ def write_model_experiment(
 
 
 def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> dict[str, Float[np.ndarray, "3"] | None]:
-    """Where each marker of the first recording is first seen."""
+    """First seen position of each marker of the first recording."""
     columns: dict[str, Any] = {
         "commands": guess.commands,
         "command_unit": guess.command_unit,
@@ -103,9 +103,9 @@ def _adapter(tables: dict[str, Any], assumed: list[str]) -> list[str]:
         "",
     ]
     said = {
-        "markers": "# What each marker is: site/NAME, body/NAME or geom/NAME.",
+        "markers": "# Element of each marker: site/NAME, body/NAME or geom/NAME.",
         "channels": "# The actuator of each command, by name, or by number from 0.",
-        "parameters": "# What may be inferred: kind/name/attribute, or * for a factor on all.",
+        "parameters": "# Parameters that may be inferred: kind/name/attribute, or * for a factor on all.",
     }
     for key, words in said.items():
         lines += [words, f"[adapter.{key}]"]
@@ -135,7 +135,7 @@ def _inferred(tables: dict[str, Any]) -> list[str]:
         "[model]",
         "mechanisms = []         # effects of drives and cameras on top: rfdropo mechanisms lists them",
         "",
-        "[model.priors]          # what to infer; {} asks for the default prior of its kind",
+        "[model.priors]          # parameters to infer; {} asks for the default prior of its kind",
         *(f"{quoted(name)} = {{}}" for name in tables["parameters"]),
         "",
         "[inference]",

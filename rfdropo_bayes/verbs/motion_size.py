@@ -11,14 +11,15 @@ from rfdropo_bayes.data.named_columns import COMMAND_UNITS, CsvColumns
 from rfdropo_bayes.verbs.motion_direction import Paths
 
 OFF = 3.0
-"""Ratio of two motions from which on a unit is doubted. A nominal model is within a factor of two if commands impose
-lengths or angles, and the nearest units are a factor of ten apart. Of four real robots the ratio is 0.5 to 1.6."""
+"""Ratio of two motions above which a unit is doubted. A nominal model is within a factor of two if commands impose
+lengths or angles, and the nearest units are a factor of ten apart. The ratio is 0.5 to 1.6 for four real robots.
+"""
 FAR_OFF = 30.0
 """The same for commands that are forces: how far they bend a body depends on its stiffness, which is not known."""
 EXPLAINED = 2.0
 """A unit explains a motion that is within this factor of the measured motion."""
 IMPOSED = ("m", "rad")
-"""Units of commands that impose where a cable goes."""
+"""Units of commands that impose cable lengths."""
 
 
 class Size(NamedTuple):
@@ -29,7 +30,7 @@ class Size(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Measured over nominal; 1 where neither moves."""
+        """Measured over nominal; 1 if neither moves."""
         if self.nominal == 0.0:
             return 1.0 if self.measured == 0.0 else float("inf")
         return self.measured / self.nominal
@@ -66,7 +67,7 @@ class Unit(NamedTuple):
 
 
 def other_units(columns: CsvColumns | None, command_unit: str) -> list[Unit]:
-    """Units that commands may have been in: those that have a name first, and powers of ten; none for forces."""
+    """Units that commands may have been in: named units first, then powers of ten; none for forces."""
     if command_unit not in IMPOSED:
         return []
     own = None if columns is None else COMMAND_UNITS.get(columns.command_unit)
@@ -82,9 +83,9 @@ def other_units(columns: CsvColumns | None, command_unit: str) -> list[Unit]:
 
 
 def likely_units(units: Sequence[Unit], size: Size | None) -> list[Unit]:
-    """Units in the order in which they are worth a try: by how near they bring the sizes.
+    """Units by the agreement of sizes, best first.
 
-    Without a size, because the simulation did not end well under commands that may be too large: smaller ones.
+    Without a size, because the simulation failed under commands that may be too large: smaller units.
     """
     if size is None:
         return sorted((unit for unit in units if unit.factor < 1.0), key=lambda unit: -unit.factor)
@@ -104,7 +105,7 @@ def size_sentence(size: Size, columns: CsvColumns | None, explained: tuple[Unit,
 
 
 def unit_words(columns: CsvColumns | None, explained: tuple[Unit, Size] | None) -> str:
-    """What to write."""
+    """Remedy: the line to write."""
     known = columns is not None and columns.command_unit in COMMAND_UNITS
     if explained is None:
         more = "" if known else ", counts_per_turn"

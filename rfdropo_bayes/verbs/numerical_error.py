@@ -20,9 +20,11 @@ from rfdropo_bayes.simulators.mechanisms import motions_of
 from rfdropo_bayes.simulators.protocol import Result
 
 FINER, MORE_ELEMENTS = 4, 2
-"""The time step is divided by this, and every element cut into so many more."""
+"""The time step is divided by this, and the number of elements is multiplied by the second."""
 LIMIT = MORE_ELEMENTS**2 / (MORE_ELEMENTS**2 - 1)
-"""Distance from the limit of ever more elements over that from so many more: the rod is of second order."""
+"""Distance from the limit of infinitely many elements over the distance from `MORE_ELEMENTS` times the elements; the
+rod is of second order.
+"""
 LONGEST, LONGEST_MESH = 20.0, 2.0
 """[s] that are simulated of a recording, of a rod and of tetrahedra, each of whose steps takes 100 times as long."""
 SOLVES = 4.0
@@ -36,7 +38,7 @@ class RestError(NamedTuple):
 
     distance: float  # root mean square, of the markers [mm]
     way: float  # of the markers about their mean [mm]
-    cheaper: float  # solves of the dynamic motion over those of the quasi-static one
+    cheaper: float  # ratio of solves of the dynamic and the quasi-static motion
 
     @property
     def enough(self) -> bool:
@@ -45,7 +47,7 @@ class RestError(NamedTuple):
 
 
 class NumericalError(NamedTuple):
-    """Root mean square distance of the markers [mm] from those of other simulations."""
+    """Root mean square distance of the markers [mm] from other simulations."""
 
     seconds: float  # that were simulated
     time_step: float | None  # a quarter of the step; None for a motion without steps
@@ -55,13 +57,13 @@ class NumericalError(NamedTuple):
 
 
 def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> NumericalError:
-    """What a quarter of the time step, twice the elements, and the other kind of motion change at the markers.
+    """Change at the markers with a quarter of the time step, twice the elements, and the other kind of motion.
 
-    Values are nominal or fixed. An error that falls with the step as implicit Euler's does is a third larger than this
-    difference, one of second order a fifteenth.
+    Values are nominal or fixed. An error of first order in the step, as of implicit Euler, is a third larger than this
+    difference; an error of second order is a fifteenth larger.
 
     Raises:
-        InputError: a black box, commands that do not fit, or a rollout that did not end well.
+        InputError: a black box, commands that do not fit, or a failed rollout.
     """
     simulator, table = build_robot_simulator(spec), spec.simulator
     longest = longest_of(simulator.engine.is_rod)
@@ -121,7 +123,7 @@ def nominal_markers(spec: ModelSpec, recording: Trajectory, longest: float) -> F
 
 
 def numerical_error_lines(spec: ModelSpec, recording: Trajectory) -> list[tuple[str, str]]:
-    """The same in words, as `Check.lines`, beside the noise where it is stated."""
+    """The numerical error in words, as `Check.lines`, compared with stated noise."""
     found, table = measure_numerical_error(spec, recording), spec.simulator
     simulator = build_robot_simulator(spec)
     integrator, step = simulator.engine.integrator, 1e3 * simulator.time_step
@@ -130,7 +132,7 @@ def numerical_error_lines(spec: ModelSpec, recording: Trajectory) -> list[tuple[
     if found.time_step is not None:
         said.append(f"a quarter of the time step ({step:.4g} ms, {integrator}): {found.time_step:.2g} mm {over}")
     if found.elements is None:
-        said.append("the mesh of tetrahedra is as given: what a finer one would change is not measured")
+        said.append("the mesh of tetrahedra is as given: the error of the mesh is not measured")
     else:
         cut = "" if table.refine == 1 else f" (refine = {table.refine})"
         limit = LIMIT * found.elements

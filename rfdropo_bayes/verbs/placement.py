@@ -1,4 +1,4 @@
-"""Where a recording's markers are when it begins, beside the undeformed robot: axes, units, order and origin."""
+"""First marker positions of a recording compared with the undeformed robot: axes, units, order and origin."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rfdropo_bayes.robots import Robot
 FAR = 0.4
 """Share of the robot's length: undeformed markers that are farther off than this, root mean square, are looked at."""
 NEAR = 0.15
-"""Share of the robot's length: what brings the markers as near as this is offered as the cause."""
+"""Share of the robot's length; a remedy that brings the markers this near is reported as the cause."""
 STRETCHED = 1.15
-"""Two markers that are farther apart than so many times their distance on the undeformed robot are said."""
+"""Ratio to the distance of two markers on the undeformed robot above which they are reported."""
 
 
 class Start(NamedTuple):
-    """Markers that robot and recording share, those seen in the first row."""
+    """Markers that robot and recording share and that are seen in the first row."""
 
     names: tuple[str, ...]
     rest: Float[np.ndarray, "marker 3"]  # [m]
@@ -32,13 +32,13 @@ class Start(NamedTuple):
 
 
 def start_of(robot: Robot, trajectory: Trajectory) -> Start:
-    """The undeformed robot's markers, and where the first row has them."""
+    """The undeformed robot's markers, and their positions in the first row."""
     first = np.where(trajectory.position_mask[0, :, None], trajectory.position[0], np.nan)
     return _start(robot, trajectory.marker_names, first)
 
 
 def _start(robot: Robot, markers: Sequence[str], first: Float[np.ndarray, "marker 3"]) -> Start:
-    """The same of markers that are at ``first`` [m], not a number where they are not seen."""
+    """The same for markers at ``first`` [m], NaN if not seen."""
     chosen = [(index, list(markers).index(name)) for index, name in enumerate(robot.marker_names) if name in markers]
     seen = [(i, j) for i, j in chosen if np.isfinite(first[j]).all()]
     rest = robot.marker_points()[[i for i, _ in seen]]
@@ -55,12 +55,12 @@ def far_from_rest(robot: Robot, trajectory: Trajectory) -> dict[str, float] | No
 
 
 class Read(NamedTuple):
-    """How a file's positions were brought into the frame of the base: turned, after the origin was taken off.
+    """Transformation of a file's positions to the frame of the base: subtract the origin, then turn.
 
     Attributes:
-        turn: from the file's frame to that of the base.
-        origin: of the base in the file's frame [m].
-        unit: in which the file has positions, and ``origin`` of [data.columns]; "" for formats without that table.
+        turn: rotation from the file's frame to the base frame.
+        origin: origin of the base in the file's frame [m].
+        unit: unit of the file's positions and of ``origin`` in [data.columns]; "" for formats without that table.
     """
 
     turn: Float[np.ndarray, "3 3"]
@@ -69,14 +69,14 @@ class Read(NamedTuple):
 
     @classmethod
     def by(cls, columns: CsvColumns | None) -> Read:
-        """What [data.columns] says."""
+        """The transformation of [data.columns]."""
         if columns is None:
             return cls(np.eye(3), np.zeros(3), "")
         origin = METRES[columns.position_unit] * np.array(columns.origin)
         return cls(axes_matrix(columns.axes), origin, columns.position_unit)
 
     def shifted(self, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> str:
-        """The line that turns what was read, and then shifts it [m]."""
+        """The line for [data.columns] that turns the positions read, and then shifts them [m]."""
         if not self.unit:
             return f"a shift by {_millimetres(shift)} mm"
         # A robot that rests bent tells no more than millimetres.
@@ -85,15 +85,15 @@ class Read(NamedTuple):
 
 
 def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | None = None) -> list[str]:
-    """What may be wrong with axes, origin, units or the order of markers, in words; nothing where all looks well.
+    """Possible faults of axes, origin, units or the order of markers, in words; empty if none is found.
 
-    A soft robot hangs or rests bent, so only a first row far from the undeformed robot is looked at, and a cause is
+    A soft robot hangs or rests bent, so only a first row far from the undeformed robot is examined, and a cause is
     named only if it brings the markers near.
 
     Args:
-        robot: with the undeformed markers.
-        trajectory: the recording, in the frame that ``axes`` and ``origin`` made of its file's.
-        columns: the table by which it was read. A hint says what to write in its place.
+        robot: robot with the undeformed markers.
+        trajectory: the recording, transformed by ``axes`` and ``origin``.
+        columns: table used to read it. A hint has the corrected line.
     """
     start = start_of(robot, trajectory)
     length = robot.length
@@ -105,19 +105,19 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     found = _cause(start, length, Read.by(columns))
     head = f"the first row is {float(f'{1e3 * _rms(start.first - start.rest):.2g}'):g} mm off the undeformed robot"
     if found is None and len(start.names) == 1 < len(trajectory.marker_names):
-        found = f"{start.names[0]} alone is seen in it, too few markers to name a cause"
+        found = f"only {start.names[0]} is seen in it: too few markers to name a cause"
     return [*hints, f"{head}; {found or 'look at axes, origin, units, the order of markers and their point_m'}"]
 
 
 def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: CsvColumns) -> list[str]:
     """Lines of [data.columns], axes and origin, that bring a first row to the undeformed robot.
 
-    None where it is near already, or where no frame brings it near.
+    Empty if it is near already, or if no frame brings it near.
 
     Args:
-        robot: with the undeformed markers.
-        first: where each marker of ``columns`` is first seen, as the file has it.
-        columns: the table by which the file is read.
+        robot: robot with the undeformed markers.
+        first: first seen position of each marker of ``columns``, in the file's frame and unit.
+        columns: table used to read the file.
     """
     start, length = _start(robot, marker_names(columns), in_base(first, columns)), robot.length
     if not start.names or _rms(start.first - start.rest) <= FAR * length:

@@ -24,11 +24,13 @@ from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.noise import LASTING_NOISE, NOISE_CORRELATION_TIME, OBSERVATION_NOISE
 from rfdropo_bayes.data import Trajectory, noise_floor
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.experiment import ROLLOUTS
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.report.identifiability import DETERMINED, FREE, NEGLIGIBLE, WELL_AWAY
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.budget import budget_within
 
 # Of a derivative, in prior standard deviations. Of the paper's trunk a draw of four snaps within 2e-3, which hides the
 # scale of its modulus and mass; 2e-4 and 2e-5 give the same slopes to five digits.
@@ -211,7 +213,9 @@ def preflight(
         known = known + _information(tension)
     more = _further(model, coordinates, tension)
     settings = model.settings.inference
-    budget = rollouts or settings.rollouts
+    budget = rollouts or settings.rollouts or ROLLOUTS
+    if rollouts is None and settings.minutes is not None:
+        budget = budget_within(settings.minutes, per_set, 1.0).rollouts
     return Preflight(
         _directions(coordinates, known, more),
         _shares(coordinates, known),

@@ -1,4 +1,4 @@
-"""Recordings from files: what an experiment file's [data] says, as a call."""
+"""Recordings from files: the table [data] of an experiment file, as a call."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def read(
         files: names and patterns, relative to $RFDROPO_DATA or ``folder``; an entry may also be a dictionary with
             ``observations``, ``commands``, ``rows`` and ``episodes``.
         format: csv, motive-csv, rosbag, lerobot, mat, npz, netcdf, asl-csv, optitrack-csv or sofa-csv.
-        columns: for the first six, what each column is, as in an experiment file's [data.columns].
-        folder: that names are relative to.
+        columns: for the first six, meaning of each column, as in an experiment file's [data.columns].
+        folder: base of relative names.
         keys: further keys of [data], such as ``resample``, ``missing`` or ``initial_command``.
 
     Raises:

@@ -32,7 +32,7 @@ from rfdropo_bayes.verbs.random_commands import random_walk
 # Number that the first marker's column carries in each source.
 FIRST_COLUMN = {"sofa-csv": 0, "optitrack-csv": 1, "asl-csv": 1}
 CUBE_COLUMNS = tuple(f"cube_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
-"""Of the cube's pose, as in SOFA's and OptiTrack's recordings."""
+"""Columns of the cube's pose, as in recordings of SOFA and OptiTrack."""
 
 
 class Simulated(NamedTuple):
@@ -54,20 +54,20 @@ def simulate(
     noise: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> list[Trajectory]:
-    """Simulate what a robot does under commands.
+    """Simulate a robot under commands.
 
     Args:
-        model: that is simulated; its fixed values hold, and all else is nominal.
-        commands: recordings that are replayed; or the keys of an experiment file's [commands], for random ones.
-        parameters: values beside the model's own.
-        noise: ``{"standard_deviation": m}``, perhaps with a ``correlation_time`` [s], that is added to the positions.
-        seed: of noise and random commands.
+        model: simulated model; its fixed values hold, and other parameters are nominal.
+        commands: recordings to replay; or the keys of an experiment file's [commands], for random commands.
+        parameters: values in addition to the model's own.
+        noise: ``{"standard_deviation": m}``, perhaps with a ``correlation_time`` [s], added to the positions.
+        seed: seed of noise and random commands.
 
     Returns:
-        recordings that say that they are synthetic, with the true parameters among their settings.
+        recordings marked as synthetic, with the true parameters among their settings.
 
     Raises:
-        InputError: bad input, or a rollout that diverged.
+        InputError: bad input, or a diverged rollout.
     """
     model = given_model(model, "simulate")
     if not isinstance(commands, Mapping):
@@ -108,14 +108,14 @@ def simulate_all(model: Model, out: Path, *, overwrite: bool = False) -> dict[st
     """Simulate into a folder each recording of a model's experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
-    column names), called ``trajectory`` where there is only one recording.
+    column names), called ``trajectory`` if there is only one recording.
 
     Returns:
-        per recording: result code, files, and the error against the measurement [mm]; and that over all recordings.
-        Where a cube is simulated, also how far its centre is from the measured one [mm] and its orientation [deg].
+        per recording: result code, files, and the error against the measurement [mm]; and the error over all
+        recordings. With a cube also the errors of its centre [mm] and its orientation [deg].
 
     Raises:
-        InputError: bad input, a folder that holds a run, or a rollout that did not end well.
+        InputError: bad input, a folder that holds a run, or a failed rollout.
     """
     settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder}
     settings |= {"texts": model.texts()}
@@ -243,7 +243,7 @@ def _table(source: Trajectory, simulated: Trajectory) -> pd.DataFrame:
 
 
 def _distance(source: Trajectory, position: np.ndarray, names: Sequence[str]) -> Float[np.ndarray, "time marker"]:
-    """Distance between simulated and measured markers [mm]; not a number where the measurement is masked."""
+    """Distance between simulated and measured markers [mm]; NaN if the measurement is masked."""
     chosen = [source.marker_names.index(name) for name in names]
     distance = 1e3 * np.linalg.norm(np.asarray(position) - source.position[:, chosen], axis=2)
     return np.where(source.position_mask[:, chosen], distance, np.nan)

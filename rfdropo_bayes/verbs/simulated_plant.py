@@ -38,18 +38,18 @@ def trunk(
     """The trunk that an experiment file describes, or the robot itself.
 
     Args:
-        robot: the robot with motors that is deployed.
+        robot: deployed robot with motors.
         experiment: file whose robot, [simulator], mechanisms and [model.fixed] are the truth; by default ``robot``.
         marker_noise: standard deviation of white noise on every coordinate of a marker, and on points of a cube [m].
-        seed: of the noise.
+        seed: seed of the noise.
         changes: entries that replace the experiment's, as ``--set`` takes them: a parameter's name, or ``"table.key"``.
 
     Raises:
-        InputError: a bad experiment, or a robot with other channels or markers than the one deployed.
+        InputError: a bad experiment, or a robot with other channels or markers than the deployed robot.
     """
     simulator, values = true_simulator(robot, experiment, changes)
     command = simulator.robot.command
-    # Drums turn steadily from one state to the next. What ramps and delays commands stands before the plant.
+    # Drums turn steadily from one state to the next. Ramps and delays of commands act before the plant.
     period = simulator.time_step * max(1, round(PERIOD / simulator.time_step))
     timing = CommandTiming(unit=command.unit, ramp_s=period, dead_time_s=0.0)
     base = simulator.robot.with_changes(command=timing)
@@ -107,12 +107,12 @@ class SimulatedTrunk:
     """A session of one lane as a `deployment.Plant`.
 
     Args:
-        robot: whose motors wind the cables.
-        simulator: of the same channels and markers, whose commands ramp over one period.
-        period: of the session [s].
-        values: of the simulator's parameters.
+        robot: robot whose motors wind the cables.
+        simulator: simulator of the same channels and markers, whose commands ramp over a period.
+        period: control period of the session [s].
+        values: values of the simulator's parameters.
         marker_noise: see `trunk` [m].
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     def __init__(
@@ -169,7 +169,8 @@ class SimulatedTrunk:
         self._found = found
 
     def _seen(self) -> PlantState:
-        # By virtual work: a drum holds what its cables pull, each times its way per command, at the drum's radius.
+        # By virtual work: a drum holds its cables' tensions, each times its displacement per command, at the drum's
+        # radius.
         tension = self._matrix.T @ np.asarray(self._found.tension, dtype=float)[0] / self._scale
         position = np.asarray(self._found.position, dtype=float)[0]
         position = position + self._noise * self._random.standard_normal(position.shape)

@@ -69,15 +69,15 @@ def train(
     """Train a policy on a model, and export it.
 
     Args:
-        model: that is simulated; its fixed values hold.
+        model: simulated model; its fixed values hold.
         out: folder to write to: report.html, policy.onnx, card.md, summary.json, curve.png, episodes.jsonl,
             TensorBoard's files and checkpoints.
-        fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws.
-        seed: of all that is random; that of the model's experiment by default.
-        resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
+        fit: a calibration, or its folder, whose posterior provides the episodes' parameters.
+        seed: seed of all random numbers; by default from the model's experiment.
+        resume: continue from the checkpoint of an interrupted run in ``out``; overwrite: replace an earlier run.
         show: progress on the terminal, as in `calibrate`.
         page: whether to play the policy and draw report.html, which takes 20 s of processor time.
-        keys: of an experiment file's [training], in the place of those of the model's own file.
+        keys: keys of an experiment file's [training], which override the model's own file.
 
     Returns:
         the content of summary.json.
@@ -135,7 +135,7 @@ def train(
 
 
 def _cautions(table: TrainingTable, fit: Calibration | Path | None, folder: Path, show: bool | None) -> list[Caution]:
-    """What earlier results say against the posterior, or phi, that parameters come from; said on stderr, too."""
+    """Cautions of earlier results on the posterior or phi of the parameters; also printed on stderr."""
     source = fit
     if source is None and table.source is not None and table.randomisation in ("posterior", "phi"):
         source = source_of(table.source, folder)
@@ -147,14 +147,14 @@ def _cautions(table: TrainingTable, fit: Calibration | Path | None, folder: Path
 
 
 def _tension_facts(best: Mapping[str, float], table: TrainingTable) -> dict[str, str]:
-    """What a deployment needs to know of tensions in the evaluation of the policy, as metadata."""
+    """Tensions in the evaluation of the policy, as metadata for a deployment."""
     limit = {} if table.tension_limit is None else {TENSION_LIMIT: f"{table.tension_limit:g}"}
     counts = {STOPPED_EPISODES: best["tension_stopped"], EVALUATED_EPISODES: table.evaluation_episodes}
     return {PEAK_TENSION: f"{best['tension_largest']:g}"} | limit | {name: f"{n:.0f}" for name, n in counts.items()}
 
 
 def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:
-    """Raise if the exported policy does not act as the trained one does, on what it may see."""
+    """Raise if the exported policy acts differently from the trained policy on possible observations."""
     apart = difference(policy, trained.act, observations(trained.normalisation, policy.layout.size))
     if apart is not None:
         raise InputError(
@@ -185,7 +185,7 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
 
 
 def _plain(row: Mapping[str, float]) -> dict[str, float | None]:
-    """A row of the curve as JSON has it: no number where episodes have no end."""
+    """A row of the curve for JSON: values that are not finite become None."""
     return {name: value if np.isfinite(value) else None for name, value in row.items()}
 
 
@@ -206,7 +206,7 @@ def learnt(summary: Mapping[str, Any]) -> str:
 
 
 def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
-    """What somebody needs to know before using a policy, as Markdown."""
+    """Facts for the users of a policy, as Markdown."""
     episodes = summary["settings"]["evaluation_episodes"]
     best, times, seed = summary["evaluation"], summary["latency"], summary["seed"]
     parts = "\n".join(f"| {part.name} | {part.size} | {part.unit} |" for part in layout.observation)
@@ -231,6 +231,6 @@ One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} 
 
 Action, every {layout.period_s:g} s: {what}. Layout SHA-256 {summary["layout_sha256"][:16]}.
 
-It has seen a simulator only. `rfdropo evaluate` says how it does on others; summary.json says what made it.
+It has seen a simulator only. `rfdropo evaluate` tests it on others; summary.json has its origin.
 Made with {versions}.
 """

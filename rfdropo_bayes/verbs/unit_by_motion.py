@@ -1,8 +1,8 @@
-"""Which unit of the commands makes cables bend a robot as far as its markers moved: constant curvature, no simulation.
+"""Unit of the commands for which cables bend a robot as far as its markers moved: constant curvature, no simulation.
 
 A cable that is pulled by :math:`d` at radius :math:`r` turns the body at its end by :math:`d / r` towards itself. The
-turn of all cables of a segment is the one that fits their displacements in least squares. It adds up from segment to
-segment, and a marker follows the mean turn below it.
+turn of a segment is the least-squares fit to the displacements of its cables. It adds up from segment to segment, and a
+marker follows the mean turn below it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rfdropo_bayes.verbs.column_units import Unit
 from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
 
 MOST_TURN = np.pi
-"""Of a body [rad]: no cable bends a body farther."""
+"""Largest turn of a body [rad] by its cables."""
 MISREAD = 5.0
 """Ratio of the measured motion and this estimate from which on a guessed unit is given up for one that explains it."""
 STEPS = 81  # along the body
@@ -27,7 +27,9 @@ STEPS = 81  # along the body
 def driven_motion(
     robot: Robot, command: Float[np.ndarray, "row channel"], heights: Sequence[float]
 ) -> Float[np.ndarray, "row marker 2"] | None:
-    """Where markers at these heights go across the body [m] under commands [m or rad]; None if no body turns so far."""
+    """Positions of markers at these heights across the body [m] under commands [m or rad]; None if the turn exceeds
+    `MOST_TURN`.
+    """
     place = np.linspace(min(cable.anchor_z_m for cable in robot.cables), max(heights), STEPS)
     pull = _pulls(robot, command)
     if np.linalg.norm(_turns(robot, pull, place), axis=2).max() > MOST_TURN:
@@ -77,14 +79,14 @@ def unit_of_motion(
     heights: Mapping[str, float],
     guessed: Unit,
 ) -> Unit:
-    """A guessed unit of commands, or the one that explains the motion where that does not, with the evidence.
+    """The guessed unit of commands, or another unit if only that explains the motion, with the evidence.
 
     Args:
-        robot: whose cables impose lengths or angles.
-        command: values in the unit that is looked for.
-        position: of the markers [m], in any frame.
-        heights: of the same markers on the robot [m].
-        guessed: the unit by the size of the commands.
+        robot: robot whose cables impose lengths or angles.
+        command: values in the unknown unit.
+        position: positions of the markers [m], in any frame.
+        heights: heights of the same markers on the robot [m].
+        guessed: unit guessed from the size of the commands.
     """
     kind, size = COMMAND_UNITS.get(guessed.unit, ("", 1.0))
     if kind not in IMPOSED or kind != robot.command_unit or not np.isfinite(command).all():

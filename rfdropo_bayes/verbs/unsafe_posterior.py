@@ -1,4 +1,4 @@
-"""What earlier results say against a posterior that a training draws from. They are read; nothing is computed anew."""
+"""Cautions of earlier results on a posterior used for training. They are read from files, not recomputed."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ NAMED = 3  # reasons that the warning gives, the worst
 
 
 def posterior_caution(source: Calibration | Path, width: float = 1.0) -> Caution | None:
-    """A caution where a calibration is not safe to randomise over, or an audit of its recordings says that its model
-    lacks something; None where nothing speaks against it.
+    """A caution if a calibration is not safe to randomise over, or an audit of its recordings found that its model
+    lacks an effect; None otherwise.
 
-    Audits are looked for in the calibration's folder and in those beside it: those that share a recording with it.
+    Audits are searched in the calibration's folder and its sibling folders; only audits that share a recording count.
 
     Args:
         source: the calibration, its folder or its posterior.nc.
-        width: times as wide as the posterior that the training draws.
+        width: factor by which the training widens the posterior.
     """
     if isinstance(source, Calibration):
         folder, content = source.folder, source.content
@@ -49,7 +49,9 @@ def posterior_caution(source: Calibration | Path, width: float = 1.0) -> Caution
 
 
 def _audited(folder: Path, summary: Mapping[str, Any]) -> list[str]:
-    """What audits of its recordings found that the calibrated model lacks; nothing where one passed this model."""
+    """Effects that the calibrated model lacks according to audits of its recordings; empty if an audit passed this
+    model.
+    """
     own, found = _terms(folder / CONFIG), []
     for path in sorted(folder.parent.glob(f"*/{AUDIT}")):
         audit = _read(path)
@@ -60,14 +62,14 @@ def _audited(folder: Path, summary: Mapping[str, Any]) -> list[str]:
             return []
         extended = _terms(place / EXTENDED)
         if own is not None and extended is not None and extended - own:
-            found.append(f"the audit in {place} names what its model lacks, see {path.with_name(EXTENDED)}")
+            found.append(f"the audit in {place} names the effects that its model lacks, see {path.with_name(EXTENDED)}")
         elif verdict in (PARTLY, UNEXPLAINED):
             found.append(f"the audit in {place} leaves a discrepancy unexplained")
     return found
 
 
 def _same_recordings(folder: Path, summary: Mapping[str, Any], place: Path, audit: Mapping[str, Any]) -> bool:
-    """Whether two runs share a recording, by their run.json; else whether they have the same ones."""
+    """Whether two runs share a recording, by their run.json; else whether they have the same recordings."""
     first, second = (set(_read(each / RUN).get("settings", {}).get("data", {}).values()) for each in (folder, place))
     if first and second:
         return bool(first & second)
@@ -75,7 +77,7 @@ def _same_recordings(folder: Path, summary: Mapping[str, Any], place: Path, audi
 
 
 def _terms(experiment: Path) -> set[str] | None:
-    """Mechanisms and laws of a run's model; None where its file does not tell."""
+    """Mechanisms and laws of a run's model; None if its file does not state them."""
     try:
         model = read_tables(experiment).get("model", {})
     except InputError:
@@ -84,7 +86,7 @@ def _terms(experiment: Path) -> set[str] | None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The content of a JSON file, empty where it cannot be read: it is not what the training needs."""
+    """The content of a JSON file, empty if it cannot be read, as training does not need it."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

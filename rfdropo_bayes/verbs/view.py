@@ -35,18 +35,18 @@ def run_view(
     """Draw a motion.
 
     Args:
-        source: an experiment to simulate, or what ``rfdropo simulate`` or ``rfdropo predict`` wrote (NetCDF), of which
-            the mean prediction is drawn.
+        source: an experiment to simulate, or a NetCDF file of ``rfdropo simulate`` or ``rfdropo predict``, whose mean
+            prediction is drawn.
         out: .png, .svg or .pdf for several instants in one picture, .gif or .mp4 for an animation, a name that ends in
             .vtk for a folder of surfaces, any other name for a folder of frames.
-        recording: which recording of the experiment, where it has several.
-        robot: file of the robot, where a NetCDF file has none beside it and the package does not know its name.
+        recording: which recording of the experiment, if it has several.
+        robot: file of the robot, if a NetCDF file has none beside it and the robot is not bundled.
 
     Returns:
         the files written, the first to open first.
 
     Raises:
-        InputError: bad input, or a format that needs what is not installed.
+        InputError: bad input, or a format that needs a missing package.
     """
     motion = _from_file(source, robot) if source.suffix == ".nc" else _from_experiment(source, overrides, recording)
     if out.suffix == ".vtk":
@@ -73,7 +73,7 @@ def _from_file(path: Path, robot: Path | None) -> DrawnMotion:
 
 
 def _robot_of(path: Path, name: str, given: Path | None) -> Robot:
-    """The robot of a NetCDF file: the one that is given, the one in its run's folder, or the package's of that name."""
+    """The robot of a NetCDF file: the given robot, the robot in its run's folder, or the bundled robot of that name."""
     beside = path.resolve().parent / ROBOT_COPY
     if given is None and name not in known_robots() and not beside.is_file():
         raise InputError(
@@ -115,7 +115,7 @@ def _from_experiment(path: Path, overrides: list[str], recording: str | None) ->
 
 
 def _markers_alone(shown: Trajectory, box: BlackBox, measured: Trajectory | None) -> DrawnMotion:
-    """A line through the markers of a simulator that shows nothing else, from the origin where there is one only."""
+    """A line through the markers of a simulator that shows nothing else, from the origin if there is only one."""
     turn, position = upright(box.gravity), shown.position
     if position.shape[1] == 1:
         position = np.concatenate([np.zeros_like(position), position], axis=1)
@@ -128,7 +128,7 @@ def _markers_alone(shown: Trajectory, box: BlackBox, measured: Trajectory | None
 
 
 class _Shown(NamedTuple):
-    """What moves: markers [m] and, if there is one, an object's pose."""
+    """Moving parts: markers [m] and, if there is one, an object's pose."""
 
     name: str
     time: Float[np.ndarray, " time"]
@@ -138,8 +138,9 @@ class _Shown(NamedTuple):
 
 
 def _motion(shown: Trajectory | _Shown, robot: Robot, measured: Trajectory | None, side: float | None) -> DrawnMotion:
-    """Geometry of a robot's motion; the tube has the robot's outer width, and passes through the markers' means where
-    several have the same height."""
+    """Geometry of a robot's motion; the tube has the robot's outer width, and passes through the markers' means if
+    several have the same height.
+    """
     rest = {name: point[2] for name, point in zip(robot.marker_names, robot.marker_points(), strict=True)}
     known = [index for index, name in enumerate(shown.marker_names) if name in rest]
     if not known:

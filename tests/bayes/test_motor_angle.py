@@ -291,5 +291,5 @@ def test_what_cannot_be_used_is_refused():
         MotorAngle.gather([recording(60, hold=3).slice_rows(1, 2)], 2)
     silent = ServoAndBody()
     silent.tells = False
-    with pytest.raises(InputError, match="does not tell where its drives stand"):
+    with pytest.raises(InputError, match="the simulator has no drive positions"):
         problem(recording(60), simulator=silent).row_log_likelihood(batch(), 60)

@@ -69,7 +69,7 @@ def test_ragged_rows_in_the_middle(sofa_table, write, tmp_path):
     lines = path.read_text().splitlines()
     lines[2] += ",1.0"
     path.write_text("\n".join(lines) + "\n")
-    with fails("row 1: has 66 values where the header names 65; repair the row"):
+    with fails("row 1: has 66 values, but the header names 65; repair the row"):
         read_sofa_csv(path)
 
 
@@ -251,7 +251,7 @@ def test_encodings(tmp_path, encoding):
 
 
 def test_decimal_commas_between_commas_are_explained(tmp_path):
-    with fails("has 8 values where the header names 4.*separate values by semicolons"):
+    with fails("has 8 values, but the header names 4.*separate values by semicolons"):
         plain(tmp_path / "own.csv", "x,y,z,u\n100,5,0,0,0,0,1,5\n100,5,0,0,0,0,1,5\n")
     with fails(r"row 1, column 'x': '1\.005,5' is not a number"):
         plain(tmp_path / "own.csv", "x;y;z;u\n100,5;0;0;1,5\n1.005,5;0;0;1,5\n100;0;0;1\n")
@@ -261,7 +261,7 @@ def test_lines_above_the_names_of_the_columns_are_named(tmp_path):
     """Loggers say there when they began; the row below the names is not at fault."""
     with fails("the names of its 4 columns stand in line 3, below other lines; leave out the lines above them"):
         plain(tmp_path / "own.csv", "# logger 3.1\n# begun at noon\n" + ROWS)
-    with fails("row 0: has 5 values where the header names 4"):
+    with fails("row 0: has 5 values, but the header names 4"):
         plain(tmp_path / "own.csv", "x,y,z,u\n" + ROWS.removeprefix("x,y,z,u\n").replace("\n", ",\n"))
 
 

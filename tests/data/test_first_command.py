@@ -143,7 +143,7 @@ def test_no_later_row_has_a_say_in_a_prediction(files):
     """The start of a recording to predict is not recognised, as that takes later rows; a rule is kept."""
     folder, table = files
     seen = load_unseen(DataSpec.parse(table), folder, "own.csv")
-    assert seen.first_command.endswith("(assumed; set data.initial_command where it was another)")
+    assert seen.first_command.endswith("(assumed; set data.initial_command if it was another)")
     np.testing.assert_array_equal(seen.initial_command, seen.command[0])
     assert not load_unseen(DataSpec.parse(table | {"initial_command": "zero"}), folder, "own.csv").initial_command.any()
 

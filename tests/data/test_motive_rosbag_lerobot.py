@@ -387,7 +387,7 @@ def test_damaged_datasets_are_refused(tmp_path, version, damage):
     said = {
         "file lost": "no such file",
         "file cut": "not a readable Parquet file",
-        "rows lost": "has 9 frames where its description tells 30",
+        "rows lost": "has 9 frames, but its description has 30",
         "version": "of version 'v9.0'",
     }
     with fails(said[damage]):

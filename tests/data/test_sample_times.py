@@ -217,7 +217,7 @@ def test_jitter_two_rates_and_a_gap_are_no_stamps_of_arrival():
 def test_a_clock_that_jumps_is_noted_with_its_row():
     time = np.r_[TIME, TIME + 3600.0]
     (note,) = clock_notes(time)
-    assert note.startswith("the clock jumps by 3599 s before row 60, where rows come every 10 ms")
+    assert note.startswith("the clock jumps by 3599 s before row 60, although rows come every 10 ms")
     assert "rows = [0, 59] and rows = [60, 119]" in note
     assert clock_notes(TIME) == []
 

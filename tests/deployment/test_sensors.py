@@ -185,7 +185,7 @@ def test_a_turn_of_the_object_is_about_the_same_axis_in_the_robots_frame(
         np.testing.assert_allclose(sensor.latest().object_pose, expected, atol=1e-12)
     sensor.receive(SimpleNamespace(rigid_bodies=[body(20, (0.1, 1.7, 0.2), valid=False)]))
     assert sensor.latest().object_pose is None
-    with pytest.raises(InputError, match=r"sensor.object_body: a marker has the same one"):
+    with pytest.raises(InputError, match=r"sensor.object_body: a marker has the same rigid body"):
         NatNetMarkers(table.model_copy(update={"object_body": 13}), robot)
 
 
@@ -196,7 +196,7 @@ def test_a_marker_without_a_rigid_body_is_refused(robot: Robot) -> None:
 
 def test_two_markers_of_one_rigid_body_are_refused(robot: Robot) -> None:
     """One of them would count as lost for ever."""
-    with pytest.raises(InputError, match=r"sensor.rigid_bodies: two markers have the same one"):
+    with pytest.raises(InputError, match=r"sensor.rigid_bodies: two markers have the same rigid body"):
         NatNetMarkers(SensorTable(kind="natnet", rigid_bodies={"m1": 1, "m2": 2, "m3": 2, "m4": 4}), robot)
 
 

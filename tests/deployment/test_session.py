@@ -214,7 +214,7 @@ def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
     settings = Deployment(robot="motor_arm", homing=homing, simulation=simulation, drives=SLOW, safety=PATIENT)
     outcome = deploy(settings, "home", tmp_path / "s", simulated=True)
     assert outcome.cause is Cause.HOMING_FAILED
-    assert "is its cable off, or its sign in the robot file the other one?" in outcome.detail
+    assert "is its cable off, or has it the opposite sign in the robot file?" in outcome.detail
     assert not (tmp_path / "s" / "homing.json").exists()
     assert np.abs(read_journal(tmp_path / "s")[1]["length"]).max() < 0.0101
 

@@ -11,7 +11,8 @@ import pytest
 
 from rfdropo_bayes.bayes.channels import Weighed
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
-from rfdropo_bayes.discrepancy.pipeline import audit, base_model
+from rfdropo_bayes.discrepancy.base_fit import base_model
+from rfdropo_bayes.discrepancy.pipeline import audit
 from rfdropo_bayes.discrepancy.score import span
 from rfdropo_bayes.discrepancy.screen import null_residuals
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT, REPEATS
+from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.extension import ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import climb
 from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, far_off, spread
-from rfdropo_bayes.discrepancy.pipeline import audit, base_model
+from rfdropo_bayes.discrepancy.pipeline import audit
 
 from .toys import NOISE, problem
 
@@ -52,7 +53,7 @@ def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
     """Under the measurement's noise the same step brings a hundred times as much."""
     asked, judge, fit = far
     search = ExtensionSearch(judge, asked.candidates, asked.rules, 0)
-    screen, _ = search.screened(fit)
+    screen = search.screened(fit)
     assert screen.omnibus.p == 1 / (1 + asked.rules.bootstraps)
     better = search.refit(fit, screen.row("play"))
     rows = np.count_nonzero(fit.residual)

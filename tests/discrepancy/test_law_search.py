@@ -15,7 +15,8 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.discrepancy import described as described_module
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
-from rfdropo_bayes.discrepancy.described import Described, NamedModel, coefficients, describe
+from rfdropo_bayes.discrepancy.base_fit import base_model
+from rfdropo_bayes.discrepancy.described import Described, coefficients, describe
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import climb
@@ -23,7 +24,8 @@ from rfdropo_bayes.discrepancy.held_out import predicted, stages_of
 from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, noise_share
 from rfdropo_bayes.discrepancy.law_search import TIED, LinearModel, _relinearised, law_search
 from rfdropo_bayes.discrepancy.law_words import law_tables, ports_sentence
-from rfdropo_bayes.discrepancy.pipeline import audit, base_model
+from rfdropo_bayes.discrepancy.naming import Named
+from rfdropo_bayes.discrepancy.pipeline import audit
 from rfdropo_bayes.discrepancy.port_responses import responses, under
 from rfdropo_bayes.discrepancy.port_rollouts import PortedForward, placed
 from rfdropo_bayes.mechanisms.features import Feature
@@ -145,7 +147,7 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert set(law["by_trajectory"]) == set(answer.causes.described.held_out.unseen.names)
     described = replace(answer.causes.described, holds=False)  # as if unseen recordings did not support it
     refused = ports_sentence(replace(answer, causes=replace(answer.causes, described=described)))
-    for words in ("a law that unseen ones do not support", "mm without it", "at marker m3 x", "u_a u_b"):
+    for words in ("a law that unseen recordings do not support", "mm without it", "at marker m3 x", "u_a u_b"):
         assert words in refused
     (table,) = law_tables(answer)
     assert table["port"] == "marker m3 x"
@@ -183,7 +185,7 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
 
     monkeypatch.setattr(described_module, "law_search", lambda *_: Twice())
     said = []
-    found = describe(question, NamedModel(target, base), None, said.append)
+    found = list(describe(question, Named(search_of(question, target), base), None, said.append))
     assert found.holds
     assert [refit.term.port.name for refit in found.found.terms] == ["marker m3 x"]
     assert len(found.held_out.predictions) == 2
@@ -369,22 +371,27 @@ class PushedPlaying(Pushed):
         return super().rollout({**parameters, "play": parameters.get("play", 0.0) + 1.0}, commands, steps)
 
 
+def search_of(question, target):
+    return ExtensionSearch(target, question.candidates, question.rules, question.seed)
+
+
 def named_with(question, names):
     """The base model of a problem with candidates, one after the other, and what it predicts."""
     target, base = base_model(question, question.seed)
     steps, fit = [], base
-    before = ExtensionSearch(target, question.candidates, question.rules, question.seed).tested(base, 0)
+    before = search_of(question, target).tested(base, 0)
     for name in names:
         free = np.union1d(fit.free, question.candidate(name).indices)
         fit = climb(target, fit.x, free)
         steps.append(Added(name, (name,), before, fit, 0.0, {}, target))
-    return NamedModel(target, base, tuple(steps)), predicted(question, target.measured, stages_of(target, base, steps))
+    named = Named(search_of(question, target), base, tuple(steps))
+    return named, predicted(question, target.measured, stages_of(target, base, steps))
 
 
 @pytest.mark.slow
 def test_mechanisms_beside_a_law_that_unseen_recordings_do_not_ask_for_stood_in_for_it():
     question = asked(6, PushedPlaying())
-    found = describe(question, *named_with(question, ["play", "creep", "wall"]))
+    *_, found = describe(question, *named_with(question, ["play", "creep", "wall"]))
     assert (found.beside, set(found.stand_ins)) == (("play",), {"creep", "wall"})
     assert [refit.term.feature.kind for refit in found.found.terms] == ["product"]
     assert found.holds

@@ -19,19 +19,22 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.discrepancy import base_fit
 from rfdropo_bayes.discrepancy import held_out as held_out_module
-from rfdropo_bayes.discrepancy import pipeline
 from rfdropo_bayes.discrepancy.audit_record import _doubt, next_experiment, record
+from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.candidates import lead
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
-from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Rules, without_each_other
+from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits, Rules
 from rfdropo_bayes.discrepancy.fit import climb
 from rfdropo_bayes.discrepancy.forward import Lanes, RoutedLanes
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements
-from rfdropo_bayes.discrepancy.pipeline import audit, base_model
+from rfdropo_bayes.discrepancy.naming import Named, without_each_other
+from rfdropo_bayes.discrepancy.pipeline import audit
+from rfdropo_bayes.discrepancy.repairs import climbed_again, without_needless
 from rfdropo_bayes.discrepancy.screen import p_in_words
 from rfdropo_bayes.discrepancy.sentence import _adoption, _named
 from rfdropo_bayes.discrepancy.verdict import decide
@@ -212,8 +215,7 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
         if line.startswith("refit"):
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        audit(asked, killed, Journal(tmp_path))
+    assert audit(asked, killed, Journal(tmp_path)).cost.stopped == "interrupt"
     assert list(tmp_path.glob("*.npz"))
     (tmp_path / "broken.npz").write_bytes(b"half of a file")
     lanes, calls = Lanes.roll, []
@@ -244,7 +246,7 @@ def test_commands_that_excite_only_one_of_two_effects_separate_them():
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     hypotheses = [Hypothesis(name, search.refit(base, screen.row(name))) for name in ("play", "delay")]
     like = asked.model.recordings.commands.of(0)
     still = like._replace(step=np.zeros_like(like.step))
@@ -265,40 +267,55 @@ class Hurried(Deadline):
 
     @property
     def left(self) -> float:
-        return 1.0 if np.isinf(self.minutes) else float(self.looks)
+        return 1.0 if self.why or np.isinf(self.minutes) else float(self.looks)
 
     def check(self) -> None:
         self.looks -= 1
         super().check()
 
 
-@pytest.mark.parametrize(
-    "share",
-    [
-        0.1,
-        pytest.param(0.4, marks=pytest.mark.slow),
-        pytest.param(0.7, marks=pytest.mark.slow),
-        pytest.param(0.95, marks=pytest.mark.slow),
-    ],
-)
-def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, share):
-    """Play of ten times the size that is sure, and the time is up between the base fit and the end."""
+def stopped_at(beginning, stop):
+    """The audit of play of ten times the size that is sure, stopped once it says a line that begins so."""
+    clock = Hurried(10**9)
     asked = problem({**TRUTH, "play": 1.0}, 1)
-    first, clock = Hurried(10**9), Hurried(10**9)
-    base_model(asked, asked.seed, deadline=first)
-    monkeypatch.setattr(pipeline, "Deadline", lambda minutes: clock)
-    whole = audit(asked)
-    assert not whole.cost.stopped
-    before, used = 10**9 - first.looks, 10**9 - clock.looks
-    clock = Hurried(int(before + share * (used - before)))
-    answer = audit(asked)
-    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
-    assert content["out_of_time"]
+    answer = audit(asked, lambda line: stop(clock) if line.startswith(beginning) else None, deadline=clock)
+    return answer, record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+
+
+def run_out(clock):
+    clock.looks = 0
+
+
+def test_an_audit_whose_time_is_up_before_a_refit_says_which_candidates_stand_out():
+    answer, content = stopped_at("joint test", run_out)
+    assert (content["verdict"], content["out_of_time"], content["stopped"]) == ("no_verdict", True, "time")
+    assert content["candidates"][0]["mechanism"] == "play"
+    assert content["not_done"] == ["naming causes"]
+    assert "play stand" in content["sentence"]
+    assert "Not done: naming causes" in content["sentence"]
+    assert "Not done: naming causes" in render_audit(shown(answer), content, "", "")
+
+
+def test_an_audit_whose_time_is_up_after_a_refit_has_its_cause_and_what_it_is_worth():
+    _, content = stopped_at("refit with play", run_out)
+    assert [finding["mechanism"] for finding in content["findings"]] == ["play"]
+    assert content["gain"]["explained_fraction"] > 0.8
+    assert content["verdict"] == "explained"
+    assert content["adopted"] == ["play"]
     assert "The time was up" in content["sentence"]
     assert "--resume" in content["sentence"]
-    named = [finding["mechanism"] for finding in content["findings"]]
-    assert named in ([], ["play"])
-    assert content["verdict"] == ("no_verdict" if not named else whole.verdict)
+
+
+def interrupt(clock):
+    if not clock.reached:
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_ends_an_audit_with_what_is_known():
+    _, content = stopped_at("measuring the gain", interrupt)
+    assert content["stopped"] == "interrupt"
+    assert "The audit was stopped" in content["sentence"]
+    assert [finding["mechanism"] for finding in content["findings"]] == ["play"]
 
 
 @pytest.mark.parametrize("start", [None, {"gain": 1.0, "bend": 0.0}])
@@ -314,7 +331,7 @@ def test_the_rollouts_that_are_announced_for_the_base_model_are_about_those_it_t
 def test_the_pace_is_that_of_different_rollouts_that_fill_a_call():
     """A call of few is filled with copies, which a compiled engine simulates for nothing."""
     asked = problem(TRUTH, 1)
-    forward = pipeline.first_target(asked, Journal()).forward
+    forward = base_fit.first_target(asked, Journal()).forward
     null = forward.coordinates.null
     forward.observe(null[None])
     assert forward.pace == 0.0
@@ -398,7 +415,7 @@ def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeyp
     asked = replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Brittle(), np.arange(4)))
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     index = asked.coordinates.space.names.index("play")
     far = base.x.copy()
     far[index] += 45.0
@@ -422,7 +439,7 @@ def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
     target, base = base_model(asked, 0)
     target = target.measured  # under whose noise so small a slope is seen
     base = climb(target, base.x, base.free)
-    screen, _ = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(base)
+    screen = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(base)
     row = screen.row("lag")
     drop, start = lead(target, base, row.probe, row.lm)
     assert drop > 10.0 * row.lm
@@ -442,7 +459,7 @@ def test_an_effect_is_found_between_a_point_that_does_nothing_and_one_that_does_
     asked = replace(problem({**TRUTH, "play": 0.4}, 2), lanes=Lanes(Stopping(), np.arange(4)))  # at 1.02 here
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     row = screen.row("play")
     drop, start = lead(target, base, row.probe, row.lm)
     index = asked.coordinates.space.names.index("play")
@@ -451,21 +468,16 @@ def test_an_effect_is_found_between_a_point_that_does_nothing_and_one_that_does_
     assert asked.coordinates.named(search.refit(base, row).x)["play"] == pytest.approx(1.02, abs=0.003)
 
 
-def test_a_candidate_that_brings_nearly_as_much_is_named_beside_the_best(monkeypatch):
+def test_a_candidate_that_brings_nearly_as_much_is_named_beside_the_best():
     """However little its signature is like that of the best: within three nats these data do not tell the two apart."""
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, replace(asked.rules, family=1.0), 0)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     brings = {"play": 20.0, "creep": 18.0, "wall": 16.0}
-    monkeypatch.setattr(ExtensionSearch, "_leading", lambda *given: [screen.row(name) for name in brings])
-    monkeypatch.setattr(ExtensionSearch, "_from_afar", lambda self, name, fit: fit)
-
-    def refit(self, fit, row, start):
-        return replace(fit, log_evidence=fit.log_evidence + brings[row.name])
-
-    monkeypatch.setattr(ExtensionSearch, "_refit", refit)
-    step = search._extend(screen, [])
+    fits = {name: replace(base, log_evidence=base.log_evidence + nats) for name, nats in brings.items()}
+    rows = tuple(screen.row(name) for name in brings)
+    step = search.best(screen, Refits(rows, {row.name: row.lm for row in rows}, fits, ()), further=False)
     assert (step.name, step.members) == ("play", ("play", "creep"))
 
 
@@ -480,7 +492,7 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     play, creep = (next(c for c in asked.candidates if c.name == name) for name in ("play", "creep"))
     with_play = np.array([*base.free, *play.indices], dtype=int)
     early = climb(target, base.x, with_play, evaluations=0)
@@ -490,10 +502,10 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     step = Added(
         "creep", ("creep",), replace(screen, fit=early), both, both.log_evidence - early.log_evidence, {}, target
     )
-    again = search._climbed_again(step)
+    again = climbed_again(search, step)
     assert again is not None
     assert again.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
-    assert search._climbed_again(replace(step, before=replace(screen, fit=whole))) is None
+    assert climbed_again(search, replace(step, before=replace(screen, fit=whole))) is None
 
 
 def test_repeats_whose_clocks_differ_are_not_joined_and_named():
@@ -596,7 +608,7 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     asked = unrepeated({"play": 3.0}, 7)
     target, base = base_model(asked, asked.seed)
     search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     useless, play = (next(c for c in asked.candidates if c.name == name) for name in ("creep", "play"))
     first = climb(target, base.x, np.array([*base.free, *useless.indices]))
     both = climb(target, first.x, np.array([*first.free, *play.indices]))
@@ -604,19 +616,20 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
         Added("creep", ("creep",), screen, first, 0.0, {}, target),
         Added("play", ("play",), screen, both, 9.0, {}, target),
     ]
-    held_out = held_out_module._held_out(asked, target, search, base, steps)
+    named = Named(search, base, tuple(steps), screen)
+    held_out = held_out_module._predicted(asked, named)
     assert held_out.supported() == 2
     assert not held_out.gain(0, 1).clear
-    kept, measured = held_out_module._without_carried(asked, target, search, base, steps, held_out)
-    assert [step.name for step in kept] == ["play"]
-    assert set(kept[0].fit.free) == {*base.free, *play.indices}
+    kept, measured = held_out_module._without_carried(asked, named, held_out)
+    assert kept.names == ["play"]
+    assert set(kept.fit.free) == {*base.free, *play.indices}
     assert measured.gain(0, 1).clear
     # Where the first of the two is needed beside the second, both stay.
     swapped = [replace(steps[0], name="play", fit=climb(target, base.x, np.array([*base.free, *play.indices])))]
     pair = [*swapped, replace(steps[1], name="creep")]
     always = replace(held_out, predictions=[held_out.predictions[k] for k in (0, 0, 2)])
-    stayed, _ = held_out_module._without_carried(asked, target, search, base, pair, always)
-    assert [step.name for step in stayed] == ["play", "creep"]
+    stayed, _ = held_out_module._without_carried(asked, named.extended(pair), always)
+    assert stayed.names == ["play", "creep"]
 
 
 def test_a_step_that_a_later_one_makes_needless_is_taken_out():
@@ -624,7 +637,7 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
     asked = unrepeated({"play": 3.0}, 7)
     target, base = base_model(asked, asked.seed)
     search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
-    screen, _ = search.screened(base)
+    screen = search.screened(base)
     delay, play = (next(c for c in asked.candidates if c.name == name) for name in ("delay", "play"))
     order = {"delay": delay, "play": play}
     for first, second, left in (("delay", "play", ["play"]), ("play", "delay", ["play", "delay"])):
@@ -632,7 +645,7 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
         both = climb(target, one.x, np.array([*one.free, *order[second].indices]))
         fits = {first: one, second: both}
         steps = [Added(name, (name,), screen, fit, 1.0, {}, target) for name, fit in fits.items()]
-        kept = search._without_needless(base, steps)
+        kept = without_needless(search, base, steps)
         assert [step.name for step in kept] == left
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}
         assert kept[-1].fit.log_evidence >= both.log_evidence
@@ -646,7 +659,7 @@ def test_a_family_takes_the_place_of_a_cause_only_if_it_wins_under_wider_priors_
     family = np.arange(len(old.free) + 10)
     for free, gain, wins in ((old.free, 2.9, False), (old.free, 3.1, True), (family, 9.8, False), (family, 10.0, True)):
         new = replace(old, free=free, log_evidence=old.log_evidence + gain)
-        assert search._surpasses(new, old, asked.rules.evidence) == wins
+        assert search.surpasses(new, old, asked.rules.evidence) == wins
 
 
 def test_what_unseen_recordings_clearly_support_is_adopted_and_no_p_value_is_zero():

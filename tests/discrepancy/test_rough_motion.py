@@ -51,13 +51,13 @@ def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
 
 def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it(monkeypatch):
     """What a base model lacks may drive it to where motion is rough: a cause counts if the model with it is fitted."""
-    fitted = pipeline._fitted_or_not
+    fits = pipeline.base_fits
 
     def unfitted(*given):
-        target, fit = fitted(*given)
-        return target, replace(fit, promise=np.inf)
+        for reached in fits(*given):
+            yield reached if reached.fit is None else replace(reached, fit=replace(reached.fit, promise=np.inf))
 
-    monkeypatch.setattr(pipeline, "_fitted_or_not", unfitted)
+    monkeypatch.setattr(pipeline, "base_fits", unfitted)
     answer = audit(problem({**TRUTH, "play": 1.0}, 1))
     assert (answer.base.converged, answer.converged) == (False, True)
     content = said(answer)

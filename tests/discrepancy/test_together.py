@@ -8,10 +8,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rfdropo_bayes.discrepancy import extension
+from rfdropo_bayes.discrepancy import naming, repairs
+from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import climb
-from rfdropo_bayes.discrepancy.pipeline import audit, base_model
+from rfdropo_bayes.discrepancy.pipeline import audit
+from rfdropo_bayes.discrepancy.repairs import climbed_again
 
 from .toys import Geared, Opposed, problem_of
 
@@ -41,7 +43,7 @@ def test_two_effects_that_pay_only_together_are_named_together(opposed):
 
 @pytest.mark.slow
 def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
-    monkeypatch.setattr(ExtensionSearch, "_pair", lambda *given: [])
+    monkeypatch.setattr(naming, "paying_pair", lambda *given: [])
     assert audit(opposed).causes.steps == []
 
 
@@ -50,7 +52,7 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     at all show where they start: the base model at what imitates the gains, which is as good as they are."""
     asked = problem_of(Geared(), {"radius": 1.0, **TRUTH}, 4, base=3)
     target, right = base_model(asked, 0)
-    screen, _ = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(right)
+    screen = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(right)
     radius, *gains = (asked.coordinates.names.index(name) for name in ("radius", "gain_a", "gain_b"))
     stuck = partial(climb, evaluations=0)
     half = 0.5 * asked.coordinates.named(right.x)["radius"]
@@ -61,11 +63,11 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     gained = extended.log_evidence - stopped.log_evidence
     assert gained > 100.0
     step = Added("cable_gains", ("cable_gains",), replace(screen, fit=stopped), extended, gained, {}, target)
-    monkeypatch.setattr(extension, "climb", stuck)
+    monkeypatch.setattr(repairs, "climb", stuck)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    again = search._climbed_again(step)
+    again = climbed_again(search, step)
     assert again is not None
     assert again.x[radius] == pytest.approx(right.x[radius], rel=1e-3)
     assert again.log_evidence > extended.log_evidence
     # Where the base model is at its optimum, none is better.
-    assert search._climbed_again(replace(step, before=replace(screen, fit=right))) is None
+    assert climbed_again(search, replace(step, before=replace(screen, fit=right))) is None

@@ -54,9 +54,9 @@ def test_a_calibration_without_a_grave_reason_is_not_warned_of(tmp_path) -> None
     ("verdict", "extended", "told"),
     [
         ("unexplained", MODEL, "leaves a discrepancy unexplained"),
-        ("explained", TILTED, "names what its model lacks, see"),
-        ("partly_explained", TILTED, "names what its model lacks, see"),
-        ("described", '[model]\n[[model.laws]]\nport = "cable left"\n', "names what its model lacks, see"),
+        ("explained", TILTED, "names the effects that its model lacks, see"),
+        ("partly_explained", TILTED, "names the effects that its model lacks, see"),
+        ("described", '[model]\n[[model.laws]]\nport = "cable left"\n', "names the effects that its model lacks, see"),
         ("no_discrepancy", MODEL, None),
         ("no_verdict", MODEL, None),
     ],
@@ -87,7 +87,7 @@ def test_a_model_that_has_what_an_audit_found_is_judged_by_what_is_left(tmp_path
             found = posterior_caution(folder)
             assert found is not None
             assert "a1 leaves a discrepancy unexplained" in found.sentence
-            assert "names what its model lacks" not in found.sentence
+            assert "names the effects that its model lacks" not in found.sentence
     assert posterior_caution(folder) is None
 
 

@@ -1,4 +1,4 @@
-"""What is measured, channel by channel: each says what a rollout should show, and how likely is what was read."""
+"""Channels of measurements: each predicts readings from a rollout, and has their likelihood."""
 
 from rfdropo_bayes.bayes.channels.channel import Channel, FeatureChannel, Seen, Series
 from rfdropo_bayes.bayes.channels.markers import Markers

@@ -1,4 +1,4 @@
-"""What every channel of measurements has: its parameters, its residuals, its density, and a draw of its noise."""
+"""Interface of every channel of measurements: parameters, residuals, density, and a draw of its noise."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from rfdropo_bayes.simulators.protocol import Observation
 
 
 class Seen(NamedTuple):
-    """What a model shows under one set of values.
+    """Simulated observations under a set of values.
 
     Attributes:
-        observation: of every recording, with a leading axis over them.
+        observation: observations of every recording, with a leading axis over recordings.
         values: all parameters by name, inferred and fixed.
-        offset: shift of measured against simulated positions of each recording [m].
+        offset: shift of measured against simulated positions in each recording [m].
     """
 
     observation: Observation
@@ -34,10 +34,10 @@ class Seen(NamedTuple):
 
 
 class Channel(ABC):
-    """One kind of measurement; a model's log likelihood is the sum of those of its channels.
+    """One kind of measurement; a model's log likelihood is the sum over its channels.
 
     Attributes:
-        name: by which its data are known.
+        name: name of its data.
     """
 
     name: ClassVar[str]
@@ -50,20 +50,21 @@ class Channel(ABC):
     @property
     @abstractmethod
     def measured(self) -> Float[Any, "..."]:
-        """What was measured; other arrays of this shape are other data of the same channel."""
+        """The measured array; other arrays of this shape are other data of the same channel."""
 
     @abstractmethod
     def residuals(self, seen: Seen, measured: Float[Any, "..."]) -> Float[Array, "..."]:
-        """Residuals of unit variance, zero where there is no reading; axes (recording, time, ...) of a `Series`."""
+        """Residuals of unit variance, zero without a reading; axes (recording, time, ...) of a `Series`."""
 
     @abstractmethod
     def row_log_density(self, seen: Seen, measured: Float[Any, "..."]) -> Float[Array, " row"]:
-        """Log density of each row given those before it, summed over recordings; the first row only of what is known
-        before any recording."""
+        """Log density of each row given the earlier rows, summed over recordings. Data without a time axis count in the
+        first row.
+        """
 
     @abstractmethod
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Array, "..."]:
-        """What would be measured: what a model shows, with a draw of the noise."""
+        """A simulated measurement: the model's observation with a draw of the noise."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,10 @@ class Series(Channel):
     """A channel with readings in every row of every recording.
 
     Attributes:
-        readings: what was read, zero where there is nothing.
-        valid: which columns of an error (`deviation`) count.
-        linear: whether errors are readings less what a rollout shows, and nothing else.
-        known: its noise in these recordings where that is stated or estimated; None where its parameters are inferred.
+        readings: readings, zero if missing.
+        valid: mask of the valid columns of an error (`deviation`).
+        linear: whether errors are readings less simulated values, without a nonlinear map.
+        known: its noise in these recordings if stated or estimated; None if its parameters are inferred.
     """
 
     linear: ClassVar[bool]
@@ -100,7 +101,7 @@ class Series(Channel):
     @property
     @abstractmethod
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of its noise, where they are inferred."""
+        """Parameters of its noise, if inferred."""
 
     @property
     def independent(self) -> bool:
@@ -109,7 +110,7 @@ class Series(Channel):
 
     @abstractmethod
     def expected(self, seen: Seen) -> Float[Any, "recording time *reading"]:
-        """What would be read without noise."""
+        """Expected readings without noise."""
 
     @abstractmethod
     def deviation(
@@ -130,7 +131,7 @@ class Series(Channel):
     def log_size(
         self, about: Float[Any, "recording time *reading"], measured: Float[Any, "recording time *reading"]
     ) -> Float[Any, "recording time column"] | None:
-        """Logarithm of what an error is relative to; None where it is absolute."""
+        """Logarithm of the unit of a relative error; None for an absolute error."""
         return None
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Series:
@@ -139,13 +140,13 @@ class Series(Channel):
         return replace(self, **own, known=self.known_of(index))
 
     def known_of(self, index: list[int]) -> Autoregression | None:
-        """Its noise in some recordings, where it is known."""
+        """Its known noise in some recordings; None if it is inferred."""
         return None if self.known is None else self.known.of_recordings(index)
 
     def mean(
         self, readings: Float[np.ndarray, "repeat time *reading"], valid: Bool[np.ndarray, "repeat time column"]
     ) -> Float[np.ndarray, "time *reading"]:
-        """Mean over repeats of what is valid, zero where nothing is."""
+        """Mean of valid readings over repeats, zero if none is valid."""
         shape = readings.shape[1:]
         used = np.where(valid, readings.reshape(valid.shape), 0.0)
         return (used.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)).reshape(shape)
@@ -159,7 +160,7 @@ class Series(Channel):
     def whiten(
         self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
     ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
-        """Errors as residuals of unit variance, zero where not valid, and the logarithms that normalise them."""
+        """Errors as residuals of unit variance, zero if not valid, and the logarithms that normalise them."""
         if self.known is None:
             return self.whiten_inferred(errors, values)
         return self.known.whiten(errors, self.valid), self.known.log_scale(self.valid)
@@ -185,7 +186,7 @@ class Series(Channel):
 
 
 class WhiteSeries(Series):
-    """A channel whose noise, where it is inferred, is white and of one size.
+    """A channel whose inferred noise is white with a single standard deviation.
 
     Attributes:
         size: standard deviation of an error.
@@ -229,14 +230,14 @@ def padded_readings(
     key: str,
     words: str,
 ) -> tuple[Float[np.ndarray, "recording time reading"], Bool[np.ndarray, "recording time reading"]]:
-    """Readings of recordings, and where there are any, padded to ``length`` rows.
+    """Readings of recordings and their mask, padded to ``length`` rows.
 
     Args:
         trajectories: the recordings.
         length: rows.
-        needed: only so many recordings, the first ones, must have readings; all by default.
-        read: readings of one recording and where they count; None where it has none.
-        key: of [model] that makes them data; words: what they are.
+        needed: number of recordings, from the first, that must have readings; all by default.
+        read: readings of one recording and their mask; None without readings.
+        key: key of [model] that makes them data; words: their name.
 
     Raises:
         InputError: a recording without readings that needs them.
@@ -263,7 +264,7 @@ def size_residuals(
     read: Float[Any, "recording time column"] | None,
     valid: Bool[np.ndarray, "recording time column"],
 ) -> Float[Any, "recording time column"]:
-    """Residuals whose squares add to twice the logarithms of the sizes, up to a constant; zero where not valid.
+    """Residuals whose squares add to twice the logarithms of the sizes, up to a constant; zero if not valid.
 
     With them the log likelihood is a sum of squares but for terms in the noise alone, as Gauss-Newton wants it.
     """
@@ -276,10 +277,10 @@ class FeatureChannel(Protocol):
 
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
-        """True where a feature was measured."""
+        """True for measured features."""
 
     def expected(self, seen: Seen) -> Float[Any, "recording time *reading"]:
-        """What would be read without noise."""
+        """Expected readings without noise."""
 
     def features(self, readings: Float[Any, "recording time *reading"]) -> Float[Any, "recording time feature"]:
         """Features of readings [m]."""

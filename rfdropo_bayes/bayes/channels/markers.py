@@ -37,8 +37,8 @@ class Markers(Series):
     """Positions of the markers [m], (recording, time, marker, 3); a column is one coordinate of one marker.
 
     Attributes:
-        recordings: that they are of.
-        model: name of the noise model, one of `NOISE_MODELS`; of known noise what it is taken from.
+        recordings: recordings with these positions.
+        model: name of the noise model, one of `NOISE_MODELS`; of known noise its source.
     """
 
     name: ClassVar[str] = "markers"
@@ -99,7 +99,7 @@ class Markers(Series):
         return _flat(white), jnp.repeat(jnp.log(scale), 3, axis=-1)
 
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """See `Series.stated`: white noise, lasting where there is a correlation time."""
+        """See `Series.stated`: white noise, or correlated noise if there is a correlation time."""
         tau = values.get(NOISE_CORRELATION_TIME.name)
         memory = [] if tau is None else [float(np.exp(-step / tau))]
         scale = np.full(self.valid.shape[-1], values[OBSERVATION_NOISE.name])
@@ -121,7 +121,7 @@ class Markers(Series):
         return jnp.where(self.recordings.line.valid[..., None], self.expected(seen) + noise, 0.0)
 
     def distribution(self, seen: Seen, index: int) -> dist.Distribution:
-        """That of the positions in one recording, as numpyro wants it."""
+        """Numpyro distribution of the positions in one recording."""
         rows = int(self.recordings.rows[index])
         line = Timeline(*(part[index, :rows] for part in self.recordings.line))
         time = jnp.asarray(self.recordings.time[index, :rows])
@@ -152,7 +152,7 @@ class Markers(Series):
 
 
 def noise_of_markers(known: Autoregression, markers: Sequence[str], recordings: RecordingSet) -> Autoregression:
-    """The part of a known noise of some markers that is of those of recordings.
+    """The part of a known noise for the markers of recordings.
 
     Raises:
         InputError: a marker whose noise is not known.
@@ -168,7 +168,7 @@ def noise_of_markers(known: Autoregression, markers: Sequence[str], recordings: 
 
 
 class PositionNoise(dist.Distribution):
-    """Measured marker positions of one recording, given the simulated ones."""
+    """Measured marker positions of one recording, given the simulated positions."""
 
     support = dist.constraints.independent(dist.constraints.real, 3)
 

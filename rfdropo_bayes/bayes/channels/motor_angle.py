@@ -1,7 +1,7 @@
-"""Measured motor angles: what the drives did, apart from what the body made of it.
+"""Measured motor angles: the motion of the drives, separate from the body's.
 
-Marker positions alone cannot tell a slow drive from a damped body, or a drive that stops short from a smaller spool. An
-encoder on the motor sees the first of each pair only (`Observation.motor_angle`).
+Marker positions alone cannot distinguish a slow drive from a damped body, or a drive that stops short from a smaller
+spool. A motor encoder measures only the drive's part of each pair (`Observation.motor_angle`).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ MOTOR_ANGLE_NOISE = ParameterSpec(
     3.0,
     0.01,
     {"distribution": "LogNormal", "median": 0.02, "sigma": 1.5},
-    "standard deviation of a motor angle: the encoder, and what the model of the drives misses; white",
+    "standard deviation of a motor angle: the encoder, and errors of the drive model; white",
 )
 
 
 @dataclass(frozen=True)
 class MotorAngle(WhiteSeries):
-    """Motor angles [rad]; columns are the channels of the commands. Readings that repeat an older one do not count."""
+    """Motor angles [rad]; columns are the channels of the commands. Repeated readings do not count."""
 
     name: ClassVar[str] = "motor_angle"
     linear: ClassVar[bool] = True
@@ -53,7 +53,7 @@ class MotorAngle(WhiteSeries):
                 return None
             if trajectory.command_unit != "rad":
                 raise InputError(
-                    f"its commands are in {trajectory.command_unit}: motor angles tell of commands in rad only",
+                    f"its commands are in {trajectory.command_unit}: motor angles inform commands in rad only",
                     where=trajectory.name,
                     remedy="leave [model] motor_angle = true out, or give the commands as angles of the motors",
                 )
@@ -63,7 +63,7 @@ class MotorAngle(WhiteSeries):
                 raise InputError(
                     "none of its motor angles is a new reading",
                     where=trajectory.name,
-                    remedy="resample less coarsely: a row counts where the angles were just read",
+                    remedy="resample less coarsely: only rows with a new reading count",
                 )
             return np.where(valid, angle, 0.0), valid
 
@@ -73,11 +73,11 @@ class MotorAngle(WhiteSeries):
         """See `Series.expected`.
 
         Raises:
-            InputError: a simulator that does not tell where its drives stand.
+            InputError: a simulator without drive positions.
         """
         if seen.observation.motor_angle is None:
             raise InputError(
-                "the simulator does not tell where its drives stand",
+                "the simulator has no drive positions",
                 where="[model] motor_angle",
                 remedy="leave it out, or let its rollout return Observation.motor_angle",
             )

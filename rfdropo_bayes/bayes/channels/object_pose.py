@@ -1,10 +1,10 @@
-"""Measured poses of a pushed body: where contact took it, which the markers on the robot do not tell.
+"""Measured poses of a pushed body: effects of contact that the robot's markers do not show.
 
-The body starts where its first pose shows it (`Placing.with_object_at`), and what is measured of it are its centre and
-its turn since then. What the model misses of a push lasts, since a body at rest stays where it was left: the noise is
-an Ornstein-Uhlenbeck process (`bayes.noise`) with its own sizes and its own correlation time. Where the noise of the
-positions is white, so is this one, and `inference.modes.lasting` says what a row counts: noise that lasts as long as
-the recording also takes up a push that is wrong throughout.
+The body starts at its first measured pose (`Placing.with_object_at`); its centre and its turn since then are measured.
+Model errors of a push are correlated in time, since a body at rest keeps its pose: the noise is an Ornstein-Uhlenbeck
+process (`bayes.noise`) with its own sizes and its own correlation time. If the noise of the positions is white, this
+noise is also white, and `inference.modes.lasting` weights the rows: noise as long as the recording would also absorb a
+wrong push.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 OFFSETS = ("offset_x", "offset_y", "offset_z")
-"""Parameters that shift what is measured against what is simulated [m]."""
+"""Parameters that shift measured against simulated positions [m]."""
 
 LEVER = 0.02
 """[m] A turn counts among features as the way of points so far from the centre."""
@@ -39,7 +39,7 @@ OBJECT_NOISE = ParameterSpec(
     0.5,
     0.005,
     {"distribution": "LogNormal", "median": 0.005, "sigma": 1.0},
-    "standard deviation of one coordinate of the pushed body's centre: what the model misses of a push",
+    "standard deviation of one coordinate of the pushed body's centre: model error of a push",
 )
 OBJECT_TURN_NOISE = ParameterSpec(
     "object_turn_noise",
@@ -63,10 +63,10 @@ OBJECT_CORRELATION_TIME = ParameterSpec(
 
 @runtime_checkable
 class Placing(Protocol):
-    """A simulator whose object can be put where it was measured.
+    """A simulator whose object can be placed at a measured pose.
 
     Attributes:
-        pushes: whether it has one.
+        pushes: whether it has an object.
     """
 
     pushes: bool
@@ -77,14 +77,14 @@ class Placing(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectPose(Series):
-    """Poses of the pushed body: centre [m] and unit quaternion (x, y, z, w); columns are those of centre and turn.
+    """Poses of the pushed body: centre [m] and unit quaternion (x, y, z, w); columns are centre and turn.
 
-    Where the body starts is taken from its first pose, which is not predicted.
+    The first pose is the start of the body and is not predicted.
 
     Attributes:
-        line: which rows have a pose, and which one came before, as of a single marker.
+        line: rows with a pose and their predecessors, as for a single marker.
         time: observation times [s].
-        lasting: whether its noise, where that is inferred, lasts from row to row.
+        lasting: whether its inferred noise is correlated in time.
     """
 
     name: ClassVar[str] = "object_pose"
@@ -118,7 +118,7 @@ class ObjectPose(Series):
                 raise InputError(
                     "its first row has no pose of the pushed body",
                     where=trajectory.name,
-                    remedy="leave [model] object_pose = true out, or start where the body is seen",
+                    remedy="remove [model] object_pose = true, or start at a row in which the body is seen",
                 )
             step = trajectory.dataset.attrs["sample_time"]
             tail = trajectory.time[-1] + step * np.arange(1, length - len(trajectory.time) + 1)
@@ -135,7 +135,7 @@ class ObjectPose(Series):
         time: Float[np.ndarray, "recording time"],
         lasting: bool = True,
     ) -> ObjectPose:
-        """Poses at some times [s], of which those that were not seen do not count."""
+        """Channel of poses at some times [s]; unseen poses do not count."""
         lines = [timeline(clock, rows[:, None]) for clock, rows in zip(time, seen, strict=True)]
         counted = seen.copy()
         counted[:, 0] = False

@@ -48,7 +48,7 @@ class Orientation(WhiteSeries):
     name: ClassVar[str] = "orientation"
     linear: ClassVar[bool] = False
     size: ClassVar[ParameterSpec] = ORIENTATION_NOISE
-    sections: tuple[int, ...] = ()  # of the simulator, those that were measured
+    sections: tuple[int, ...] = ()  # indices of the measured sections in the simulator
 
     @classmethod
     def gather(
@@ -94,12 +94,12 @@ class Orientation(WhiteSeries):
         """See `Series.expected`.
 
         Raises:
-            InputError: a simulator that does not tell how its sections are turned.
+            InputError: a simulator without section orientations.
         """
         found = seen.observation.orientation
         if found is None:
             raise InputError(
-                "the simulator does not tell how its sections are turned",
+                "the simulator has no section orientations",
                 where="[model] orientation",
                 remedy="leave it out, or use a body that is a rod",
             )

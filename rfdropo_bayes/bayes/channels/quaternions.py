@@ -28,7 +28,7 @@ def turn_between(first: Float[Any, "... 4"], second: Float[Any, "... 4"]) -> Flo
 
 
 def of_rotation_vector(turn: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
-    """The rotation by a vector [rad]; smooth where it is zero."""
+    """The rotation by a vector [rad]; smooth at zero."""
     square = jnp.sum(turn**2, axis=-1, keepdims=True)
     small = square < 1e-8
     half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, square))

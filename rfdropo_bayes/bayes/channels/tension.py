@@ -46,11 +46,11 @@ SMALLEST_READING = 0.05
 class Tension(WhiteSeries):
     """Cable tensions [N]; an error is relative to the size of the tension.
 
-    That is the size of the tension, not of what was read for it: readings that happen to be low would count more than
-    high ones, and pull all forces down by twice the square of their relative error.
+    This is the size of the true tension, not of its reading. Otherwise low readings would count more than high
+    readings, and bias all forces down by twice the square of the relative error.
 
     Attributes:
-        cables: which of the simulator's cables were measured.
+        cables: indices of the measured cables.
     """
 
     name: ClassVar[str] = "tension"
@@ -123,7 +123,7 @@ def reading_size(
     known: Bool[np.ndarray, "recording time cable"],
     among: Float[Any, "recording time cable"],
 ) -> Float[Any, "recording time cable"]:
-    """Size of each tension that its reading's relative error applies to [N]; ``among`` sets what the least one is."""
+    """Size of each tension that its reading's relative error applies to [N]; ``among`` sets the least size."""
     square = jnp.sum(jnp.where(known, among, 0.0) ** 2, axis=(1, 2), keepdims=True)
     least = SMALLEST_READING * jnp.sqrt(square / np.maximum(known.sum(axis=(1, 2), keepdims=True), 1))
     return jnp.maximum(jnp.abs(tension), jnp.where(least > 0.0, least, 1.0))

@@ -1,12 +1,12 @@
-"""Noise that is known: an autoregression, stated or estimated where an experiment was repeated.
+"""Known noise: an autoregression, stated or estimated from repeats.
 
 Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
-predicted from the min(k, p) rows before it (Levinson-Durbin). Noise that columns share, such as that of a shaking
-mount, has the same memory as the rest (a separable covariance); across a gap in some of the columns alone its whitening
-is approximate.
+predicted from the min(k, p) rows before it (Levinson-Durbin). Noise shared by columns, such as from a shaking mount,
+has the same memory as the rest (a separable covariance); across a gap in some of the columns alone its whitening is
+approximate.
 
-Memory lasts for seconds, not for rows: in recordings of another rate each row is predicted under the autocorrelation at
-its own lags (`Autoregression.at`).
+Memory is defined in seconds, not in rows: in recordings of another rate each row is predicted under the autocorrelation
+at its own lags (`Autoregression.at`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rfdropo_bayes.data.sample_times import ONE_RATE
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
-MISFIT = "misfit"  # white, of the size of what a model that is far off leaves
+MISFIT = "misfit"  # white, of the size of a misspecified model's residuals
 SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
 LEAST_ROWS = 3  # for each column, to estimate correlations at all
@@ -39,14 +39,14 @@ class Autoregression:
 
     Attributes:
         scale: marginal standard deviation of each column, in the column's unit.
-        autocorrelation: at lags 0 ... p; its length says the order.
-        source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (an assumption: what the base
-            model leaves is taken for noise as far as such a process can make it).
-        freedom: degrees of freedom of the variance; infinite where stated.
-        correlation: of the columns at one time; None where they are independent.
-        step: time between rows [s] that the lags count; None where it is not known, and rows of any rate count alike.
-        paces: time between the rows of each recording, in steps; None where all have the rate of ``step``. Series then
-            have an axis of these recordings before that of time.
+        autocorrelation: at lags 0 ... p; its length gives the order.
+        source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's
+            residuals are noise of such a process).
+        freedom: degrees of freedom of the variance; infinite if stated.
+        correlation: of the columns at one time; None if they are independent.
+        step: time between rows [s] that the lags count; None if unknown, and rows of any rate count equally.
+        paces: time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then
+            have an axis of these recordings before the time axis.
     """
 
     scale: Float[np.ndarray, " column"]
@@ -74,7 +74,7 @@ class Autoregression:
         return replace(self, scale=self.scale[index], correlation=across)
 
     def at(self, steps: Sequence[float] | Float[np.ndarray, " recording"]) -> Autoregression:
-        """The same noise in recordings whose rows are so many seconds apart."""
+        """The same noise in recordings with the given seconds between rows."""
         if self.step is None or not self.order:
             return self
         found = tuple(_pace(float(step) / self.step, np) for step in steps)
@@ -93,7 +93,7 @@ class Autoregression:
         return self if self.paces is None else replace(self, paces=tuple(self.paces[i] for i in index))
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, those of recordings left out; `from_dict` undoes it."""
+        """As plain values without recordings; `from_dict` is the inverse."""
         arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
         found = {name: None if array is None else array.tolist() for name, array in arrays.items()}
         freedom = self.freedom if np.isfinite(self.freedom) else None
@@ -120,8 +120,8 @@ class Autoregression:
     def _autocorrelation_at(self, pace: Float[Any, "..."]) -> Float[Any, "... lag"]:
         """Autocorrelation at lags of rows that are ``pace`` steps apart.
 
-        Between the lags of steps it is a straight line, which keeps it that of a stationary process (its spectrum is
-        the periodic one times a squared sinc); of a first-order process whose memory is positive it is exact.
+        It is linear between the lags of steps, which keeps the process stationary (its spectrum is the periodic one
+        times a squared sinc); of a first-order process whose memory is positive it is exact.
         """
         numbers: Any = jnp if isinstance(pace, jax.Array) else np
         lags = numbers.asarray(pace)[..., None] * np.arange(self.order + 1)
@@ -151,16 +151,17 @@ class Autoregression:
         valid: Bool[np.ndarray, "*rest time column"],
         count: Float[np.ndarray, "*rest time column"] | None = None,
     ) -> Float[Any, "*batch time column"]:
-        """Independent unit-variance rows, zero where not valid; linear in the series.
+        """Independent unit-variance rows, zero if not valid; linear in the series.
 
-        ``count`` repeats stand behind each value, whose noise is smaller by its root; one without.
+        Each value is a mean of ``count`` repeats, with noise smaller by its square root; by default a single reading.
         """
         innovations = self.innovations(series, valid)
         return self.separate(innovations if count is None else innovations * np.sqrt(count), valid)
 
     def log_scale(self, valid: Bool[np.ndarray, "*rest time column"]) -> Float[np.ndarray, "*rest time column"]:
-        """Logarithms that normalise the density of `whiten`: zero where not valid, and their sum is half that of the
-        covariance's determinant. A row's columns have equal parts of what their correlation takes away."""
+        """Logarithms that normalise the density of `whiten`: zero if not valid; their sum is half the log determinant
+        of the covariance. The effect of correlation is divided equally between a row's columns.
+        """
         found = np.log(self._prediction(valid)[1] * self.scale)
         if self.correlation is not None:
             shared = half_log_determinant(self.correlation, valid)
@@ -170,7 +171,7 @@ class Autoregression:
     def innovations(
         self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[Any, "*batch time column"]:
-        """What the rows before do not predict, in unit variance; columns that share noise still do."""
+        """Prediction errors from earlier rows, with unit variance; shared noise between columns remains."""
         coefficients, deviation = self._prediction(valid)
         numbers: Any = jnp if isinstance(series, jax.Array) else np
         innovation = numbers.asarray(series, dtype=float)
@@ -189,13 +190,13 @@ class Autoregression:
     def gather(
         self, white: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[Any, "*batch time column"]:
-        """Innovations of the columns themselves, what they share included."""
+        """Innovations of the columns, with their shared noise."""
         return white if self.correlation is None else mixed(white, valid, self.correlation, 0.5)
 
     def colour(
         self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[np.ndarray, "*batch time column"]:
-        """The series that `whiten` makes ``white`` of; zero where not valid."""
+        """Inverse of `whiten`; zero if not valid."""
         coefficients, deviation = self._prediction(valid)
         series = np.where(valid, self.gather(white, valid) * deviation * self.scale, 0.0)
         for row in range(1, series.shape[-2]):
@@ -207,15 +208,14 @@ class Autoregression:
     def row_log_density(
         self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[Any, "*batch time"]:
-        """Log density of each row given those before it."""
+        """Log density of each row given the earlier rows."""
         white = self.whiten(series, valid)
         return -(0.5 * white**2 + np.where(valid, self.log_scale(valid) + 0.5 * np.log(2.0 * np.pi), 0.0)).sum(axis=-1)
 
     def draw_rows(
         self, key: PRNGKeyArray, rows: int, time: Float[Any, " time"] | None = None
     ) -> Float[Any, "time column"]:
-        """A realisation in one recording, whose rows are those of ``time`` [s] where there are several rates;
-        traceable."""
+        """A realisation in one recording, at the times ``time`` [s] if there are several rates; traceable."""
         coefficients, deviation = self.predictors
         if self.paces is not None and self.step is not None and time is not None:
             pace = _pace(jnp.median(jnp.diff(jnp.asarray(time))) / self.step, jnp)
@@ -296,17 +296,17 @@ def estimate_noise(
     pooled: bool | None = None,
     shared: bool | None = False,
 ) -> Autoregression:
-    """Fit the noise to deviations that hold nothing else.
+    """Fit the noise to deviations of pure noise.
 
     Args:
         series: deviations [m], e.g. of repeats from their mean.
-        valid: which may be used.
+        valid: mask of usable values.
         freedom_share: degrees of freedom per value: (n - 1) / n for deviations from the mean of n repeats.
-        source: what the deviations are.
-        steps: time between rows of each series [s]; where there are several rates, memory is estimated from the series
-            of the rate that has the most values. All of one unknown rate by default.
-        order: of the process; by default the one of smallest BIC up to `MAX_ORDER`.
-        pooled: one standard deviation for all columns; by default as BIC has it.
+        source: source of the deviations.
+        steps: time between rows of each series [s]; with several rates, memory is estimated from the series of the rate
+            that has the most values. All of one unknown rate by default.
+        order: order of the process; by default with the smallest BIC up to `MAX_ORDER`.
+        pooled: whether all columns have the same standard deviation; by default chosen by BIC.
         shared: whether columns share noise; None to test it.
     """
     square = np.where(valid, series, 0.0) ** 2
@@ -331,7 +331,7 @@ def estimate_noise(
     across = shrunk_correlation(alone.innovations(series, valid)[whole], freedom_share, shared=shared)
     if across is None:
         return alone
-    # The mean of correlated squares is known as well as that of fewer independent ones.
+    # The mean of correlated squares is as accurate as the mean of fewer independent squares.
     return replace(alone, correlation=across, freedom=alone.freedom * len(across) / float(np.sum(across**2)))
 
 
@@ -358,22 +358,22 @@ def _autocorrelation(series: np.ndarray, valid: np.ndarray, lags: int) -> np.nda
 def shrunk_correlation(
     rows: Float[np.ndarray, "row column"], freedom_share: float, *, shared: bool | None = None
 ) -> Float[np.ndarray, "column column"] | None:
-    """Correlation of the columns, drawn towards independence as far as its own uncertainty calls for.
+    """Correlation of the columns, shrunk towards independence according to its uncertainty.
 
     Args:
-        rows: independent of one another, every column present.
+        rows: independent rows without missing columns.
         freedom_share: degrees of freedom per value.
-        shared: whether noise is shared; by default as Bartlett's test of independence has it (Bartlett 1951).
+        shared: whether noise is shared; by default by Bartlett's test of independence (Bartlett 1951).
 
     Returns:
-        Schaefer and Strimmer's (2005) estimate under normal errors; None where the columns are independent.
+        Schaefer and Strimmer's (2005) estimate under normal errors; None if the columns are independent.
     """
     count, columns = len(rows) * freedom_share, rows.shape[1]
     if shared is False or columns < 2 or count < LEAST_ROWS * columns:
         return None
     scale = np.sqrt(np.maximum(np.mean(rows**2, axis=0), 1e-300))
     sample = (rows / scale).T @ (rows / scale) / len(rows)
-    np.fill_diagonal(sample, 1.0)  # of a column that never differs, too
+    np.fill_diagonal(sample, 1.0)  # also of a constant column
     pairs = columns * (columns - 1) / 2
     if shared is None:
         likelihood = -(count - 1.0 - (2.0 * columns + 5.0) / 6.0) * np.linalg.slogdet(sample)[1]
@@ -417,7 +417,7 @@ def half_log_determinant(
 
 
 def _patterns(valid: Bool[np.ndarray, "*batch row column"]) -> tuple[np.ndarray, np.ndarray]:
-    """The sets of columns that rows have, and which of them each row has; rows without any count with whole ones."""
+    """The distinct sets of valid columns, and the index of each row's set; empty rows count as complete."""
     rows = valid.reshape(-1, valid.shape[-1])
     rows = np.where(rows.any(axis=1, keepdims=True), rows, True)
     if rows.all():

@@ -1,11 +1,11 @@
 """Observation noise: white, correlated in time, both at once, or heavy-tailed; masked rows are left out.
 
-``auto`` is the sum of white noise and of a stationary Ornstein-Uhlenbeck process (AR(1) where rows are evenly spaced),
-for every coordinate of every marker alike. It becomes ``white`` where the lasting part vanishes, and ``ar1`` where the
-white part does. Its density given the rows before comes from a Kalman filter with one state (Sarkka, Bayesian Filtering
+``auto`` is the sum of white noise and of a stationary Ornstein-Uhlenbeck process (AR(1) for evenly spaced rows), equal
+for every coordinate of every marker. It becomes ``white`` if the correlated part vanishes, and ``ar1`` if the white
+part vanishes. Its density given the rows before comes from a Kalman filter with one state (Sarkka, Bayesian Filtering
 and Smoothing, 2013, section 4.3), which takes irregular and masked rows as they are. ``ar1`` needs no filter: given the
 last valid row, ``gap`` seconds before, the residual is normal with mean ``phi r`` and variance ``sigma^2 (1 - phi^2)``,
-``phi = exp(-gap / tau)``. ``student-t`` is independent in time; its tails hold single rows that are far off.
+``phi = exp(-gap / tau)``. ``student-t`` is independent in time; its tails absorb single outliers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OBSERVATION_NOISE = ParameterSpec(
     0.2,
     1e-3,
     {"distribution": "LogNormal", "median": 2e-3, "sigma": 1.5},
-    "standard deviation of one coordinate of one marker: sensor noise and what the simulator misses",
+    "standard deviation of one coordinate of one marker: sensor noise and simulator error",
 )
 LASTING_NOISE = ParameterSpec(
     "lasting_noise",
@@ -41,7 +41,7 @@ LASTING_NOISE = ParameterSpec(
     0.2,
     1e-3,
     {"distribution": "LogNormal", "median": 2e-3, "sigma": 1.5},
-    "standard deviation of the part of the noise that lasts from row to row: mostly what the simulator misses",
+    "standard deviation of the correlated part of the noise: mostly simulator error",
 )
 NOISE_CORRELATION_TIME = ParameterSpec(
     "noise_correlation_time",
@@ -59,7 +59,7 @@ NOISE_DEGREES = ParameterSpec(
     1000.0,
     30.0,
     {"distribution": "LogNormal", "median": 10.0, "sigma": 1.0},
-    "degrees of freedom of the noise: few where single rows are far off, many where it is normal",
+    "degrees of freedom of the noise: few with outliers, many if it is normal",
 )
 _SPECS = {
     "auto": (OBSERVATION_NOISE, LASTING_NOISE, NOISE_CORRELATION_TIME),
@@ -86,8 +86,8 @@ class Timeline(NamedTuple):
     """For every row and marker: is it valid, which valid row came before it, and how long ago.
 
     Attributes:
-        valid: False where the recording is masked.
-        previous: index of the last valid row before this one; its own index if there is none.
+        valid: False for masked positions.
+        previous: index of the last valid row before; its own index if there is none.
         gap: time since then [s]; `LONG_AGO` if there is none.
     """
 
@@ -106,14 +106,14 @@ def timeline(time: Float[np.ndarray, " time"], valid: Bool[np.ndarray, "time mar
 
 
 class Noise(NamedTuple):
-    """Values of a noise model; the parts that are None are not there.
+    """Values of a noise model; absent parts are None.
 
     Attributes:
-        sigma: standard deviation [m] of one coordinate of one marker: of the white part, or of everything without one.
-            Of heavy-tailed noise half the width of the central 68 %, which tails do not change.
-        tau: correlation time [s] of the lasting part; None for independent rows.
-        lasting: standard deviation [m] of the lasting part beside a white one; None where all of the noise lasts.
-        degrees: of freedom of a Student-t; None for normal noise.
+        sigma: standard deviation [m] of one coordinate of one marker: of the white part, or of all noise if there is no
+            correlated part. For heavy-tailed noise half the width of the central 68 %, which tails do not change.
+        tau: correlation time [s] of the correlated part; None for independent rows.
+        lasting: standard deviation [m] of the correlated part beside a white part; None if all noise is correlated.
+        degrees: degrees of freedom of a Student-t; None for normal noise.
     """
 
     sigma: Any
@@ -139,10 +139,10 @@ def noise_specs(model: str) -> tuple[ParameterSpec, ...]:
 
 
 def noise_values(model: str, known: Mapping[str, Any]) -> Noise:
-    """The values of a noise model among those of all parameters.
+    """The values of a noise model, taken from all parameters.
 
     Raises:
-        InputError: one of them is missing.
+        InputError: a value is missing.
     """
     missing = [spec.name for spec in noise_specs(model) if spec.name not in known]
     if missing:
@@ -157,10 +157,10 @@ def noise_values(model: str, known: Mapping[str, Any]) -> Noise:
 def whiten(
     residual: Float[Array, "time marker 3"], noise: Noise, line: Timeline
 ) -> tuple[Float[Array, "time marker 3"], Float[Array, "time marker"]]:
-    """Independent residuals of unit size (zero where masked), and the scale [m] that normalises each.
+    """Independent residuals of unit size (zero if masked), and the scale [m] that normalises each.
 
     With white residuals w and scales s the log density of a coordinate is ``-w^2 / 2 - log(s) - log(2 pi) / 2``; s
-    depends on the noise and the timeline alone. Normal noise makes w standard normal. Of heavy-tailed noise w is the
+    depends on the noise and the timeline alone. Normal noise makes w standard normal. For heavy-tailed noise w is the
     signed root of the deviance, which is nearly normal.
     """
     if noise.degrees is not None:
@@ -187,7 +187,7 @@ def _student(
 ) -> tuple[Float[Array, "time marker 3"], Float[Array, ""]]:
     scale = _student_scale(sigma, degrees)
     square = (residual / scale) ** 2 / degrees
-    # log1p(x) / x is 1 at zero, where neither a quotient nor the derivative of a root exists.
+    # log1p(x) / x is 1 at zero, at which neither the quotient nor the derivative of a root exists.
     small = square < 1e-8
     ratio = jnp.where(small, 1.0 - 0.5 * square, jnp.log1p(square) / jnp.where(small, 1.0, square))
     white = residual / scale * jnp.sqrt((degrees + 1.0) / degrees * ratio)

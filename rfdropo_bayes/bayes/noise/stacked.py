@@ -24,17 +24,17 @@ class Stacked:
 
     @property
     def first(self) -> Autoregression:
-        """That of the markers."""
+        """Noise of the markers."""
         return self.parts[0]
 
     @property
     def source(self) -> str:
-        """What it was taken from; channels have one source in common."""
+        """Source of the noise, the same for all channels."""
         return self.first.source
 
     @property
     def doubtful(self) -> bool:
-        """Whether that of any channel is."""
+        """Whether the noise of any channel is doubtful."""
         return any(part.doubtful for part in self.parts)
 
     @property
@@ -76,5 +76,5 @@ class Stacked:
 
 
 def side_by_side(widths: Sequence[int]) -> list[slice]:
-    """Where blocks of columns of some widths lie."""
+    """Slices of adjacent blocks of columns."""
     return [slice(low, high) for low, high in pairwise(accumulate(widths, initial=0))]

@@ -1,1 +1,1 @@
-"""Drives without motors: simulated drives on a hub, what they pull on, and a simulation of the whole bus."""
+"""Drives without motors: simulated drives on a hub, the plant that they pull on, and a simulation of the whole bus."""

@@ -22,7 +22,7 @@ from rfdropo_bayes.errors import InputError
 
 FRAME = struct.Struct("<IB3x8s")
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
-_SEND_TIMEOUT = struct.pack("ll", 0, 50_000)  # 50 ms: a control loop must not hang where a hub does
+_SEND_TIMEOUT = struct.pack("ll", 0, 50_000)  # 50 ms: a control loop must not hang with its hub
 _QUEUE = 1 << 20  # [bytes]: sixty thousand frames, a quarter of an hour of nothing read
 
 
@@ -171,7 +171,7 @@ class Hub:
         self.channel = channel if family == socket.AF_UNIX else f"{name[0]}:{name[1]}"
 
     def serve(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Pass frames on until ``stop`` says so (asked twice a second)."""
+        """Pass frames on until ``stop`` returns True; it is called twice a second."""
         try:
             while not stop():
                 for key, events in self._selector.select(0.5):

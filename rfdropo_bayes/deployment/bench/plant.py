@@ -1,4 +1,6 @@
-"""What the drives pull on: the `Plant` protocol, cables as springs in closed form, a plant in its own process."""
+"""The plant that the drives pull on: the `Plant` protocol, cables as springs in closed form, a plant in its own
+process.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,16 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 START = 300.0  # [s]: a plant may compile itself first
-_END = 5.0  # [s]: for the step that it is at, and for what its libraries tidy up
+_END = 5.0  # [s]: for the present step, and for the clean-up of its libraries
 
 
 class PlantState(NamedTuple):
-    """What a plant shows.
+    """Measurable state of a plant.
 
     Attributes:
-        tension: of each channel's cable [N].
-        position: of each marker in the robot's base frame [m].
-        object_pose: centre [m] and unit quaternion x, y, z, w of what the robot pushes; None without.
+        tension: tension of each channel's cable [N].
+        position: positions of the markers in the robot's base frame [m].
+        object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None without an object.
     """
 
     tension: Float[np.ndarray, " channel"]
@@ -54,14 +56,14 @@ class Plant(Protocol):
 class SpringCables:
     """Each cable a spring under pretension; markers lean towards the cables that are pulled, without inertia.
 
-    Tension is ``max(0, pretension + stiffness x length)``. The marker at height z above the base moves across by
-    ``lean x (z / z_tip)^2 x`` the sum of the pulls times the directions of their cables. Closed forms, so that tests
-    know every number; a simulated trunk takes its place where the motion matters.
+    Tension is ``max(0, pretension + stiffness x length)``. The marker at height z above the base moves across by ``lean
+    x (z / z_tip)^2 x`` the sum of the pulls times the directions of their cables. Closed forms, so that tests know
+    every number; use a simulated trunk if the motion matters.
 
     Args:
         robot: gives channels, cables and markers.
-        stiffness: of every cable [N/m].
-        pretension: at length zero [N].
+        stiffness: stiffness of every cable [N/m].
+        pretension: tension at length zero [N].
         lean: sideways motion of the tip per metre of pull [-].
     """
 
@@ -158,11 +160,11 @@ class PlantProcess:
 
     @property
     def late(self) -> float:
-        """Time [s] between what was sent and what the newest state answers."""
+        """Age [s] of the command that the newest state answers."""
         return self._sent - self._answered
 
     def close(self) -> None:
-        """End the process: it leaves by itself once nobody asks, and is ended where it does not."""
+        """End the process: it exits by itself once requests stop, and is terminated otherwise."""
         self._pipe.close()
         self._process.join(_END)
         self._process.terminate()

@@ -1,4 +1,4 @@
-"""The object dictionary of a simulated drive and its SDO server: canopen's, held to CiA 301 where it is lenient."""
+"""The object dictionary of a simulated drive and its SDO server: canopen's, made to obey CiA 301 strictly."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class StrictNode(canopen.LocalNode):
 
 
 class StrictServer(SdoServer):
-    """An SDO server without block transfer, which keeps to the order of a segmented one.
+    """An SDO server without block transfer, which enforces the order of segmented transfers.
 
-    Segments that nothing began, or of the other direction, are aborted; so is a download of another length than was
-    announced, and one that could not be written, at its first frame. An expedited download that leaves its length open
-    has that of the object. Frames of another length than eight bytes are no SDOs.
+    Segments without a started transfer, or of the other direction, are aborted. A download whose length differs from
+    the announced length is aborted. A download that cannot be written is aborted at its first frame. An expedited
+    download without a length takes the object's length. Frames that are not eight bytes long are ignored.
     """
 
     def __init__(self, rx_cobid: int, tx_cobid: int, node: StrictNode) -> None:

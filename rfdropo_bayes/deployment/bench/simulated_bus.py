@@ -33,23 +33,23 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 TICK = 0.002  # [s]: drives check their guards and move between frames
-PLANT_PERIOD = 0.01  # [s]: how often plant and markers are brought up to date where no SYNC comes
+PLANT_PERIOD = 0.01  # [s]: time between updates of plant and markers without SYNC
 DATAGRAM = struct.Struct("<4sId")
 MAGIC = b"RFMK"
 
 
 class SimulationTable(NamedTuple):
-    """What is simulated.
+    """Settings of a simulation.
 
     Attributes:
         robot: name or path of a robot with motors.
-        bus: where the drives live.
+        bus: the bus that the drives are on.
         plant, settings: as for `build_plant`.
         own_process: whether the plant runs in a process of its own.
         markers: "HOST:PORT" that markers are sent to; empty for none.
         encoder_offset: counts that every encoder shows at length zero, less the motor's own offset.
         start_length_m: cable on every drum at power-on.
-        values: of every node's dictionary, as for `SimulatedNode`.
+        values: entries of every node's dictionary, as for `SimulatedNode`.
         eds: data sheet of the drives.
     """
 
@@ -68,8 +68,8 @@ class SimulationTable(NamedTuple):
 class SimulatedDrives:
     """All drives of a robot on one bus, fed by one thread.
 
-    The plant is computed while the time from one SYNC to the next passes, with the drives where they will be then:
-    status, tensions and markers of a cycle belong to one instant.
+    The plant is computed while the time from one SYNC to the next passes, with the positions that the drives will have
+    then: status, tensions and markers of a cycle belong to one instant.
     """
 
     def __init__(self, robot: Robot, table: SimulationTable, bus: can.BusABC, plant: PlantHere | PlantProcess) -> None:
@@ -134,7 +134,7 @@ class SimulatedDrives:
                 due += TICK * max(1, math.ceil((time.monotonic() - due) / TICK))
 
     def tick(self, now: float) -> None:
-        """Let time pass for the drives, and for the plant where no SYNC leads it."""
+        """Let time pass for the drives, and for the plant if no SYNC drives it."""
         for node in self.nodes.values():
             node.tick(now)
         if now < self._next_plant:
@@ -180,7 +180,7 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
     """Run the drives until SIGINT or SIGTERM, with a hub of their own if the bus is one and nobody serves it.
 
     Args:
-        table: what is simulated.
+        table: settings of the simulation.
         ready: file to write the channel of the bus to once the drives are on it.
 
     Raises:
@@ -212,7 +212,7 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
 
 @contextlib.contextmanager
 def _hub_process(table: BusTable) -> Iterator[BusTable]:
-    """A hub in a process of its own, that ends with this one."""
+    """A hub in a child process, which ends with its parent."""
     program = "import sys; from rfdropo_bayes.deployment.bench.simulated_bus import run_hub; run_hub(sys.argv[1])"
     process = subprocess.Popen([sys.executable, "-c", program, table.channel], stdout=subprocess.PIPE, text=True)
     try:
@@ -229,7 +229,7 @@ def _hub_process(table: BusTable) -> Iterator[BusTable]:
 
 
 def run_hub(channel: str) -> None:
-    """Body of the hub's process: says where it listens, and ends when its parent does."""
+    """Body of the hub's process: reports the address it listens on, and ends with its parent."""
     hub, parent = Hub(channel), os.getppid()
     print(hub.channel, flush=True)
     with real_time(), steady_interpreter():
@@ -241,7 +241,7 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
     """The drives in a process of their own; yields the bus to find them on.
 
     Raises:
-        InputError: if they do not start; with what they said.
+        InputError: if they do not start; includes their output.
     """
     with tempfile.TemporaryDirectory(prefix="rfdropo_") as folder:
         ready, errors = Path(folder) / "ready", Path(folder) / "errors"

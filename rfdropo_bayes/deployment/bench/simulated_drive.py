@@ -1,6 +1,6 @@
 """The power section of a CiA 402 drive in software: states, set-points, motion, following error of one axis.
 
-What it says and hears on the bus is the `SimulatedNode`'s, which may have several of them.
+The communication on the bus belongs to `SimulatedNode`, which may have several axes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LAG = 0.004  # [s]: time constant of a tuned position loop of 40 Hz
 
 
 class Dictionary(Protocol):
-    """What an axis needs of its node."""
+    """Access of an axis to the object dictionary of its node."""
 
     def value(self, index: int, subindex: int = 0) -> int:
         """A setting in the object dictionary."""
@@ -51,7 +51,7 @@ class SimulatedDrive:
         self.torque = 0.0  # [per mille], set from outside
 
     def power_on(self, now: float) -> None:
-        """Begin, at rest where it stands."""
+        """Begin at rest, at the present position."""
         self.state, self.controlword, self.error_code = DriveState.SWITCH_ON_DISABLED, 0, 0
         self.velocity = 0.0
         self.target = self.demand = round(self.position)
@@ -106,7 +106,7 @@ class SimulatedDrive:
         self._node.emergency(code, register=0x21)
 
     def connection_lost(self, code: int) -> None:
-        """What object 0x6007 says: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
+        """Apply the reaction of object 0x6007: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
         self.error_code = int(code) or self.error_code
         if not self.state.powered:
             return
@@ -159,7 +159,7 @@ class SimulatedDrive:
         return min(max(wanted, -largest), largest)
 
     def ahead(self, duration: float) -> float:
-        """Counts where it will stand after this time, if no set-point comes before."""
+        """Position [counts] after ``duration`` if no set-point arrives before."""
         following = self.state is DriveState.OPERATION_ENABLED
         return self.position + (self._step(duration) if following else 0.0)
 
@@ -170,7 +170,7 @@ class SimulatedDrive:
         return float(self.value(Object.INTERPOLATION_TIME, 1) * 10.0**exponent)
 
     counts_per_turn = 2048.0
-    """Of the encoder, per turn of the motor; the speed limit 0x6080 is in turns."""
+    """Encoder counts per turn of the motor; the speed limit 0x6080 is in turns."""
 
     def _slow_down(self, duration: float) -> None:
         unit = told_counts(self.value(Object.ACCELERATION_UNIT), self.counts_per_turn) or 1.0

@@ -25,7 +25,7 @@ from rfdropo_bayes.deployment.sheets import data_sheet
 
 
 class SimulatedFault(IntEnum):
-    """What can be asked of object 0x2F00; 0 mends everything but a crash."""
+    """Faults requested through object 0x2F00; 0 clears every fault except a crash."""
 
     NONE = 0
     NO_TPDO = 1
@@ -61,10 +61,10 @@ class SimulatedNode:
     """One node.
 
     Args:
-        number: of the node.
+        number: number of the node.
         send: called with identifier and data of every frame it sends.
         positions: counts of each axis at power-on.
-        eds: electronic data sheet; another one stands for a drive of another kind.
+        eds: electronic data sheet; another sheet simulates a drive of another kind.
         values: values of the dictionary other than the data sheet's, {(index, subindex): value}.
     """
 
@@ -88,7 +88,8 @@ class SimulatedNode:
     def _power_on(self, now: float) -> None:
         self.local = StrictNode(self.number, data_sheet(self._eds, self.number, len(self.drives)))
         self.local.sdo.network = _Sender(self._send)  # type: ignore[assignment]
-        self.local._write_callbacks.clear()  # LocalNode's own heartbeat runs in a thread that one send error ends
+        # LocalNode's own heartbeat runs in a thread that ends at the first send error
+        self.local._write_callbacks.clear()
         self.local.add_write_callback(self._check_write)
         self.local.add_read_callback(self._read)
         for (index, subindex), value in self._values.items():
@@ -101,11 +102,11 @@ class SimulatedNode:
         self.fault = SimulatedFault.NONE
         self._settings: dict[tuple[int, int], int] = {}
         self._pending: dict[int, bytes] = {}
-        self._heard: float | None = None  # consumer heartbeat: guarded from the first one on
-        self._last_sync = math.inf  # guarded from the first one on
+        self._heard: float | None = None  # consumer heartbeat: guarded from the first
+        self._last_sync = math.inf  # guarded from the first
         self._next_heartbeat = now
         self._last_status: dict[int, bytes] = {}  # of each TPDO, as sent
-        self._sent: dict[int, tuple[float, bytes]] = {}  # of each TPDO: when, and what
+        self._sent: dict[int, tuple[float, bytes]] = {}  # of each TPDO: time and content
         self._beats = 0
         for drive in self.drives:
             drive.power_on(now)
@@ -329,7 +330,7 @@ class SimulatedNode:
             raise SdoAbortedError(_ABORT_PDO_LENGTH)
 
     def _after_write(self, now: float) -> None:
-        """Act on what an SDO has written: words that the master may send without PDOs, and requests for faults."""
+        """Act on objects written by SDO: control words sent without PDOs, and requests for faults."""
         store = self.local.data_store
         for drive in self.drives:
             word, target = (of_axis(index, drive.axis) for index in (Object.CONTROLWORD, Object.TARGET_POSITION))
@@ -356,7 +357,7 @@ class SimulatedNode:
     # Guards
 
     def _connection_lost(self, code: int, now: float) -> None:
-        """What object 0x1029 says of the node, and 0x6007 of each axis."""
+        """Apply the reactions of object 0x1029 to the node, and of 0x6007 to each axis."""
         if code:
             self.emergency(code, register=0x11)
             behaviour = self.value(Object.ERROR_BEHAVIOUR, 1) if self.nmt is NmtState.OPERATIONAL else 1
@@ -394,7 +395,7 @@ _ABSENT: dict[tuple[int, int], int] = {
     (Object.INTERPOLATION_TIME, 2): 0,
     (Object.ACCELERATION_UNIT, 0): 0,
 }
-"""What a drive does whose data sheet lacks an object: no guard, or its maker's own value."""
+"""Default of each object that a data sheet lacks: no guard, or the maker's own value."""
 
 
 class _Sender:

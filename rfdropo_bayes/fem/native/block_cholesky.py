@@ -52,8 +52,9 @@ class BlockPattern(NamedTuple):
 
 
 def elimination_order(adjacency: sparse.csr_matrix) -> Int[np.ndarray, " n"]:
-    """Order that keeps the fill small: minimum degree, then a postorder, which keeps what is used together close in
-    memory."""
+    """Order that keeps the fill small: minimum degree, then a postorder, which keeps related entries close in
+    memory.
+    """
     count = adjacency.shape[0]
     degree = np.asarray(np.abs(adjacency).sum(axis=1)).ravel()
     dominant = (sparse.diags(degree + 1.0) - adjacency).tocsc()
@@ -298,7 +299,8 @@ def extend_border(pattern, pivot, lower, rows, panels, reached, count, token):
 @kernel
 def condense_rows(pattern, target, rows, panels, others, other_panels, own, reached, count, token):
     """``target`` = products of `extend_border`'s rows and others, in tiles by columns: the same rows if ``own``, else
-    those of the factor's border."""
+    the rows of the factor's border.
+    """
     zero = fill(0.0, target, token)
     for tile in range(panels * other_panels):
         i, j = tile // other_panels, tile % other_panels

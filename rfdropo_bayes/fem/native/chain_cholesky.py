@@ -1,13 +1,13 @@
 """Cholesky factorisation of bordered block-tridiagonal matrices, many side by side in SIMD lanes.
 
-The stations of a rod, each of two tiles, are eliminated one after the other from the tip to the base. Three arrays
-hold, for every station, the pivot block, the coupling to the next station and the border: rows below the matrix, one
-for each right-hand side. All are cut into 3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block are
-panel p, element (3 p + r, c) at ``(p * SIZE + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all
-of the work. The factorisation turns a border row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
+The stations of a rod, each of two tiles, are eliminated in sequence from the tip to the base. Three arrays hold, for
+every station, the pivot block, the coupling to the next station and the border: rows below the matrix, one for each
+right-hand side. All are cut into 3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block are panel p,
+element (3 p + r, c) at ``(p * SIZE + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all of the
+work. The factorisation turns a border row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
 
 A border row is zero beyond the station that its cable reaches. Rows come in the order of their reach, so that the
-panels which are not zero at a station are its first ``active`` ones.
+panels which are not zero at a station are its first ``active`` panels.
 """
 
 from __future__ import annotations

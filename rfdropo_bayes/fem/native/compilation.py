@@ -32,7 +32,7 @@ def _new_library(state: Any) -> CPUCodeLibrary:
 
 
 def _link_all(library: CPUCodeLibrary) -> None:
-    """Link what a library calls, directly or not, each once: what was deferred has linked nothing itself."""
+    """Link all direct and indirect callees of a library once: a deferred library has linked nothing itself."""
     called: dict[CPUCodeLibrary, None] = {}
     waiting = list(library._linking_libraries)
     while waiting:
@@ -49,7 +49,7 @@ def _linked_module(library: CPUCodeLibrary) -> Any:
     """The module of a deferred library for one that Numba compiles its own way, which links its direct callees only."""
     if library._linking_libraries:
         _link_all(library)
-        library._shared_module = None  # of what was there before
+        library._shared_module = None  # of earlier libraries
     return CPUCodeLibrary._get_module_for_linking(library)
 
 

@@ -1,8 +1,8 @@
-"""Which compilers the kernels of rods take: ours, or Numba's own where ours do not fit the Numba at hand.
+"""Which compilers the kernels of rods take: ours, or Numba's own if ours do not fit the installed Numba.
 
 Ours (`compilation`) rest on private parts of Numba. They are used without asking with the versions that they are tested
 with. With another version a small program is compiled and run first; if that fails in any way, Numba compiles the
-kernels its own way, which takes longer to compile and gives the same numbers. docs/native.md says more.
+kernels its own way, which takes longer to compile and gives the same numbers. See docs/native.md.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ def chosen_compilers(wanted: str | None, version: str) -> Compilers:
 
     Args:
         wanted: "ours", "numba", or None to choose by the version of Numba.
-        version: of Numba.
+        version: version of Numba.
 
     Raises:
-        InputError: another word, or "ours" where they do not fit.
+        InputError: another word, or "ours" if they do not fit.
     """
     if wanted not in (None, "", OURS, NUMBA):
         raise InputError(f"{wanted!r} is no compiler", where=VARIABLE, remedy=f"use {OURS} or {NUMBA}, or unset it")

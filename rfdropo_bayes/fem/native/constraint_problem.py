@@ -1,10 +1,10 @@
 """Cables, slip and contacts of a step in every lane: the convex problem of ``fem.constraints``, by Newton's method.
 
-G, the derivative of what the constraints answer, is L S L' with signs S and columns L: one for a cable or a run of
-guides, three for a contact. With r = L a + l the solution of (I + G W) d = r is d = L y + l, where
-(S + L' W L) y = S a - L' W l: symmetric, as small as what acts, and free of differences of the large numbers 1 / R. A
-lane whose impulses are found keeps them while others go on, and rows that exert nothing add exact zeros: a lane's
-result does not depend on its neighbours.
+G, the derivative of the constraints' impulses, is L S L' with signs S and columns L: one for a cable or a run of
+guides, three for a contact. With r = L a + l the solution of (I + G W) d = r is d = L y + l, with (S + L' W L) y = S a
+- L' W l: symmetric, no larger than the active part, and free of differences of the large numbers 1 / R. A converged
+lane keeps its impulses while others continue, and inactive rows add exact zeros: a lane's result does not depend on its
+neighbours.
 """
 
 from __future__ import annotations
@@ -43,22 +43,24 @@ SETTLED = {"float64": 1e-11, "float32": 1e-5}
 """Error of a velocity, relative to the largest that a row has or its impulse makes, that ends a lane's iterations. In
 single precision 43 of 600 prior draws of the demo never came to 3e-6; all come to 1e-5."""
 SOFTNESS = {"float64": CABLE_SOFTNESS, "float32": 1e-5}
-"""Of cables, relative to W. At less, rounding hides which sign the impulse of a taut cable has, and a push is taken for
-found: 52 of 192 rollouts of nearly incompressible trunks then err by over 1e-5 m at 1e-6, 9 at 1e-5."""
+"""Softness of cables, relative to W. At smaller values rounding hides which sign the impulse of a taut cable has, and a
+push is accepted as solved: 52 of 192 rollouts of nearly incompressible trunks then err by over 1e-5 m at 1e-6, 9 at
+1e-5.
+"""
 ROUNDING = 0.03
 """Share of that error up to which the velocities are rounded."""
 RATIO = TANGENT_SOFTNESS / NORMAL_SOFTNESS
 
 
 class ConstraintProblem(NamedTuple):
-    """Constraints of a step in one lane block; rows are those of cables, of runs of guides, of contacts (three each).
+    """Constraints of a step in one lane block; rows belong to cables, runs of guides, and contacts (three each).
 
     Lines are the rows of cables and runs. The last axis is the lane.
     """
 
     matrix: Float[np.ndarray, "rows2 lanes"]  # condensed compliance W, row-major [1/kg]
     free: Float[np.ndarray, "rows lanes"]  # velocities without impulses [m/s]
-    impulse: Float[np.ndarray, "rows lanes"]  # [N s]; where the iterations start, and what they find
+    impulse: Float[np.ndarray, "rows lanes"]  # [N s]; start of the iterations, and their result
     before: Float[np.ndarray, "rows lanes"]  # impulses before a correction
     velocity: Float[np.ndarray, "rows lanes"]
     aim: Float[np.ndarray, "rows lanes"]  # change that the constraints ask of the impulses, in the columns L
@@ -131,7 +133,7 @@ def soften(p, cables, runs, contacts, time_step, softness, token):
 
 @kernel
 def _line(p, i, cables, velocity, token):
-    """What a line answers to a velocity."""
+    """Impulse of a line at a velocity."""
     zero, firm = fill(0.0, p.free, token), load(p.firmness, i, token)
     if i < cables:
         return where_greater(zero, velocity, -firm * velocity, zero)
@@ -143,8 +145,9 @@ def _line(p, i, cables, velocity, token):
 
 @kernel
 def _contact_state(p, c, u, v, w, token):
-    """Of a contact at a relative velocity: impulses if it sticks, their tangential size, the normal impulse if it
-    slides, and friction."""
+    """Quantities of a contact at a relative velocity: impulses if it sticks, their tangential size, the normal impulse
+    if it slides, and friction.
+    """
     friction, one = load(p.friction, 0, token), fill(1.0, p.free, token)
     y = (-load(p.opening, c, token) - u) * load(p.normal, c, token)
     firm = load(p.tangent, c, token)
@@ -157,7 +160,7 @@ def _contact_state(p, c, u, v, w, token):
 
 @kernel
 def _contact(p, c, u, v, w, token):
-    """What a contact answers to a relative velocity: normal impulse and two tangential ones."""
+    """Impulses of a contact at a relative velocity: one normal and two tangential."""
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
     y, a, b, size, push, friction = _contact_state(p, c, u, v, w, token)
     push = where_greater(push, zero, push, zero)
@@ -169,7 +172,7 @@ def _contact(p, c, u, v, w, token):
 
 @kernel
 def _linearise_contact(p, c, lines, token):
-    """Columns L of a contact at its velocity, and what its impulses are to change by."""
+    """Columns L of a contact at its velocity, and the required change of its impulses."""
     zero, one, i = fill(0.0, p.free, token), fill(1.0, p.free, token), lines + 3 * c
     u, v, w = load3(p.velocity, i, token)
     y, a, b, size, push, friction = _contact_state(p, c, u, v, w, token)
@@ -197,7 +200,7 @@ def _linearise_contact(p, c, lines, token):
     x = where_greater(sticks, zero, y, push) - load(p.impulse, i, token)
     y = where_greater(sticks, zero, a, slide * f) - load(p.impulse, i + 1, token)
     z = where_greater(sticks, zero, b, slide * g) - load(p.impulse, i + 2, token)
-    # The columns are orthogonal: what they reach of the change, and what is left.
+    # The columns are orthogonal: their part of the change, and the rest.
     square = fma(l00, l00, fma(l10, l10, l20 * l20))
     r0 = fma(l00, x, fma(l10, y, l20 * z)) / where_greater(square, zero, square, one)
     square = fma(l11, l11, l21 * l21)
@@ -212,8 +215,9 @@ def _linearise_contact(p, c, lines, token):
 
 @kernel
 def _linearise_line(p, i, cables, first, rounding, token):
-    """As `_linearise_contact`, of a line; cables that pulled still pull in the first iteration, and where
-    rounding hides their velocity."""
+    """As `_linearise_contact`, of a line; cables that pulled still pull in the first iteration, and also if rounding
+    hides their velocity.
+    """
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
     velocity, impulse, firm = load(p.velocity, i, token), load(p.impulse, i, token), load(p.firmness, i, token)
     root = square_root(magnitude(firm, zero))
@@ -238,8 +242,9 @@ def _linearise_line(p, i, cables, first, rounding, token):
 
 @kernel
 def _linearise(p, cables, lines, contacts, first, rounding, token):
-    """Columns L at ``velocity``, ``aim`` and ``left``: what the impulses are to change by, in L and beside it. Returns
-    how many columns act."""
+    """Columns L at ``velocity``, ``aim`` and ``left``: the required change of the impulses, in L and beside it. Returns
+    the number of active columns.
+    """
     zero, n = fill(0.0, p.free, token), lines + 3 * contacts
     for i in range(lines):
         _linearise_line(p, i, cables, first, rounding, token)
@@ -259,7 +264,7 @@ def _linearise(p, cables, lines, contacts, first, rounding, token):
 
 @kernel
 def _first_root(i, lines):
-    """Where the entries of column i begin."""
+    """Index of the first entry of column i."""
     if i < lines:
         return i
     at = (i - lines) % 3
@@ -380,7 +385,7 @@ def _slope(p, cables, lines, contacts, share, token):
 
 @kernel
 def _firmness(p, i, lines, token):
-    """Derivative of what a row answers by its own velocity."""
+    """Derivative of a row's impulse by its own velocity."""
     if i < lines:
         root = load(p.root, i, token)
         return root * root
@@ -395,7 +400,7 @@ def _firmness(p, i, lines, token):
 
 @kernel
 def _residual(p, lines, n, token):
-    """Largest error of a velocity: of what acts, over the norm of its column L, and of what is to be let go."""
+    """Largest error of a velocity: of active columns, over the norm of their column L, and of columns to release."""
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
     largest = zero
     for i in range(n):
@@ -411,12 +416,12 @@ def _residual(p, lines, n, token):
 
 @kernel
 def _doubt(p, lines, n, rounding, settled, each, token):
-    """Slope along the change that rounded velocities would make: all of them by the ``rounding`` of the largest one, or
-    ``each`` by that of its own size.
+    """Slope along the change that rounded velocities would make: all by the ``rounding`` of the largest velocity, or
+    ``each`` by the rounding of its own size.
 
-    Cables that hang loose at 3 m/s say nothing of a cube at rest, whose contacts go from sticking to sliding within
-    1 um/s: in single precision 19 of 512 prior draws of TrunkPush come to no end in steps of SDIRK2 with the largest, 4
-    with each. With the largest it is 3 in implicit Euler, on whose digits recordings and policies rest.
+    Loose cables at 3 m/s are no scale for a cube at rest, whose contacts go from sticking to sliding within 1 um/s: in
+    single precision 19 of 512 prior draws of TrunkPush do not converge in steps of SDIRK2 with the largest, 4 with
+    each. With the largest it is 3 in implicit Euler, on whose digits recordings and policies rest.
     """
     zero, total = fill(0.0, p.free, token), fill(0.0, p.free, token)
     for i in range(n):
@@ -432,7 +437,7 @@ def _doubt(p, lines, n, rounding, settled, each, token):
 
 @kernel
 def _search_share(p, cables, lines, contacts, going, doubt, token):
-    """All of the change, or where its slope vanishes before; slopes up to ``doubt`` are rounding."""
+    """The share of the change at which its slope vanishes, at most 1; slopes up to ``doubt`` are rounding."""
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
     beyond = where_greater(going, zero, _slope(p, cables, lines, contacts, one, token), zero)
     if not any_greater(beyond, doubt):
@@ -447,8 +452,9 @@ def _search_share(p, cables, lines, contacts, going, doubt, token):
 
 @kernel
 def solve_problem(p, cables, runs, contacts, settled, each, token):
-    """Find ``impulse`` from where it is, and the ``velocity`` that follows; ``going`` is left at 1 where it was not
-    found. ``each``: see `_doubt`."""
+    """Solve for ``impulse`` from its present value, and for the ``velocity`` that follows; ``going`` stays 1 without
+    convergence. ``each``: see `_doubt`.
+    """
     zero, lines = fill(0.0, p.free, token), cables + runs
     n, going = lines + 3 * contacts, fill(1.0, p.free, token)
     for iteration in range(ITERATIONS):

@@ -1,7 +1,7 @@
 """The contacts of a step in SIMD lanes: their gaps, frames and rows, as ``fem.pushing.find_contacts`` finds them.
 
-Lanes share the pairs that they look at. A pair is a candidate where it is near in any lane, and a contact where any
-lane has chosen it; in the other lanes it stays open.
+Lanes share the examined pairs. A pair is a candidate if it is near in any lane, and a contact if any lane has chosen
+it; it stays open in the other lanes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ALARM = 0.005
 EAGER = 0.02
 """[m/s] A candidate is a contact from the start if it would open more slowly than this; it saves solves, no more."""
 HALF_DIAGONAL = 0.5 * math.sqrt(3.0)
-"""Of a cube of side one."""
+"""Half the diagonal of a unit cube."""
 
 
 @kernel
@@ -107,7 +107,7 @@ def _length(x, y, z):
 
 @kernel
 def _within(gap, reach, token):
-    """The gap, or out of all reach where it is."""
+    """The gap, or a gap out of reach if it exceeds ``reach``."""
     return where_greater(reach, gap, gap, fill(APART, gap, token))
 
 
@@ -239,7 +239,7 @@ def kind_of(touch, slot):
 
 @kernel
 def trunk_velocity(scene, touch, slot, kind, field, token):
-    """What a velocity field of the body adds to a candidate's relative velocity."""
+    """Contribution of a velocity field of the body to a candidate's relative velocity."""
     zero = fill(0.0, touch.cube, token)
     u, v, w = zero, zero, zero
     if kind == 0:
@@ -255,7 +255,7 @@ def trunk_velocity(scene, touch, slot, kind, field, token):
 
 @kernel
 def cube_rate(touch, slot, kind, r, twist, first, token):
-    """What the cube's twist, at rows from ``first`` on, adds to a candidate's relative velocity along row r."""
+    """Contribution of the cube's twist, at rows from ``first`` on, to a candidate's relative velocity along row r."""
     a, b, c, d, e, f = cube_row(touch, slot, r, kind, token)
     x, y, z = load3(twist, first, token)
     u, v, w = load3(twist, first + 3, token)
@@ -264,7 +264,7 @@ def cube_rate(touch, slot, kind, r, twist, first, token):
 
 @kernel
 def add_cube_velocity(touch, slot, kind, u, v, w, twist, first, token):
-    """A candidate's relative velocity with what the cube's twist, at rows from ``first`` on, adds to it."""
+    """A candidate's relative velocity including the cube's twist, at rows from ``first`` on."""
     u = u + cube_rate(touch, slot, kind, 0, twist, first, token)
     v = v + cube_rate(touch, slot, kind, 1, twist, first, token)
     return u, v, w + cube_rate(touch, slot, kind, 2, twist, first, token)
@@ -335,7 +335,7 @@ def choose_closing(touch, gravity, drag, stage, wide, narrow, going, token):
         if stage.predicted:  # the velocity of the start has closed the gap already
             store(touch.gap, slot, fnma(u * wide, time_step, load(touch.gap, slot, token)))
         closing = where_greater(_closing(touch, slot, u, v, w, time_step, narrow, token), -EAGER * one, one, zero)
-        # What touched before may hold on by its friction.
+        # A former contact may hold on by its friction.
         x, y, z = load3(touch.memory, 3 * touch.pair[slot], token)
         closing = where_greater(_dot(x, y, z, x, y, z), zero, one, closing)
         store(touch.chosen, slot, _near(touch, slot, closing, token))

@@ -1,4 +1,4 @@
-"""What the kernels of a trunk that pushes a cube work on: what can touch, the cubes, and the contacts of a step."""
+"""Data of the kernels of a trunk that pushes a cube: touching bodies, cubes, and contacts of a step."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ MISSED = {"float64": 1e-9, "float32": 1e-5}
 
 
 class ContactScene(NamedTuple):
-    """What can touch; sphere s is bound to rows ``place[k]`` of the velocities, k in ``first[s]:first[s + 1]``; see
-    ``sphere_maps``.
+    """Bodies that can touch; sphere s is bound to rows ``place[k]`` of the velocities, k in ``first[s]:first[s + 1]``;
+    see ``sphere_maps``.
 
-    The centre of a mesh's sphere is bound to those before ``within[s]`` only.
+    The centre of a mesh's sphere is bound only to entries before ``within[s]``.
     """
 
     first: Int[np.ndarray, " spheres_1"]
@@ -48,7 +48,7 @@ class Cubes(NamedTuple):
 
 
 class PushOutput(NamedTuple):
-    """What a batch returns of the cubes; recorded row 0 is the initial state."""
+    """Motion of the cubes of a batch; recorded row 0 is the initial state."""
 
     pose: Float[np.ndarray, "batch records 7"]
 
@@ -57,7 +57,7 @@ class ContactRecords(NamedTuple):
     """Cubes and contacts of one lane block; the last axis is the lane.
 
     A pair is a corner of the cube and the plate, a sphere and the cube, or a sphere and the plate. Pairs that are near
-    each other in any lane are the candidates of a step, ``count`` of each kind; those that any lane has chosen are its
+    each other in any lane are the candidates of a step, ``count`` of each kind; candidates chosen by any lane are its
     contacts.
     """
 
@@ -171,5 +171,5 @@ def cube_rows(
         array = np.asarray(given, dtype=float)
         if array.shape not in ((width,), (1, width), (count, width)):
             raise InputError(f"{name} has shape {array.shape}, expected {(count, width)}", where="cube")
-        rows.append(np.ascontiguousarray(np.broadcast_to(array, (count, width)), dtype=dtype))
+        rows.append(np.array(np.broadcast_to(array, (count, width)), dtype=dtype, order="C"))
     return Cubes(*rows)

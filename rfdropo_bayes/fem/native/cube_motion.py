@@ -22,7 +22,9 @@ def start_cubes(scene, cubes, count, touch, first, token):
 
 @kernel
 def add_cube(touch, p, lines, contacts, time_step, wide, narrow, token):
-    """Add the cube to the problem of a step: W, the velocities without impulses, openings, and where to start."""
+    """Add the cube to the problem of a step: W, the velocities without impulses, openings, and the start of the
+    iterations.
+    """
     zero, one, n = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), lines + 3 * contacts
     light = one / load(touch.values, 0, token)
     gyration = load(touch.values, 2, token)
@@ -105,7 +107,7 @@ def find_impacts(touch, p, lines, contacts, token):
 
 @kernel
 def carry_cube(touch, p, lines, contacts, later, accepted, token):
-    """The change of the cube's twist without impacts, where a later stage carries a share of it on."""
+    """The change of the cube's twist without impacts, a share of which a later stage carries on."""
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     light = fill(1.0, touch.cube, token) / load(touch.values, 0, token)
     gyration = load(touch.values, 2, token)
@@ -167,7 +169,7 @@ def _move_cube(touch, time_step, moved, lane, lanes):
 
 @kernel
 def take_cube_stage(touch, accepted, lost, length, wide, predicted, token):
-    """Move the cube on where the body's stage was taken, else stop it; marks lanes where that leads nowhere."""
+    """Move the cube if the body's stage was accepted, else stop it; marks lanes with a non-finite result."""
     lanes, moved = len(token), 1.0 if predicted else 0.0
     for lane in range(lanes):
         if not (accepted[lane] > 0.0 and _move_cube(touch, length * wide[lane], moved, lane, lanes)):

@@ -18,19 +18,19 @@ from rfdropo_bayes.fem.section_loads import SectionLoads
 
 
 def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:
-    """A function of each number on its own: NumPy's own depend in the last bit on where in an array a number stands."""
+    """A function of each number on its own: NumPy's results depend in the last bit on the index of a number."""
     return np.array([function(float(value)) for value in np.broadcast_to(values, count)])
 
 
 def _decay(time: float, rate: float) -> float:
-    """What a time leaves of the moduli."""
+    """Remaining share of the moduli after a time."""
     return math.exp(-rate * time)
 
 
 def effect_rows(
     effects: BodyEffects, count: int, stages: Sequence[Stage], time_step: float
 ) -> Float[np.ndarray, "batch rows"]:
-    """Numbers of the effects beside the bending of sections, null where there are none."""
+    """Numbers of the effects beside the bending of sections, zero without effects."""
     rows, length = np.zeros((count, at.EFFECTS)), stages[0].length * time_step
     rows[:, at.DECAY : at.LATER_DECAY + 1] = 1.0
     if effects.bending is not None:
@@ -64,7 +64,7 @@ def law_rows(
     shear_modulus: Float[np.ndarray, " batch"],
     scale: Float[np.ndarray, "batch elements"],
 ) -> Float[np.ndarray, "batch element_rows"]:
-    """What the bending law adds to the stiffness of every element over its length; see ``fem.bending_law``."""
+    """Contribution of the bending law to the stiffness of every element over its length; see ``fem.bending_law``."""
     law = effects.bending
     rows = np.zeros((*scale.shape, at.LAW))
     if law is None:
@@ -83,7 +83,7 @@ def law_rows(
 
 
 def effect_flags(effects: BodyEffects) -> Int[np.ndarray, " flags"]:
-    """Which effects a batch has, as far as they are skipped where it has not."""
+    """Flags of a batch's effects, by which absent effects are skipped."""
     flags = np.zeros(at.FLAGS, dtype=np.int64)
     flags[at.BENDING] = effects.bending is not None
     flags[at.BRANCH] = effects.viscoelasticity is not None
@@ -94,11 +94,11 @@ def effect_flags(effects: BodyEffects) -> Int[np.ndarray, " flags"]:
 
 
 def load_rows(loads: SectionLoads | None) -> tuple[Float[np.ndarray, "batch values"], Int[np.ndarray, " places"]]:
-    """What acts on the body as the kernels read it, row by row, and the stations that forces act on."""
+    """Loads on the body in the kernels' layout, row by row, and the stations with forces."""
     if loads is None:
         return np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
     force = np.asarray(loads.force, float)
     batch, rows = force.shape[:2]
     factors = [np.exp(np.asarray(part, float))[..., None] for part in (loads.stiffness, loads.damping)]
     columns = [force.reshape(batch, rows, -1), *factors, np.asarray(loads.gravity, float)]
-    return np.concatenate(columns, axis=-1).reshape(batch, -1), np.asarray(loads.station, dtype=np.int64)
+    return np.concatenate(columns, axis=-1).reshape(batch, -1), np.array(loads.station, dtype=np.int64)

@@ -1,7 +1,7 @@
-"""What compiled kernels are kept under between processes.
+"""Names of compiled kernels in the cache between processes.
 
-Numba's cache of what was compiled looks at one source file only, and fails where a module that an earlier kernel knew
-is gone: each version of a kernel has a cache of its own, named by a digest of all the files that it is made of.
+Numba's cache checks a single source file, and fails if a module of an earlier kernel is gone. Each version of a kernel
+therefore has its own cache, named by a digest of all its source files.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[2]
 OWN = __package__.rpartition(".")[0]
 """The package that holds this folder."""
 KERNELS = b"rfdropo_bayes.fem.native.simd import"
-"""What a module of kernels contains."""
+"""Text that every module of kernels contains."""
 IMPORT = re.compile(rb"^from (\S+) import", re.MULTILINE)
 
 
@@ -40,7 +40,7 @@ def kernel_sources(module: str) -> str:
 
 
 def named_by(sources: str) -> Callable[[Callable], Callable]:
-    """Decorator that puts a digest of sources into a function's name, and so into that of its cache."""
+    """Decorator that puts a digest of sources into a function's name, and so into the name of its cache."""
 
     def rename(function: Callable) -> Callable:
         function.__qualname__ += f"_{sources[:16]}"

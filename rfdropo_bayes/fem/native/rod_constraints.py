@@ -1,6 +1,6 @@
 """A stage of a rod in SIMD lanes with everything that holds it: cables, slip at their guides, and contacts.
 
-Slip and contacts are further border rows of the factor that the step has already. What is None is not there.
+Slip and contacts are further border rows of the factor that the step has already. None stands for an absent part.
 """
 
 from __future__ import annotations
@@ -57,12 +57,13 @@ class Rows(NamedTuple):
 
     border: Float[np.ndarray, "values lanes"]
     own: Float[np.ndarray, "tiles lanes"]  # minus their condensed products
-    across: Float[np.ndarray, "tiles lanes"]  # and those with the engine's border
+    across: Float[np.ndarray, "tiles lanes"]  # and products with the engine's border
 
 
 def row_storage(station_values: int, panels: int, others: int, lanes: int, dtype: type) -> Rows:
-    """Zeroed, aligned storage of one lane block: ``panels`` beside ``others`` of the engine, each with so many values
-    over all stations."""
+    """Zeroed, aligned storage of one lane block: ``panels`` beside ``others`` of the engine, each with
+    ``station_values`` values over all stations.
+    """
     sizes = 3 * station_values * panels, 9 * panels**2, 9 * panels * others
     return Rows(*(aligned_zeros((max(size, 1), lanes), dtype) for size in sizes))
 
@@ -92,7 +93,9 @@ def _top_station(scene, touch, contacts):
 
 @kernel
 def _gather_contacts(scene, touch, rows, p, lines, contacts, first, panels, token):
-    """Border rows of the contacts from panel ``first`` on, and what the body's velocity adds to the problem."""
+    """Border rows of the contacts from panel ``first`` on, and the contribution of the body's velocity to the
+    problem.
+    """
     for c in range(contacts):
         slot, i = touch.contact[c], lines + 3 * c
         for r in range(3):
@@ -174,7 +177,7 @@ def hold(
 
 @kernel
 def _add_rows(tables, rows, work, p, panels, slips, corners, top, token):
-    """Add the impulses of the extra rows to what the back substitution starts from."""
+    """Add the impulses of the extra rows to the start of the back substitution."""
     cables = tables.cables
     for station in range(tables.held, top + 1):
         for c in range(SIZE):
@@ -207,7 +210,7 @@ def _add_forces(scene, touch, impulses, lines, contacts, accepted, field, token)
 
 @kernel
 def _carry_contacts(tables, scene, touch, work, p, lines, contacts, later, token):
-    """What the next stage goes on with of what contacts did: nothing of their impacts."""
+    """The contacts' change that the next stage carries on, without impacts."""
     find_impacts(touch, p, lines, contacts, token)
     carry_cube(touch, p, lines, contacts, later, work.accepted, token)
     if later > 0.0:

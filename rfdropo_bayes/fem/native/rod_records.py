@@ -37,7 +37,7 @@ ELEMENT = HELD + 21
 class RodSamples(NamedTuple):
     """Rollout parameters of one lane block; the last axis is the lane."""
 
-    moduli: Float[np.ndarray, "2 lanes"]  # of Young and of shear [Pa]
+    moduli: Float[np.ndarray, "3 lanes"]  # of Young, of shear, and of Young in tension [Pa]
     density: Float[np.ndarray, "1 lanes"]
     scale: Float[np.ndarray, "elements lanes"]  # of the stiffness
     point_mass: Float[np.ndarray, "stations lanes"]

@@ -37,7 +37,7 @@ class Batch(NamedTuple):
     """Parameters and commands of a batch in the precision of the kernels, one row a rollout; commands may be one
     row for all."""
 
-    moduli: Float[np.ndarray, "batch 2"]
+    moduli: Float[np.ndarray, "batch 3"]
     density: Float[np.ndarray, "batch 1"]
     damping: Float[np.ndarray, "batch 2"]
     gravity: Float[np.ndarray, "batch 3"]
@@ -98,7 +98,7 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
     samples = rows(
-        moduli=2, density=1, scale=elements, point_mass=stations, section=SECTION * elements, gravity=3, damping=2,
+        moduli=3, density=1, scale=elements, point_mass=stations, section=SECTION * elements, gravity=3, damping=2,
         law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
     state = dict.fromkeys(
@@ -122,11 +122,11 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
 @kernel
 def _prepare(tables, samples, token):
     """Stiffness of the sections of a block's rollouts."""
-    young, shear = load(samples.moduli, 0, token), load(samples.moduli, 1, token)
+    young, shear, axial = load(samples.moduli, 0, token), load(samples.moduli, 1, token), load(samples.moduli, 2, token)
     for element in range(tables.stations - 1):
         scale, e = load(samples.scale, element, token), SECTION * element
         for i in range(SECTION):
-            modulus = scale * (shear if i == 0 or i == SECTION - 1 else young)
+            modulus = scale * (shear if i == 0 or i == SECTION - 1 else (axial if i == 1 else young))
             store(samples.section, e + i, modulus * tables.area[e + i])
 
 
@@ -134,7 +134,7 @@ def _prepare(tables, samples, token):
 def start_rollouts(tables, batch, samples, work, first, token):
     """Parameters of a block's rollouts; at rest, without tension."""
     count, values, nothing = batch.count, SIZE * tables.stations, fill(0.0, work.frame, token)
-    fill_lanes(batch.moduli, 2, 0, 2, first, count, samples.moduli, token)
+    fill_lanes(batch.moduli, 3, 0, 3, first, count, samples.moduli, token)
     fill_lanes(batch.density, 1, 0, 1, first, count, samples.density, token)
     fill_lanes(batch.damping, 2, 0, 2, first, count, samples.damping, token)
     fill_lanes(batch.gravity, 3, 0, 3, first, count, samples.gravity, token)

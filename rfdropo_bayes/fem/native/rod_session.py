@@ -1,4 +1,4 @@
-"""Sessions of a rod: lanes that keep their state between calls, so that a body goes on where it stood.
+"""Sessions of a rod: lanes that keep their state between calls, so that a body continues from its state.
 
 A session runs the kernel of whole rollouts, on blocks of lanes whose parameters and state are its own; scratch belongs
 to the threads. Steps taken in several calls give the same bits as in one.
@@ -23,6 +23,7 @@ from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_engine import NativeRod, Records, Run
 from rfdropo_bayes.fem.native.rod_records import RodSamples
+from rfdropo_bayes.fem.native.rod_tables import as_kernel_array
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads
@@ -39,13 +40,13 @@ MIXED = ("change", "went", "older", "earlier")
 GIVEN = ("moduli", "density", "damping", "gravity", "scale", "point_mass", "law", "effects", "start", "loads")
 """Fields of a batch that an initial state depends on."""
 PITCHED = ("start", "loads")
-"""Those of them of which one row may serve all."""
+"""Fields of which one row may serve all lanes."""
 REMEMBERED = 2**26
 """Most memory for equilibria that were found before [bytes]."""
 
 
 class _Place(NamedTuple):
-    """Where a field of a record lies in a lane's memory."""
+    """Location of a record's field in a lane's memory."""
 
     record: str
     name: str
@@ -54,7 +55,7 @@ class _Place(NamedTuple):
 
 
 GRAVITY = 3
-"""Last values of a lane's memory: gravity without what is added to it from step to step [m/s2]."""
+"""Last values of a lane's memory: gravity without the changes from step to step [m/s2]."""
 
 
 def _places(records: Records, still: bool) -> list[_Place]:
@@ -145,12 +146,12 @@ class RodSession:
         stride: int = 1,
         loads: SectionLoads | None = None,
     ) -> Motion:
-        """Take steps to the cable displacements [m] at their ends, under what acts on the body in each; recorded before
-        the first, and every ``stride``.
+        """Take steps to the cable displacements [m] at their ends, under the loads of each step; recorded before the
+        first, and every ``stride``.
 
         Raises:
-            InputError: a session that was not started, displacements of another shape, or loads where its lanes started
-                without, or the other way round.
+            InputError: a session that was not started, displacements of another shape, or loads if and only if its
+                lanes started without loads.
         """
         engine = self.engine
         if self._run is None:
@@ -158,10 +159,12 @@ class RodSession:
         if displacement.ndim != 3 or displacement.shape[::2] != (self.count, engine.tables.cables):
             expected = f"({self.count}, steps, {engine.tables.cables})"
             raise InputError(f"displacement has shape {displacement.shape}, expected {expected}", where="advance")
-        moves = np.ascontiguousarray(displacement, dtype=engine.dtype).reshape(self.count, -1)
+        moves = as_kernel_array(np.asarray(displacement, float).reshape(self.count, -1), engine.dtype.type)
         batch = self._run.batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
         if bool(batch.present[LOADED]) != (loads is not None):
-            raise InputError("loads in some calls only", where="advance", remedy="give them to reset, too")
+            raise InputError(
+                "loads must be given in every call of a session", where="advance", remedy="also give them to reset"
+            )
         if loads is not None:
             rows = load_rows(loads)[0].astype(engine.dtype)
             acting = np.concatenate([rows[:, : rows.shape[1] // displacement.shape[1]], rows], axis=1)
@@ -181,7 +184,7 @@ class RodSession:
         return self.memory.transpose(0, 2, 1).reshape(-1, self.memory.shape[1])[: self.count].copy()
 
     def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """Set lanes to rows of what `save` returned, of this or another session of the same body and effects.
+        """Set lanes to rows of the result of `save`, of this or another session of the same body and effects.
 
         Raises:
             InputError: a session that was not started, or a state of another body or precision.
@@ -229,7 +232,7 @@ class RodSession:
         return _SessionLane(state, run.motion._replace(pose=None))
 
     def _with_cubes(self, lanes: _SessionLane, cubes: Cubes) -> _SessionLane:
-        """Lanes with cubes at the start: those of a body that was settled before may have been others."""
+        """Lanes with cubes at the start: a settled body in the cache may have had other cubes."""
         fields = {"cube": cubes.state, "values": cubes.values, "memory": 0.0}
         for place in self._places:
             if place.record == "touch":
@@ -237,7 +240,7 @@ class RodSession:
         return lanes
 
     def _remember(self, known: OrderedDict[bytes, _SessionLane], found: dict[bytes, _SessionLane]) -> None:
-        """Keep what was found last, as far as the memory set aside for it goes."""
+        """Cache the latest results within the reserved memory."""
         for key, lane in found.items():
             known[key] = lane
             known.move_to_end(key)
@@ -255,7 +258,7 @@ class RodSession:
             own: dict[str, dict[str, np.ndarray]] = {place.record: {} for place in self._places}
             for place in self._places:
                 own[place.record][place.name] = self.memory[block, place.first : place.last]
-            # What is present is the same for all blocks, and no lane's own.
+            # Flags of present effects are the same for all blocks and lanes.
             own["samples"]["present"] = self._run.batch.present
             parts = {name: getattr(records, name)._replace(**fields) for name, fields in own.items()}
             self._local.records[block] = records._replace(**parts)
@@ -263,7 +266,7 @@ class RodSession:
 
 
 class _SessionLane(NamedTuple):
-    """State of a lane, or of several, and what it shows of its body."""
+    """State of a lane, or of several, and its recorded motion."""
 
     state: Float[np.ndarray, "*lane values"]
     motion: Motion

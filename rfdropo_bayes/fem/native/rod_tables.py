@@ -180,7 +180,10 @@ def rod_tables(system: Any, points: Any, dtype: type) -> RodTables:
 
 
 def as_kernel_array(value: np.ndarray | float, dtype: type) -> np.ndarray | float:
-    """An array in the precision of the kernels; numbers as they are."""
+    """An array in the precision of the kernels; numbers as they are.
+
+    It can be written to: Numba compiles a second kernel, which takes half a minute, for an array that cannot.
+    """
     if not isinstance(value, np.ndarray):
         return value
-    return np.ascontiguousarray(value, dtype=dtype if value.dtype.kind == "f" else value.dtype)
+    return np.require(value, dtype if value.dtype.kind == "f" else value.dtype, ("C", "W"))

@@ -1,9 +1,8 @@
 """A vector of lanes as a value inside compiled kernels: one lane is one sample, and lanes never mix.
 
 A `Simd` value is an LLVM vector of 32- or 64-bit floats. The arithmetic operators act lane by lane; a plain number met
-on the way fills all lanes. Nothing is reordered or contracted behind the kernel's back: fused multiply-add happens
-where `fma` or `fnma` stands and nowhere else, so that a lane's result depends neither on its neighbours nor on what
-the compiler chose to inline.
+on the way fills all lanes. Nothing is reordered or contracted behind the kernel's back: fused multiply-add happens only
+for `fma` and `fnma`, so that a lane's result depends neither on its neighbours nor on the compiler's inlining.
 
 Kernels keep their data in C-contiguous arrays ``(n, lanes)``, or know their `addresses`, and move rows with `load` and
 `store`. The number of lanes must be known to the compiler: kernels take it as the tuple made by `lane_token`, whose
@@ -48,8 +47,8 @@ inlined = partial(kernel, forceinline=True)
 whole = partial(COMPILERS.whole, nogil=True, cache=True, error_model="numpy")
 """Decorator of the kernel at the top, which Python calls."""
 
-# Numba's own way, each function optimised by itself, for meshes (see `compilation`): parts of a kernel, those that it
-# takes in before and after its types are known, and kernels that are kept between processes.
+# Numba's own way, each function optimised by itself, for meshes (see `compilation`): parts of a kernel, included before
+# and after its types are known, and cached kernels.
 mesh_part = numba.njit(nogil=True, error_model="numpy")
 mesh_pasted = numba.njit(inline="always")
 mesh_inlined = numba.njit(forceinline=True, error_model="numpy")
@@ -79,8 +78,8 @@ def vector_type(simd: SimdType) -> ir.VectorType:
 
 @cache
 def vector_width() -> int:
-    """Bytes of the widest vector register of the processor that Numba compiles for: this machine's, or the one that
-    ``NUMBA_CPU_NAME`` and ``NUMBA_CPU_FEATURES`` name. At least 16, as on any 64-bit machine.
+    """Bytes of the widest vector register of the processor that Numba compiles for: this machine's, or the processor
+    that ``NUMBA_CPU_NAME`` and ``NUMBA_CPU_FEATURES`` name. At least 16, as on any 64-bit machine.
     """
     # A name such as x86-64-v3 has no list of features: LLVM is asked which registers it adds 64 bytes in.
     module = llvm.parse_assembly(
@@ -214,7 +213,7 @@ def fill(typing_context, number, array, token):
 
 
 def _vectors(context, builder, sig, arguments) -> list:
-    """Arguments of which those that are numbers fill all lanes."""
+    """Arguments, with plain numbers broadcast to all lanes."""
     return [
         value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, sig.return_type)
         for value, kind in zip(arguments, sig.args, strict=True)
@@ -301,7 +300,7 @@ def square_root(typing_context, value):
 
 @intrinsic
 def where_greater(typing_context, left, right, first, second):
-    """``first`` in the lanes where left > right, ``second`` elsewhere (and where either is not a number)."""
+    """``first`` in the lanes with left > right, ``second`` elsewhere (also for NaN)."""
     if not all(isinstance(kind, SimdType) for kind in (left, right, first, second)):
         return None
 
@@ -332,5 +331,5 @@ def any_greater(typing_context, left, right):
     return types.boolean(left, right), generate
 
 
-# What Numba loads before it calls its first kernel (0.4 s), with the other imports rather than in the first rollout.
+# Numba loads this before its first kernel (0.4 s): with the other imports rather than in the first rollout.
 cpu_target.target_context.refresh()

@@ -1,4 +1,4 @@
-"""Cable friction in SIMD lanes: what ``fem.cable_friction`` makes of the shape of a body and of a step."""
+"""Cable friction in SIMD lanes: the model of ``fem.cable_friction`` for the shape of a body and for a step."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def start_slip(tables, runs, friction, work, token):
 
 @kernel
 def sum_losses(tables, runs, samples, friction, p, token):
-    """``lost``: what every cable has lost before and at each of its guides."""
+    """``lost``: tension lost by every cable before and at each of its guides."""
     kinds, _ = kinds_present(samples)
     zero, one = fill(0.0, friction.lost, token), fill(1.0, friction.lost, token)
     for g in range(runs.guides):
@@ -179,7 +179,7 @@ def start_row(tables, runs, samples, friction, work, token):
 
 @kernel
 def slide(tables, runs, friction, rows, work, token):
-    """Share of the friction that is mobilised where the body is, as if nothing could slide, into ``trial``."""
+    """Trial share of mobilised friction at the body's state, without sliding, into ``trial``."""
     for i in range(rows):
         r, k = i % runs.count, i // runs.count
         slip, before = fill(0.0, work.course, token), fill(0.0, work.course, token)

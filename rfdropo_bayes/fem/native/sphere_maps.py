@@ -1,9 +1,9 @@
-"""Spheres of a body that pushes a cube, in SIMD lanes: where they are, and how contacts on them move with the body.
+"""Spheres of a body that pushes a cube, in SIMD lanes: their positions, and the motion of contacts on them with the
+body.
 
-A sphere of a mesh follows the affine motion of nodes around it; that of a rod is bound to sections. An entry of a
+A sphere of a mesh follows the affine motion of nodes around it; a sphere of a rod is bound to sections. An entry of a
 sphere is a triple of the body's velocities. Entries of a rod come in pairs, translation and spin of a section.
-``gradient``, of the scene, is None for a rod and ``arm`` for a mesh: what is None is no part of the kernel that is
-compiled.
+``gradient``, of the scene, is None for a rod and ``arm`` for a mesh: the compiled kernel lacks a part that is None.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ def centre_velocity(scene, gradient, arm, touch, sphere, velocity, token):
 
 @kernel
 def _gradient_offset(scene, touch, slot, sphere, position, token):
-    """Where the sphere touches, from its centre in the body at rest: -radius F^-1 n with the deformation gradient F."""
+    """Contact point of the sphere, from its centre in the body at rest: -radius F^-1 n with the deformation gradient
+    F.
+    """
     zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
     a, b, c, d, e, f, g, h, i = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for k in range(scene.first[sphere], scene.first[sphere + 1]):
@@ -76,7 +78,7 @@ def _gradient_offset(scene, touch, slot, sphere, position, token):
 
 @kernel
 def place_offset(scene, gradient, arm, touch, slot, sphere, position, token):
-    """Where the sphere of a candidate touches, from its centre: in the body at rest for a mesh, in space for a rod."""
+    """Contact point of a candidate's sphere, from its centre: in the body at rest for a mesh, in space for a rod."""
     if gradient is not None:
         _gradient_offset(scene, touch, slot, sphere, position, token)
     if arm is not None:

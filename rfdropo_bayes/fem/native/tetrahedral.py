@@ -1,8 +1,8 @@
 """Kernels of a body of corotational tetrahedra in SIMD lanes: frames, forces, and the matrix of a stage.
 
-The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``, with samples in lanes. Nodes are numbered
-in elimination order, held nodes after the free ones. Block storage beyond that of the factor is a dump for blocks of
-held nodes.
+The physics follows ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``, with samples in lanes. Nodes are numbered in
+elimination order, held nodes after the free nodes. Block storage beyond the factor's is a dump for blocks of held
+nodes.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class TetrahedralWork(NamedTuple):
     accepted: Float[np.ndarray, "1 lanes"]
     lost: Float[np.ndarray, "1 lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]
-    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in units of the other stage's
     narrow: Float[np.ndarray, "1 lanes"]  # its inverse
     going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
     axes: Float[np.ndarray, "9 lanes"]

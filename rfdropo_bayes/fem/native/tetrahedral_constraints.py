@@ -1,7 +1,7 @@
 """Cables and contacts of a step of a tetrahedral body in SIMD lanes, between its factorisation and its substitution.
 
-Border row 0 of the factor is the right-hand side, the following ones are -dl/dx of the cables. Contacts are further
-rows. A body without a cube has no scene: what is None is not there.
+Border row 0 of the factor is the right-hand side, the following rows are -dl/dx of the cables. Contacts are further
+rows. A body without a cube has no scene: None stands for an absent part.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ def _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, fre
 
 @kernel
 def _across(pattern, touch, work, rows, p, reached, cables, contacts, free, token):
-    """Products of the contacts' rows with the engine's border; add those with the right-hand side to ``free``."""
+    """Products of the contacts' rows with the engine's border; add the products with the right-hand side to
+    ``free``.
+    """
     corners, others = touch.count[3], pattern.border
     panels = contacts - corners
     condense_rows(pattern, rows.across, rows.border, panels, work.lower, others, False, reached, free, token)
@@ -198,8 +200,9 @@ def _add_impacts(scene, touch, work, p, cables, contacts, free, token):
 
 @kernel
 def end_stage(scene, touch, work, p, cables, contacts, free, schedule, stage, later, token):
-    """Move the cube, and keep what contacts did: for a later stage of the step, which carries a share of it on, and as
-    impulses to start from."""
+    """Move the cube, and store the contacts' impulses: a later stage carries a share of them on and starts its
+    iterations from them.
+    """
     if schedule.count > 1:
         find_impacts(touch, p, cables, contacts, token)
         carry_cube(touch, p, cables, contacts, later, work.accepted, token)
@@ -211,7 +214,7 @@ def end_stage(scene, touch, work, p, cables, contacts, free, schedule, stage, la
 
 @kernel
 def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, stage, schedule, token):
-    """As `hold`, for what a step's solution has left: the change of the impulses since it was found."""
+    """As `hold`, for the residual of a step's solution: the change of the impulses since."""
     n = cables + 3 * contacts
     for i in range(cables):
         store(p.free, i, load(work.slack, i, token))

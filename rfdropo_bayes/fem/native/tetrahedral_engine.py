@@ -41,9 +41,9 @@ class TetrahedralEngine:
 
     Args:
         dtype: ``numpy.float64`` or ``numpy.float32``.
-        threads: lane blocks at a time; results do not depend on it.
-        scene: what the body pushes a cube on; None for a body that touches nothing.
-        integrator: how a step is taken; SOFA's drive limits, which are those of a step, go with "euler" only.
+        threads: number of lane blocks at a time; results do not depend on it.
+        scene: geometry on which the body pushes a cube; None for a body that touches nothing.
+        integrator: how a step is taken; SOFA's drive limits, which apply per step, need "euler".
     """
 
     def __init__(
@@ -197,7 +197,7 @@ def _kernel() -> Callable:
 
 
 def _numbering(body: TetrahedralBody) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
-    """Nodes in elimination order, held ones last, and the place of every node in that order."""
+    """Nodes in elimination order, held nodes last, and the place of every node in that order."""
     free = np.flatnonzero(~body.fixed)
     order = np.concatenate(
         [free[elimination_order(_adjacency(body)[free][:, free].tocsr())], np.flatnonzero(body.fixed)]

@@ -47,9 +47,9 @@ class Cables(NamedTuple):
     node: Int[np.ndarray, "points weights"]
     weight: Float[np.ndarray, "points weights"]
     anchor: Float[np.ndarray, "cables 3"]
-    rest_segment: Float[np.ndarray, " points"]  # from the point before to this one, at rest [m]; 0 for the first
+    rest_segment: Float[np.ndarray, " points"]  # from the previous point to this point, at rest [m]; 0 for the first
     limit: Float[np.ndarray, " cables"]  # largest displacement [m]
-    rate: float  # largest change of the displacement in a step, against the one measured a step before [m]
+    rate: float  # largest change of the displacement in a step, against the displacement measured a step before [m]
 
 
 class TetrahedralSchedule(NamedTuple):
@@ -66,7 +66,7 @@ class TetrahedralSchedule(NamedTuple):
 
 
 class TetrahedralOutput(NamedTuple):
-    """What a lane block records; the last axis is the lane."""
+    """Recorded states of a lane block; the last axis is the lane."""
 
     node: Int[np.ndarray, "points weights"]
     weight: Float[np.ndarray, "points weights"]
@@ -172,7 +172,7 @@ def _keep_border(pattern, work, token):
 
 @mesh_part
 def unbalance(pattern, mesh, samples, work, count, stage, token):
-    """Write what the stage leaves unbalanced to border row 0, and the slack that it leaves the cables."""
+    """Write the residual forces of the stage to border row 0, and the remaining slack of the cables."""
     elastic_forces(mesh, samples, work, stage, token)
     time_step = stage.length * load(work.wide, 0, token)
     drag, size = load(samples.rayleigh_mass, 0, token), 9 * pattern.border
@@ -207,7 +207,7 @@ def _moved(work, i, stage, token):
 
 @mesh_part
 def accept(rest, count, work, schedule, stage, token):
-    """Take the stage; in the lanes where it is lost, stay in place at rest without tension."""
+    """Take the stage; failed lanes stay in place, at rest without tension."""
     one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
     accepted, reach = one, fill(schedule.reach, work.position, token)
     for i in range(work.solution.shape[0]):
@@ -230,7 +230,7 @@ def accept(rest, count, work, schedule, stage, token):
 
 @mesh_part
 def begin_stage(work, stage, token):
-    """Where a stage takes its forces."""
+    """Position at which a stage takes its forces."""
     one = fill(1.0, work.wide, token)
     store(work.wide, 0, one)
     store(work.narrow, 0, one)
@@ -273,7 +273,7 @@ def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, names its cache.
 
     It steps through ``commands`` (steps, cables, lanes) and records after every ``schedule.stride`` steps; ``rest`` are
-    the nodes' coordinates at rest. ``scene``, ``cubes``, ``touch`` and ``poses`` are None where there is no cube.
+    the nodes' coordinates at rest. ``scene``, ``cubes``, ``touch`` and ``poses`` are None without a cube.
     """
 
     @whole

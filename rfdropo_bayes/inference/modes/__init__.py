@@ -1,1 +1,1 @@
-"""Optima of a posterior: climbs, where they start, and the normal approximation around where they end."""
+"""Optima of a posterior: optimisations, their starts, and the normal approximations at their ends."""

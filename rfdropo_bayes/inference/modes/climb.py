@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
+NOISE_GRID = 13  # values of a noise coordinate tried at the start of an optimisation
 AXIS, LONGEST = 0.5, 0.05  # step along an axis of a posterior, in its deviations, and at most in any coordinate
 NOISE_STEP = 1e-2  # of a noise coordinate, along which residuals only change their scale
 ROUNDS = 3  # of differences along axes that get better
@@ -17,7 +17,7 @@ SAME = 0.05  # nats between two normal distributions that are taken for one
 
 @runtime_checkable
 class Climbable(Protocol):
-    """A log posterior with what a climb needs of it."""
+    """A log posterior with the derivatives that an optimisation needs."""
 
     @property
     def noise(self) -> Bool[np.ndarray, " d"]:
@@ -43,31 +43,32 @@ class Climbable(Protocol):
         ...
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Climbable | None:
-        """The same log posterior with differences over one step along and one against each column.
+        """The same log posterior with central differences along each column of ``axes``.
 
-        None where derivatives are exact.
+        None if derivatives are exact.
         """
         ...
 
     @property
     def prior_gradient(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Of the log prior, at one point."""
+        """Gradient of the log prior at one point."""
         ...
 
     @property
     def prior_hessian(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Of the log prior, at one point."""
+        """Hessian of the log prior at one point."""
         ...
 
 
 class LevenbergState(NamedTuple):
-    """Where an optimisation stands.
+    """State of an optimisation.
 
     Attributes:
         position: unconstrained point.
         log_density: log posterior there.
-        damping: Levenberg-Marquardt's, relative to the diagonal of the Hessian.
-        converged: the last step promised less than the tolerance, or little more and delivered less.
+        damping: Levenberg-Marquardt damping, relative to the diagonal of the Hessian.
+        converged: whether the predicted gain of the last step was below the tolerance, or slightly above with a smaller
+            actual gain.
     """
 
     position: Float[np.ndarray, " d"]
@@ -90,8 +91,8 @@ class Laplace(NamedTuple):
         mean: the mode.
         covariance: inverse of minus the Hessian.
         log_density: log posterior, unnormalised, at the mode.
-        information: share of the likelihood in minus the Hessian; None where it is not known.
-        slope: gradient of the log likelihood at the mode, which the prior's cancels; None likewise.
+        information: share of the likelihood in minus the Hessian; None if unknown.
+        slope: gradient of the log likelihood at the mode, cancelled by the prior's gradient; None if unknown.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -113,7 +114,7 @@ def init(target: Climbable, u: Float[np.ndarray, " d"]) -> LevenbergState:
 
 
 def _solved(matrix: Float[np.ndarray, "d d"], right: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """Solution of a linear system, the shortest one where coordinates that do the same leave many."""
+    """Solution of a linear system, the solution of least norm if it is not unique."""
     try:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
@@ -146,8 +147,8 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     best = int(np.argmax(densities))
     gain = float(densities[best] - state.log_density)
     position, density = (tried[best], float(densities[best])) if gain > 0.0 else state[:2]
-    # An engine in single precision promises for ever what it does not deliver. Where six decades of damping gain
-    # nothing, the differences left are those of rounding, or the model is useless here: smaller steps, if any.
+    # The predicted gain of an engine in single precision may never be realised. If six decades of damping gain nothing,
+    # the remaining differences are rounding, or the model is useless here: smaller steps, if any.
     if gain < tolerance:
         stuck = bool(dampings[-1] > 1e8 or promised < 100.0 * tolerance)
         moved = LevenbergState(position, density, state.damping * 1e5, stuck)
@@ -175,9 +176,9 @@ def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: flo
 def maximise(
     target: Climbable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
-    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats; no steps, no search.
+    """Optimise from one start, noise first, until the predicted gain of a step is below ``tolerance`` nats.
 
-    A start without a likelihood has no derivatives either, and is left where it is.
+    A start without a likelihood has no derivatives, and is returned unchanged.
     """
     state = init(target, with_fitting_noise(target, u) if max_steps else u)
     trace: list[dict[str, Any]] = []
@@ -190,13 +191,14 @@ def maximise(
 
 
 def climb_cost(d: int, noise: int) -> tuple[float, float]:
-    """Rollouts, of its horizon, of a climb's beginning and of each of its steps, for so many coordinates in all and of
-    the noise: the grid of the noise; a Jacobian by central differences, two more per noise, six dampings."""
+    """Rollouts for the start of an optimisation and for each of its steps, with ``d`` coordinates and ``noise`` noise
+    coordinates: the grid of the noise; a Jacobian by central differences, two more per noise, six dampings.
+    """
     return float(NOISE_GRID * noise), 4.0 * d + 7.0
 
 
 def laplace(target: Climbable, state: LevenbergState) -> Laplace:
-    """Normal approximation at a mode; where derivatives are differences, the last of them are along its own axes."""
+    """Normal approximation at a mode; finite differences are taken along its own axes at the end."""
     found = normal_at(target, state)
     for _ in range(ROUNDS):
         nearer = target.along(_axes(found.covariance, target.noise))
@@ -210,7 +212,7 @@ def laplace(target: Climbable, state: LevenbergState) -> Laplace:
 
 
 def normal_at(target: Climbable, state: LevenbergState) -> Laplace:
-    """Normal approximation by the derivatives that climbs use."""
+    """Normal approximation from the derivatives of the optimisation."""
     u = state.position
     information = positive_part(target.information(u))
     values, vectors = np.linalg.eigh(information + positive_part(-target.prior_hessian(u)))
@@ -220,7 +222,7 @@ def normal_at(target: Climbable, state: LevenbergState) -> Laplace:
 
 
 def _axes(covariance: Float[np.ndarray, "d d"], noise: Bool[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-    """Steps to take differences over, one per column; those of noise coordinates are along themselves."""
+    """Steps to take differences over, one per column; noise coordinates keep their own axes."""
     axes, physical = NOISE_STEP * np.eye(len(covariance)), np.flatnonzero(~noise)
     if len(physical):
         values, vectors = np.linalg.eigh(covariance[np.ix_(physical, physical)])
@@ -238,6 +240,6 @@ def divergence(first: Laplace, second: Laplace) -> float:
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:
-    """The matrix without what makes it smaller in any direction."""
+    """The matrix without its negative eigenvalues."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -1,14 +1,14 @@
-"""How much rows count whose residuals last: the likelihood of white noise, mended after the fit.
+"""Weight of rows with correlated residuals: the likelihood of white noise, adjusted after the fit.
 
-What a simulator gets wrong lasts from row to row and is shared by neighbouring markers, so that rows repeat one piece
-of evidence. Noise that lasts may be inferred instead; but noise that lasts for seconds also takes up a pose that is
-wrong throughout, which only parameters can mend. Here the residuals at the optimum of white noise say how much a row is
-worth. The log likelihood is then multiplied by one share below 1, and climbed anew, so that parameters are as uncertain
-as the correlation of the residuals makes them (magnitude adjustment of Pauli, Racugno & Ventura 2011, Ribatet, Cooley &
+Errors of a simulator are correlated between rows and between neighbouring markers, so that rows repeat evidence.
+Correlated noise may be inferred instead, but noise with a correlation time of seconds also absorbs a constant pose
+error, which parameters should explain. Here the residuals at the optimum under white noise give the weight of a row.
+The log likelihood is then multiplied by a share below 1 and optimised again, so that parameters are as uncertain as the
+correlation of the residuals makes them (magnitude adjustment of Pauli, Racugno & Ventura 2011, Ribatet, Cooley &
 Davison 2012).
 
-The residuals also are smaller than the errors of new recordings, because parameters follow them. How large these are is
-seen where rows are left out in blocks that are as long as residuals last: for a linear model no fit has to be repeated
+The residuals also are smaller than the errors of new recordings, because parameters follow them. These errors are
+estimated by leaving out blocks of rows as long as the correlation time; a linear model needs no repeated fit
 (jackknife, CR3 of Bell & McCaffrey 2002).
 """
 
@@ -53,12 +53,12 @@ class CountedProblem(ResidualProblem, Protocol):
 
 
 class Lasting(NamedTuple):
-    """What the residuals of a channel, at an optimum, say of the likelihood that led there.
+    """Statistics of a channel's residuals at an optimum, which correct its likelihood.
 
     Attributes:
-        share: what a row counts; 1 where residuals do not last.
-        rows: for which residuals last; 1 where they do not.
-        widened: how many times larger the errors of each column are in rows that are left out of the fit.
+        share: weight of a row; 1 for uncorrelated residuals.
+        rows: correlation time of residuals, in rows; 1 if uncorrelated.
+        widened: errors in rows left out of the fit over residuals, per column.
     """
 
     share: float
@@ -67,12 +67,12 @@ class Lasting(NamedTuple):
 
 
 def lasting_residuals(problem: CountedProblem, target: Target, mode: Laplace) -> dict[str, Lasting]:
-    """What the residuals at a mode say, by channel.
+    """Statistics of the residuals at a mode, by channel.
 
     Args:
-        problem: whose rows they are.
-        target: of it, at the full horizon.
-        mode: its optimum.
+        problem: problem with these rows.
+        target: its posterior at the full horizon.
+        mode: optimum of the posterior.
     """
     residual, jacobian = target.linearise(mode.mean)
     physical = ~target.noise
@@ -91,13 +91,12 @@ def lasting_series(
     reach: Float[np.ndarray, "d recording time column"],
     steps: Float[np.ndarray, " recording"],
 ) -> Lasting:
-    """What the residuals of a channel say; they last for as many seconds in recordings of every rate.
+    """Statistics of the residuals of a channel, with one correlation time in seconds for all recordings.
 
     Args:
-        series: residuals, of unit size by the likelihood that led there.
+        series: residuals, whitened by the likelihood.
         valid: which of them were measured.
-        reach: by how much fitted values move along orthonormal directions of the posterior, in its deviations; zero
-            where not valid.
+        reach: change of fitted values per posterior deviation along orthonormal directions; zero for invalid entries.
         steps: time between rows of each recording [s].
     """
     noise = estimate_noise(series, valid, 1.0, source=RESIDUALS, steps=steps, order=1, pooled=False, shared=None)
@@ -127,7 +126,7 @@ def _widened(
     reach: Float[np.ndarray, "d recording time column"],
     lengths: Int[np.ndarray, " recording"],
 ) -> Float[np.ndarray, " column"]:
-    """Root mean square error of blocks that are left out of a linear fit, over that of the residuals."""
+    """Root mean square error of blocks left out of a linear fit, over the root mean square residual."""
     left_out = np.zeros_like(series)
     for recording, length in enumerate(lengths):
         for first in range(0, series.shape[1], length):
@@ -145,8 +144,8 @@ def lasting_cautions(lasting: Mapping[str, Lasting]) -> list[Caution]:
     return [
         Caution(
             Code.RESIDUALS_LAST,
-            f"residuals of the {name} last for {each.rows:.2g} rows, and coordinates share them: a row counts "
-            f"{each.share:.2g}; rfdropo audit can tell what the simulator misses",
+            f"residuals of the {name} are correlated over {each.rows:.2g} rows and between coordinates: a "
+            f"row counts {each.share:.2g}; rfdropo audit can find the effect that the simulator lacks",
         )
         for name, each in lasting.items()
         if each.share < WIDER**-2

@@ -21,13 +21,13 @@ from rfdropo_bayes.inference.modes.climb import Laplace
 
 MIXTURES = ("equal", "evidence", "best")
 CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
-STRONG = 3.0  # nats by which it must be worse, too: less is no strong evidence under any noise (Kass & Raftery 1995)
+STRONG = 3.0  # nats by which it must also be worse: less is no strong evidence under any noise (Kass & Raftery 1995)
 
 
 def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
-    """Which optima explain the data about as well as the first, given the log density of each row at each.
+    """Mask of the optima that explain the data about as well as the best, from the log density of rows.
 
-    An optimum is left out where its rows are worse in sum by more than 3 nats and by more than two standard errors of
+    An optimum is excluded if its sum over rows is lower by more than 3 nats and by more than two standard errors of
     that sum. The standard error takes the autocorrelation of the differences into account. The best is always kept.
     """
     best = int(np.argmax(rows.sum(axis=1)))
@@ -70,12 +70,12 @@ def draw_mixture(
 
 
 def mixture_cautions(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
-    """A caution where more than one optimum explains the data about as well."""
+    """A caution if several optima explain the data about equally well."""
     if len(weights) == 1:
         return []
     use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
     sentence = (
-        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does not describe "
-        "this posterior; use the bridge or SMC where the noise model is right"
+        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does "
+        "not describe this posterior; use the bridge or SMC if the noise model is right"
     )
     return [Caution(Code.SEVERAL_OPTIMA, sentence)]

@@ -1,14 +1,14 @@
-"""Where modes are searched: climbs from the best of many prior draws, over growing horizons, then Laplace.
+"""Search for modes: optimisations from the best of many prior draws, over growing horizons, then Laplace.
 
-1. Climbs start at draws from the prior that explain a short prefix of the data: the best one, and others of the best
-   quarter that lie far apart. Where a budget allows it, a survey takes their place: particles tempered from the prior
-   to the posteriors of short prefixes. A climb ends on the first of many small summits, and the best of some prior
-   draws need not lie near the highest. A population that is cooled slowly ends in the basins that hold the mass, at
-   horizons at which rollouts are cheap.
-2. Each climb is a Levenberg-Marquardt search at growing horizons. Short prefixes come first, because a long recording
-   has many local optima.
-3. From one horizon to the next goes one climb of each optimum, the better half of them, and every rival of the best.
-   They begin anew, at draws from the normal distributions around these optima, see `begun_anew`.
+1. Optimisations start at prior draws that explain a short prefix of the data: the best draw, and distant draws of the
+   best quarter. If the budget allows it, a pilot run (`survey`) replaces the draws: particles tempered from the prior
+   to the posteriors of short prefixes. An optimisation stops at the first local optimum, and the best prior draws need
+   not lie near the highest. A slowly tempered population ends in the basins with most mass, at horizons with cheap
+   rollouts.
+2. Each optimisation is a Levenberg-Marquardt search at growing horizons. Short prefixes come first, because a long
+   recording has many local optima.
+3. Each optimum keeps one optimisation for the next horizon: the better half of the optima, and every optimum within
+   `RIVAL` nats of the best. They restart at draws from the normal distributions around these optima, see `begun_anew`.
 4. Around each optimum stands a normal distribution (Laplace's approximation), whose integral estimates its evidence.
 """
 
@@ -61,34 +61,34 @@ from rfdropo_bayes.inference.smc.moves import BlockProblem, StraightProblem, squ
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
 JACOBIANS = ("auto", "forward", "central")
-SAME = 0.02  # largest difference of any coordinate between two climbs that ended at one point
+SAME = 0.02  # largest difference of any coordinate between two optimisations with the same result
 RIVAL = 30.0  # nats below the best optimum, beyond which another matters to no posterior: exp(-30) is 1e-13
-SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take, and of their progress
-SURVEYS = 2  # of the last prefixes, whose particles climbs start from; as many horizons of climbs come after
-SURVEY_MOVES = 8  # of a stage, at most: climbs need a place in the right basins, not a fair sample of them
-FEWEST_STEPS = 4.0  # of a climb that is worth its start
+SURVEY_OF_CLIMBS = 0.6  # share of the budget of optimisations that a pilot run may take, and of their progress
+SURVEYS = 2  # number of last prefixes whose particles start optimisations; the same number of horizons follows
+SURVEY_MOVES = 8  # of a stage, at most: optimisations need a start in the right basins, not a fair sample of them
+FEWEST_STEPS = 4.0  # of an optimisation that is worth its start
 
 
 @dataclass(frozen=True, repr=False)
 class LaplaceConfig(MethodOptions, called="Laplace"):
-    """Laplace: a normal posterior around the optima that Levenberg-Marquardt climbs reach.
+    """Laplace: a normal posterior around the optima found by Levenberg-Marquardt optimisations.
 
     Attributes:
-        starts: number of climbs at the first horizon; the better half of their summits go on to each longer one, and
-            every rival of the best.
-        screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
-            horizon: the best is the first start, the others lie apart from it among the best quarter.
-        survey: particles of the tempered population that finds the starts instead; 0 for none. Only for problems with
+        starts: number of optimisations at the first horizon; the better half of their optima continue to longer
+            horizons, with every optimum close to the best.
+        screen: number of draws from the prior, or from the problem's own distribution of starts, evaluated at the first
+            horizon. The best draw is the first start; the others are distant draws of the best quarter.
+        survey: particles of a tempered pilot run that finds the starts instead; 0 for none. Only for problems with
             residuals.
-        blocks: horizons of a climb, or of the survey, doubling; climbs after a survey have two.
-        max_steps: most steps of a climb at one horizon.
-        tolerance: a climb ends when a step promises less [nat].
+        blocks: number of horizons of an optimisation or of the pilot run, doubling; two follow a pilot run.
+        max_steps: most steps of an optimisation at one horizon.
+        tolerance: predicted gain of a step below which an optimisation ends [nat].
         jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximations, weighted by the exact posterior and resampled.
-        mixture: weights of the optima that explain the data about as well as the best, see `mixture.rivals`: "equal",
+        mixture: weights of the optima that explain the data about equally well, see `mixture.rivals`: "equal",
             "evidence" (Laplace's), or "best" for the best alone.
-        rollouts: budget in full-length rollouts, of which every climb gets its share, and a survey at most
-            `SURVEY_OF_CLIMBS`; what climbs leave, a quarter at least, weights the draws. None for no limit.
+        rollouts: budget in full-length rollouts, shared by the optimisations, with at most `SURVEY_OF_CLIMBS` for a
+            pilot run; the rest, at least a quarter, weights the draws. None for no limit.
     """
 
     starts: int = 4
@@ -121,13 +121,13 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
 
 
 class Climbs(NamedTuple):
-    """State of several climbs over growing horizons.
+    """State of several optimisations over growing horizons.
 
     Attributes:
-        positions: where each climb stands.
-        log_density: log posterior there, at the horizon of the climb's last visit.
-        converged: of the climb at that horizon.
-        level: index of the present horizon; done: climbs done at it.
+        positions: present point of each optimisation.
+        log_density: log posterior there, at the horizon of its last update.
+        converged: whether it converged at that horizon.
+        level: index of the present horizon; done: optimisations finished at it.
         noise: noise coordinates.
         ledger, trace, seconds: as in every method.
     """
@@ -144,7 +144,7 @@ class Climbs(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """Distinct optima at the full horizon, best evidence first, with what it took to find them."""
+    """Distinct optima at the full horizon, best evidence first, with the cost of the search."""
 
     modes: list[Laplace]
     climbs: Climbs
@@ -160,16 +160,16 @@ def find_modes(
     ledger: Ledger | None = None,
     chosen: Callable[[Climbs], Bool[np.ndarray, " start"]] | None = None,
 ) -> Modes:
-    """Climb from the best of some prior draws to the optima of the full posterior.
+    """Optimise from the best of some prior draws to the optima of the full posterior.
 
     Args:
-        problem: to be climbed.
+        problem: problem to optimise.
         config: settings.
         key: random key.
-        checkpoint: of the climbs.
-        logbook: for the checkpoint of a survey, and where stages are reported.
-        ledger: is charged; after an error it knows what was spent in vain.
-        chosen: which of the last climbs matter; by default those within `RIVAL` nats of the best.
+        checkpoint: checkpoint of the optimisations.
+        logbook: checkpoint of a pilot run, and reports of stages.
+        ledger: charged with the cost, also after an error.
+        chosen: selects from the final optimisations; by default all within `RIVAL` nats of the best.
 
     Raises:
         InputError: a problem without residuals whose likelihood JAX cannot differentiate either.
@@ -213,15 +213,15 @@ def find_modes(
 def screened(
     problem: Problem, screen: int, horizon: int, count: int, key: PRNGKeyArray, ledger: Ledger
 ) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
-    """Some of many draws from the prior, or from where the problem says that climbs may start.
+    """Some of many draws from the prior, or from the problem's own distribution of starts.
 
     Args:
-        problem: to be climbed.
+        problem: problem to optimise.
         screen: number of draws.
-        horizon: at which draws are judged.
-        count: of starts wanted; there may be fewer.
+        horizon: horizon at which draws are evaluated.
+        count: number of starts; there may be fewer.
         key: random key.
-        ledger: is charged.
+        ledger: charged with the cost.
 
     Returns:
         unconstrained points, the best first, and their log posterior at the horizon.
@@ -239,10 +239,10 @@ def screened(
 def surveyed(
     problem: ResidualProblem, config: LaplaceConfig, horizon: int, key: PRNGKeyArray, ledger: Ledger, logbook: Logbook
 ) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
-    """Particles of the last prefixes of a survey, as many of each; the answer is that of `screened`.
+    """Particles of the last prefixes of a pilot run, equally many of each; returns the same as `screened`.
 
-    The longest prefix knows best where the summit is, unless all its particles lie in one basin and the summit in
-    another; when those of a shorter one were drawn there was less between the two.
+    The longest prefix locates the optimum best, unless all its particles lie in a wrong basin; particles of a shorter
+    prefix cross between basins more easily.
     """
     prefixes = block_boundaries(problem.n_rows, config.blocks + 1)
     found = survey(problem, config, prefixes[:-1] or prefixes, key, ledger, logbook)[-SURVEYS:]
@@ -267,15 +267,15 @@ def _heights(problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger
         raise NoLikelihoodError(
             f"none of {len(u)} draws has a positive likelihood up to row {horizon} ({ledger.reasons})",
             where="[model.priors]",
-            remedy="widen the priors, or look at what the simulator reports for them",
+            remedy="widen the priors, or look at the simulator's reports for them",
         )
     return density
 
 
 def _spread(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count: int) -> Int[np.ndarray, " k"]:
-    """The best draw, and then always the one of the best quarter that is farthest from those chosen.
+    """The best draw, then repeatedly the draw of the best quarter that is farthest from all chosen draws.
 
-    The best few alone often lie together, and then all climb to one optimum of several.
+    The best few draws are often close together, and would all lead to the same optimum.
     """
     order = np.argsort(-density, kind="stable")
     order = order[np.isfinite(density[order]) & np.isfinite(u[order]).all(axis=1)]
@@ -302,23 +302,23 @@ def survey(
     """Temper particles to the posteriors of growing prefixes.
 
     Args:
-        problem: to be climbed.
-        config: with the number of particles.
+        problem: problem to optimise.
+        config: settings with the number of particles.
         horizons: the prefixes.
         key: random key.
-        ledger: is charged.
-        logbook: for the checkpoint, and where stages are reported.
+        ledger: charged with the cost.
+        logbook: checkpoint, and reports of stages.
 
     Returns:
-        for each prefix the particles that have arrived at its posterior, and not been moved there yet: unconstrained
-        positions, and their log posterior.
+        for each prefix the particles weighted to its posterior, before moves: unconstrained positions, and their log
+        posterior.
 
     Raises:
         NoLikelihoodError: no particle has a positive likelihood.
     """
     straight_key, run_key = jax.random.split(key)
     blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
-    # The sampler takes blocks for rows of equal cost, which is more than short ones cost.
+    # The sampler assumes rows of equal cost in a block, which overestimates short prefixes.
     whole = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts * problem.n_rows / horizons[-1]
     sampling = sampler.SmcConfig(
         rollouts=whole,
@@ -370,7 +370,7 @@ def _populations(
 
 
 def _charge(problem: ResidualProblem, horizons: tuple[int, ...], trace: list[dict[str, Any]], ledger: Ledger) -> None:
-    """What the sampler counted in blocks, in rows."""
+    """Convert the sampler's cost from blocks to rows, and charge it."""
     before = 0.0
     for stage in trace:
         block, spent = stage["horizon"], stage["rollouts"]
@@ -381,12 +381,12 @@ def _charge(problem: ResidualProblem, horizons: tuple[int, ...], trace: list[dic
 def begin(
     positions: Float[np.ndarray, "start d"], log_density: Float[np.ndarray, " start"], ledger: Ledger, seconds: float
 ) -> Climbs:
-    """Climbs at their starts."""
+    """Optimisations at their starts."""
     return Climbs(positions, log_density, np.zeros(len(positions), dtype=bool), 0, 0, None, ledger, [], seconds)
 
 
 def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, target: Climbable) -> Climbs:
-    """Put down one finished climb."""
+    """Record a finished optimisation."""
     positions, density, converged = climbs.positions.copy(), climbs.log_density.copy(), climbs.converged.copy()
     positions[climbs.done], density[climbs.done] = state.position, state.log_density
     converged[climbs.done] = state.converged
@@ -398,19 +398,20 @@ def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, tar
 
 
 def _go_on(climbs: Climbs, horizon: int) -> Climbs:
-    """Keep one climb of each optimum and go to the next horizon.
+    """Keep one optimisation of each optimum and continue at the next horizon.
 
-    Of the climbs of a horizon the better half goes on (successive halving), and every rival of the best.
+    The better half of the optimisations continues (successive halving), and every optimum within `RIVAL` nats of the
+    best.
 
     Raises:
-        NoLikelihoodError: no climb has a likelihood.
+        NoLikelihoodError: no optimisation has a likelihood.
     """
     positions, density = climbs.positions, climbs.log_density
     if not np.isfinite(density).any():
         raise NoLikelihoodError(
             f"no climb has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
             where="[inference]",
-            remedy="look at what the simulator reports there, or allow more starts",
+            remedy="look at the simulator's reports there, or allow more starts",
         )
     kept: list[int] = []
     for index in np.argsort(-density, kind="stable"):
@@ -430,17 +431,17 @@ def _go_on(climbs: Climbs, horizon: int) -> Climbs:
 def begun_anew(
     problem: Problem, target: Climbable, climbs: Climbs, horizon: int, screen: int, key: PRNGKeyArray
 ) -> Climbs:
-    """The climbs at their starts for a longer prefix of the data.
+    """The optimisations at their starts for a longer prefix of the data.
 
-    Of what a prefix does not tell, every optimum has the prior's middle: the mass of a cube before the robot touches
-    it. Climbs from there to a longer prefix would all begin at one such value. So starts are chosen among the optima
-    and as many draws as a screening takes from the normal distributions around them, which keep the prior's spread.
+    Parameters that a prefix does not inform, such as the mass of a cube before contact, are at the prior's centre in
+    every optimum. All optimisations of the longer prefix would then share this value. Starts are therefore chosen from
+    the optima and from ``screen`` draws of the normal distributions around them, which keep the prior's spread.
 
     Args:
-        problem: to be climbed.
-        target: the posterior of the prefix that the climbs have ended at.
-        climbs: one of each optimum.
-        horizon: of the longer prefix, at which draws are judged.
+        problem: problem to optimise.
+        target: posterior of the finished prefix.
+        climbs: one optimisation per optimum.
+        horizon: horizon of the longer prefix, at which draws are evaluated.
         screen: number of draws.
         key: random key.
 
@@ -457,7 +458,7 @@ def begun_anew(
 
 
 def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays of the climbs and the rest of them, for a checkpoint."""
+    """Arrays and metadata of the optimisations, for a checkpoint."""
     assert climbs.noise is not None
     meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
     arrays = {name: getattr(climbs, name) for name in ("positions", "log_density", "converged", "noise")}
@@ -465,14 +466,14 @@ def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
-    """The climbs that `_pack` took apart."""
+    """Inverse of `_pack`."""
     named = {name: meta[name] for name in ("level", "done", "trace", "seconds")}
     saved: dict[str, Any] = {**arrays, **named}
     return Climbs(ledger=Ledger.from_record(meta["ledger"]), **saved)
 
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
-    """Horizons to climb at, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
+    """Horizons of the search, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
     if not isinstance(problem, ResidualProblem):
         raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
     prior = prior_derivatives(problem)
@@ -484,9 +485,9 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
 
 
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
-    """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons.
+    """Steps of the present optimisation: the rest of the budget is shared among optimisations by their horizons.
 
-    Of the climbs of a horizon half are expected at the next, see `_go_on`.
+    Half of the optimisations are expected to continue, see `_go_on`.
     """
     if config.rollouts is None:
         return config.max_steps
@@ -497,7 +498,7 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     share = now * waiting / (now * waiting + later)
     grid, step = climb_cost(d, noise)
     rows = max(config.rollouts - climbs.ledger.rollouts, 0.0) * n_rows / now * share
-    # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
+    # More optima than expected may have reached the last horizon: continue with the best, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
@@ -518,13 +519,15 @@ def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start
 
 
 def _unfinished(converged: bool) -> list[Caution]:
-    """A caution where the best climb has not converged."""
+    """A caution if the best optimisation has not converged."""
     sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
     return [] if converged else [Caution(Code.CLIMB_UNFINISHED, sentence, grave=True)]
 
 
 def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
-    """Whether a point lies beyond one posterior deviation of every mode: climbs also stop on one flat top."""
+    """Whether a point lies beyond one posterior deviation of every mode: optimisations also stop at different points of
+    a flat optimum.
+    """
     factors = [np.linalg.cholesky(mode.covariance) for mode in modes]
     away = [squared_distance(factor, (position - mode.mean)[None]) for factor, mode in zip(factors, modes, strict=True)]
     return all(distance > len(position) for distance in away)
@@ -566,7 +569,7 @@ def run(
         exact = reweighted(problem, modes, weights, left, draw_key, ledger, config.draws, by_evidence)
         position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
         draws = chains(problem, [position])
-        rows = exact.rows[None] if exact is not None and problem is whole else None
+        rows = exact.rows[None] if exact is not None and exact.rows is not None and problem is whole else None
     best, seconds = modes[0], found.climbs.seconds + time.monotonic() - began
     return InferenceResult(
         method="laplace",
@@ -645,9 +648,9 @@ def _with_scales(
 
 
 def _counted(problem: Problem, found: Modes, config: LaplaceConfig) -> tuple[Problem, Modes, dict[str, Lasting]]:
-    """The problem whose rows count by how long residuals last, its modes, and what the residuals say there.
+    """The problem with rows weighted by the residual correlation time, its modes, and the residual statistics.
 
-    The modes are climbed to from those that were found; see `modes.lasting`.
+    The new modes are optimised from the given modes; see `modes.lasting`.
     """
     modes, climbs = found.modes, found.climbs
     if not isinstance(problem, CountedProblem):

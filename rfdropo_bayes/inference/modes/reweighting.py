@@ -1,11 +1,14 @@
-"""Draws of normal approximations, weighted by the exact posterior: what a normal says of a curved ridge is mended here.
+"""Draws of normal approximations, weighted by the exact posterior, which corrects the approximation of curved ridges.
 
-The first candidates come from the approximations. A normal is thin where a ridge bends away from it, and weights do not
-show what no candidate has seen. So the next rounds come from Student-t distributions with the weighted covariance of
-all before them, added to that of the normal (adaptive multiple importance sampling, Cornuet et al. 2012). All together
-have the density ``q``. A candidate's weight for optimum k is ``p(u) / q(u)`` times the share
-of k in ``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight
-are then resampled, and the effective number ``(sum w)^2 / sum w^2`` says how many candidates are behind them.
+The first candidates come from the approximations. A normal has little density on a curved ridge, and weights cannot
+reveal regions without candidates. So the next rounds come from Student-t distributions with the weighted covariance of
+all earlier candidates, added to the normal's covariance (adaptive multiple importance sampling, Cornuet et al. 2012).
+All together have the density ``q``. A candidate's weight for optimum k is ``p(u) / q(u)`` times the share of k in
+``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight are
+then resampled, and the effective number ``(sum w)^2 / sum w^2`` measures the number of effective candidates.
+
+If the first candidates have nearly equal weights, the normals describe the posterior: the draws then come from them
+without weights, and no more rollouts are spent.
 """
 
 from __future__ import annotations
@@ -23,14 +26,17 @@ from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.mixture import draw_mixture
 from rfdropo_bayes.inference.smc.moves import host_generator
 
-CANDIDATE_SHARE = 0.25  # of a budget that climbs leave to candidates
+CANDIDATE_SHARE = 0.25  # of a budget that optimisations leave to candidates
 FEWEST_CANDIDATES = 20
 ROUNDS = 4
+FIRST = 100  # candidates that tell whether the normals need weights
+ALIKE = 0.98  # effective share of the first candidates from which on their weights count as equal
 DEGREES = 5.0  # of freedom of the wide candidates
 ENOUGH, TOO_FEW = 100.0, 20.0  # effective draws: fewer are said, and still fewer must not be used
-LIKE = 0.1  # share of the candidates that counts where the normal describes the posterior
+LIKE = 0.1  # share of the candidates that counts if the normal describes the posterior
 
 
 class Reweighted(NamedTuple):
@@ -38,13 +44,13 @@ class Reweighted(NamedTuple):
 
     Attributes:
         position: unconstrained.
-        rows: log density of each data row at each of them.
+        rows: log density of each data row at each of them; None for draws of the normals, which no rollout has seen.
         effective: number of independent draws that they are worth.
-        candidates: from which they were taken.
+        candidates: whose posterior density was computed.
     """
 
     position: Float[np.ndarray, "draw d"]
-    rows: Float[np.ndarray, "draw row"]
+    rows: Float[np.ndarray, "draw row"] | None
     effective: float
     candidates: int
 
@@ -65,7 +71,7 @@ def reweighted(
         problem: whose posterior it is.
         modes: normal approximations.
         weights: of the mixture.
-        candidates: number of rollouts.
+        candidates: number of rollouts, at most.
         key: random key.
         ledger: is charged; candidates without a likelihood are counted there.
         count: of draws wanted.
@@ -80,8 +86,8 @@ def reweighted(
     generator = host_generator(draw_key)
     sources = [[multivariate_normal(mode.mean, mode.covariance) for mode in modes]]
     u, rows, posterior = np.empty((0, len(modes[0].mean))), np.empty((0, problem.n_rows)), np.empty(0)
-    for size in np.diff(np.linspace(0, candidates, ROUNDS + 1).astype(int)).tolist():
-        if len(u):
+    for widened, size in _batches(candidates):
+        if widened:
             by_mode = _weights(posterior, weights, sources, u)
             sources.append([_widened(mode, u, by_mode[:, k]) for k, mode in enumerate(modes)])
         sizes = zip(sources[-1], _counts(weights, size), strict=True)
@@ -89,15 +95,39 @@ def reweighted(
         more_rows, more = _exact(problem, np.concatenate(drawn), ledger)
         u, rows = np.concatenate([u, *drawn]), np.concatenate([rows, more_rows])
         posterior = np.concatenate([posterior, more])
+        if len(u) == size and size >= FEWEST_CANDIDATES and np.isfinite(posterior).all():
+            worth = _effective(_by_share(_weights(posterior, weights, sources, u), weights, by_evidence)) / len(u)
+            if worth >= ALIKE:
+                return Reweighted(draw_mixture(modes, weights, count, order_key), None, worth * count, len(u))
     if not np.isfinite(posterior).any():
         return None
-    by_mode = _weights(posterior, weights, sources, u)
+    weight = _by_share(_weights(posterior, weights, sources, u), weights, by_evidence)
+    chosen = _systematic(weight, count, order_key)
+    return Reweighted(u[chosen], rows[chosen], _effective(weight), candidates)
+
+
+def _batches(candidates: int) -> list[tuple[bool, int]]:
+    """Numbers of candidates, and whether they come from the widened distributions: the first, the rest of the first
+    round, and the next rounds."""
+    rounds = np.diff(np.linspace(0, candidates, ROUNDS + 1).astype(int)).tolist()
+    first = min(FIRST, rounds[0])
+    narrow = [(False, size) for size in (first, rounds[0] - first) if size]
+    return narrow + [(True, size) for size in rounds[1:]]
+
+
+def _by_share(
+    by_mode: Float[np.ndarray, "n mode"], weights: Float[np.ndarray, " mode"], by_evidence: bool
+) -> Float[np.ndarray, " n"]:
+    """Weights of candidates: each optimum gets its share of the mixture, or what the exact posterior gives it."""
     mass = by_mode.sum(axis=0)
     found = mass > 0.0
     share = mass[found] if by_evidence else weights[found]
-    weight = by_mode[:, found] @ (share / share.sum() / mass[found])
-    chosen = _systematic(weight, count, order_key)
-    return Reweighted(u[chosen], rows[chosen], float(weight.sum() ** 2 / np.sum(weight**2)), candidates)
+    return by_mode[:, found] @ (share / share.sum() / mass[found])
+
+
+def _effective(weight: Float[np.ndarray, " n"]) -> float:
+    """Number of independent draws that weighted candidates are worth."""
+    return float(weight.sum() ** 2 / np.sum(weight**2))
 
 
 def _exact(
@@ -145,7 +175,7 @@ def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) 
 
 
 def reweighting_cautions(found: Reweighted | None) -> list[Caution]:
-    """What the exact posterior says of the normal approximation; None stands for draws that were not compared."""
+    """Cautions from the comparison of the normal approximation with the exact posterior; None means no comparison."""
     remedy = "allow more rollouts, or use the bridge or SMC"
     if found is None:
         sentence = f"no rollouts were left to check the normal approximation that the draws are from: {remedy}"

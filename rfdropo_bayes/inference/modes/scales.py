@@ -1,9 +1,9 @@
-"""Standard deviations of groups of coordinates, integrated out of a normal approximation instead of climbed.
+"""Standard deviations of groups of coordinates, integrated out of a normal approximation instead of optimised.
 
 The joint mode of a hierarchy is no place to approximate it at: a standard deviation runs to zero there, or to the end
-of its prior. Given the standard deviations, what they are of is as normal as the rest. The climb therefore holds them.
-Their posterior follows from the likelihood's quadratic form at the mode, which is the same whatever they are (nested
-Laplace approximation, Rue, Martino & Chopin 2009).
+of its prior. Given the standard deviations, the group parameters are as normal as the others. The optimisation
+therefore fixes the standard deviations. Their posterior follows from the likelihood's quadratic form at the mode, which
+does not depend on them (nested Laplace approximation, Rue, Martino & Chopin 2009).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def integrate_scales(
     """
     owner = np.concatenate([np.full(len(m), j) for j, m in enumerate(members)])
     index = np.concatenate([np.asarray(m, dtype=int) for m in members])
-    # The rest of the quadratic form stays; in its own coordinates but those of the members it is integrated out once.
+    # The rest of the quadratic form is unchanged; it is integrated out once in its coordinates other than the members'.
     precision = np.linalg.inv(mode.covariance)
     precision[index, index] -= 1.0 / held[owner] ** 2
     slope = np.zeros(len(mode.mean))

@@ -1,16 +1,16 @@
-"""The posterior of a problem with residuals as climbs see it: Gauss-Newton in the unconstrained space.
+"""The posterior of a problem with residuals for optimisation: Gauss-Newton in the unconstrained space.
 
-Observation noise among the parameters. The residuals r are whitened, so the log likelihood is ``-r'r / 2 + c`` where c
-holds the log determinants and depends on noise parameters alone. Noise parameters stay in the vector that is optimised
-(they are not profiled out: their posterior and their correlation with the rest are wanted). They are found by testing
-along which coordinates ``c`` changes. Along these the gradient is taken from the log likelihood itself, by central
+Observation noise among the parameters. The residuals r are whitened, so the log likelihood is ``-r'r / 2 + c``; c holds
+the log determinants and depends on noise parameters alone. Noise parameters stay in the vector that is optimised (they
+are not profiled out: their posterior and their correlation with the rest are wanted). They are found by testing along
+which coordinates ``c`` changes. Along these the gradient is taken from the log likelihood itself, by central
 differences; and since ``J'J`` holds only one half of the information about a scale (``m`` instead of ``2 m``), their
 block of the Hessian at the optimum is taken by second differences of the log likelihood. Physical parameters keep the
 Gauss-Newton block.
 
-Differences of rollouts in single precision carry rounding, whose square adds to ``J'J`` in all directions alike. Along
-a ridge, where the data say least, it can be most of what is there, and the ridge then looks shorter than it is. Where
-the posterior is roughly known, differences are therefore taken along its own axes, over a good part of its deviations.
+Differences of rollouts in single precision carry rounding, whose square adds to ``J'J`` equally in all directions.
+Along a ridge, which the data hardly inform, rounding can dominate, and the ridge then appears too short. Once the
+posterior is roughly known, differences are therefore taken along its own axes, over a large part of its deviations.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate
 from rfdropo_bayes.inference.modes.climb import positive_part
 
 FLATTEST = 1e-10  # curvature that a step takes a direction to have at least, as a share of the steepest
-DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
+DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order 1
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 
 UNBOUNDED = (-np.inf, np.inf)
 
 
 class Target(NamedTuple):
-    """A posterior at one horizon, as functions of one unconstrained point (batched where marked).
+    """A posterior at one horizon, as functions of one unconstrained point (batched if marked).
 
     Attributes:
         density: log posterior of a batch (n, d).
         likelihood: log likelihood of a batch (n, d).
-        prior_gradient, prior_hessian: of the log prior.
+        prior_gradient, prior_hessian: derivatives of the log prior.
         linearise: residuals (m,) and their Jacobian (m, d).
-        residuals: of a batch (n, d), as (n, m); zero where there are no data.
+        residuals: residuals (n, m) of a batch (n, d); zero for missing data.
         noise: coordinates along which the log determinant changes.
-        differences: residuals (m,), and half of what they change by (m, d) from one step against each column of a
-            matrix (d, d) to one step along it; None where derivatives are not taken anew.
-        beside: gradient of what the log likelihood holds beside half the sum of squares, whose curvature is left out;
-            None where that changes along noise coordinates only.
+        differences: residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if
+            derivatives are not recomputed.
+        beside: gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is
+            neglected; None if these terms depend on noise coordinates only.
         bounds: lowest and highest value of each coordinate.
     """
 
@@ -88,12 +88,12 @@ class Target(NamedTuple):
         if self.noise.any():
             slope = _slope(self.likelihood, u, self.noise)
             gradient[self.noise] = np.where(np.isfinite(slope), slope, 0.0)
-            # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
+            # Twice, exact in expectation for a scale: J'J has m, the information is 2 m.
             curvature[np.ix_(self.noise, self.noise)] *= 2.0
         return gradient + self.prior_gradient(u), curvature + positive_part(-self.prior_hessian(u))
 
     def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-        """See `Climbable.information`: Gauss-Newton's, with second differences where noise parameters are concerned."""
+        """See `Climbable.information`: Gauss-Newton, with second differences for noise parameters."""
         curvature = self.quadratic(u)[1] - positive_part(-self.prior_hessian(u))
         if self.noise.any():
             exact = -_noise_hessian(self.likelihood, u, self.noise)
@@ -115,12 +115,12 @@ def make_target(
     """Posterior of the first ``horizon`` rows.
 
     Args:
-        problem: with residuals.
+        problem: problem with residuals.
         horizon: rows to use.
-        ledger: every rollout is charged to it; a Jacobian in d directions counts as d + 1.
-        u: a point with a finite likelihood, around which noise coordinates are looked for.
+        ledger: charged with every rollout; a Jacobian in d directions counts as d + 1.
+        u: a point with a finite likelihood, at which noise coordinates are identified.
         prior: `prior_derivatives`.
-        jacobian: "forward" (JAX), "central" differences, or "auto": forward where residuals can be traced.
+        jacobian: "forward" (JAX), "central" differences, or "auto": forward if residuals can be traced.
         noise: noise coordinates, if known.
     """
 
@@ -228,7 +228,7 @@ def _noise_coordinates(determinant: Callable, u: np.ndarray, width: float = 0.05
 
 
 def _known(jacobian: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
-    """Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for a step."""
+    """A failed rollout of a neighbour leaves no derivative: that coordinate is then fixed for a step."""
     return np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
 
 

@@ -22,11 +22,11 @@ class ScorePlan(NamedTuple):
     """Sizes fixed at the start.
 
     Attributes:
-        space: what is searched.
+        space: search space.
         population: candidates per generation.
-        horizons: of every generation, in rows.
-        finalists: how many are scored again.
-        fixed: values of the parameters that are not searched.
+        horizons: horizon of every generation, in rows.
+        finalists: number of candidates scored again.
+        fixed: values of fixed parameters.
         scale: unit of the features [unit of the problem's features].
         floor: added to the variance of each feature, in squares of that unit.
     """
@@ -41,7 +41,7 @@ class ScorePlan(NamedTuple):
 
 
 def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:
-    """Uniform numbers that all candidates of a generation share; stratified ones (Latin hypercube) scatter less."""
+    """Uniform numbers that all candidates of a generation share; stratified numbers (Latin hypercube) scatter less."""
     generator = host_generator(key)
     return qmc.LatinHypercube(d, rng=generator).random(m) if stratified else generator.uniform(size=(m, d))
 
@@ -79,7 +79,7 @@ def simulate(
 def row_scores(
     problem: RolloutProblem, plan: ScorePlan, found: CandidateRollouts, horizon: int
 ) -> Float[np.ndarray, "c horizon"]:
-    """Log likelihood (eq. 3) of each row under every candidate; minus infinity where half of its rollouts failed."""
+    """Log likelihood (eq. 3) of each row under every candidate; minus infinity if half of its rollouts failed."""
     mask = np.asarray(problem.observed_mask)[:horizon]
     observed = np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale
     c, m = found.alive.shape
@@ -100,15 +100,15 @@ def step_log_likelihood(
 ) -> Float[np.ndarray, " time"]:
     """Log density of each observed time step under the Gaussian of the Monte-Carlo rollouts.
 
-    Mean and covariance are those of the live rollouts; ``variance_floor`` is added to the variances, without which the
-    density has no maximum (one trajectory, spread to zero).
+    Mean and covariance are taken over the live rollouts. ``variance_floor`` is added to the variances; without it the
+    density is unbounded as the spread goes to zero.
 
     Args:
         features: rollouts of ONE parameter distribution.
         alive: rollouts that ended well; at least two.
         observed: the trajectory, in the units of the features.
         mask: observed entries that count.
-        variance_floor: in squared units of the features; one for all, or one of each.
+        variance_floor: in squared units of the features; a scalar, or one value per feature.
     """
     good = features[alive]
     mean = good.mean(axis=0)
@@ -125,9 +125,9 @@ def step_log_likelihood(
 
 
 def motion_scale(observed: Float[np.ndarray, "time f"], mask: Bool[np.ndarray, "time f"]) -> float:
-    """Root mean square motion of the observed features away from where each was first seen, the unit of the match.
+    """Root mean square motion of the observed features from their first observed values, the unit of the match.
 
-    In this unit the paper's variance floor of 1e-5 is a deviation of 0.3 % of the motion, whatever the robot's size.
+    In this unit the paper's variance floor of 1e-5 is a deviation of 0.3 % of the motion, for a robot of any size.
     """
     squares: list[np.ndarray] = []
     for column, valid in zip(observed.T, mask.T, strict=True):

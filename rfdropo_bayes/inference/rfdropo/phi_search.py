@@ -2,9 +2,9 @@
 
 phi holds a mean and a standard deviation per parameter; it maximises the likelihood of growing prefixes of the data
 (eq. 2 and 3) under Monte-Carlo rollouts, by a gradient-free optimiser. Three flaws of the published pipeline are mended
-unless ``mended = false``: the horizon ends at the last row; the finalists (the best of every stage) are scored again
-at the FULL horizon with common random numbers, because losses at different horizons cannot be compared; and what is
-measured has noise, whose variance is added to the rollouts', which phi would have to make up for otherwise.
+unless ``mended = false``: the horizon ends at the last row; the finalists (the best of every stage) are scored again at
+the FULL horizon with common random numbers, because losses at different horizons cannot be compared; and measurements
+have noise, whose variance is added to the rollouts' so that phi need not explain it.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
 
     Attributes:
         rollouts: budget in full-length rollouts, which then decides the number of generations.
-        evaluations: candidates tried, where no budget is given (paper: 5000).
+        evaluations: number of candidates if there is no budget (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
         optimiser: "cma" or "cem".
         sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
-        levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
+        levels: rollouts are simulated to one of this many horizons, the shortest sufficient horizon.
         variance_floor: added to the variances, in squared units of the trajectory's root mean square motion; mended,
             the observation noise at the prior's medians is added as well.
-        finalists: candidates scored again at the full horizon.
-        parameters: names to search; empty for all that rollouts depend on.
+        finalists: number of candidates scored again at the full horizon.
+        parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
-        draws: draws of the final distribution.
+        draws: number of draws of the final distribution.
         mended: False gives the published schedule (99 of 100 rows), takes measurements for exact, and returns the
             lowest loss at any horizon.
     """
@@ -87,11 +87,11 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
 
 
 class SearchState(NamedTuple):
-    """What was tried so far; the optimiser is a function of it.
+    """History of the search; the optimiser's state is a function of it.
 
     Attributes:
-        candidates: of every generation done.
-        losses: theirs, each generation at its own horizon.
+        candidates: candidates of every finished generation.
+        losses: their losses, each generation at its own horizon.
         ledger, trace, seconds: as in every method.
     """
 
@@ -191,7 +191,7 @@ def step(
 
 
 def choose_finalists(state: SearchState, plan: ScorePlan, centre: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c k"]:
-    """Best candidates of evenly spread stages, and where the optimiser ended; a stage is a run of generations.
+    """Best candidates of evenly spread stages, and the final centre of the optimiser; a stage is a run of generations.
 
     Within a stage candidates are compared by loss per row, horizons there being nearly the same.
     """
@@ -253,7 +253,7 @@ def _search(
     checkpoint: Checkpoint,
     logbook: Logbook,
 ) -> tuple[SearchState, np.ndarray]:
-    """All generations; a resumed optimiser is told again what it knew."""
+    """All generations; a resumed optimiser is given its history again."""
     k = plan.space.dimension
     seed = int(host_generator(key).integers(2**31))
     optimiser = make_optimiser(
@@ -359,7 +359,7 @@ class CrossEntropy:
     Args:
         d, high, sigma, population, seed: as in `make_optimiser`, sigma in the box's units.
         elite: share of the candidates that the refit uses.
-        smoothing: weight of the new fit; the rest stays with the old one, which keeps the spread from collapsing.
+        smoothing: weight of the new fit; the old fit keeps the rest, which prevents collapse of the spread.
     """
 
     def __init__(
@@ -371,7 +371,7 @@ class CrossEntropy:
         self._generator = np.random.default_rng(seed)
 
     def ask(self) -> Float[np.ndarray, "population d"]:
-        """Normal candidates; what falls outside is reflected, so that the edges do not collect mass."""
+        """Normal candidates; values outside are reflected, so that mass does not collect at the edges."""
         z = self._generator.standard_normal((self.population, len(self.mean)))
         folded = np.mod(self.mean + self.sd * z, 2.0 * self.high)
         return np.minimum(folded, 2.0 * self.high - folded)
@@ -390,7 +390,7 @@ class CrossEntropy:
 
 
 class CovarianceAdaptation:
-    """CMA-ES of pycma, with random numbers of its own instead of numpy's global ones."""
+    """CMA-ES of pycma, with random numbers of its own instead of numpy's global generator."""
 
     def __init__(self, d: int, high: float, sigma: float, population: int, seed: int) -> None:
         with warnings.catch_warnings():
@@ -426,5 +426,6 @@ class CovarianceAdaptation:
 
 
 Optimiser = CrossEntropy | CovarianceAdaptation
-"""Minimises a noisy loss over a box: `ask` for the candidates of a generation, `tell` their losses (infinite ones rank
-last), and `centre`, where the search distribution stands."""
+"""Minimises a noisy loss over a box: `ask` for the candidates of a generation, `tell` their losses (infinite losses
+rank last), and `centre` of the search distribution.
+"""

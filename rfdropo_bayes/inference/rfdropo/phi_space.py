@@ -1,4 +1,4 @@
-"""What RF-DROPO searches: independent truncated normals over simulator parameters, each coded by a vector.
+"""Search space of RF-DROPO: independent truncated normals over simulator parameters, each coded by a vector.
 
 Vectors lie in [0, 4]^k, as the optimisers want them. Draws transform given uniform numbers, so that several vectors
 share their random numbers.
@@ -18,7 +18,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 
 WIDTH = 4.0  # every parameter's search range is scaled to [0, 4]
-SMALLEST_STD = 1e-5  # in those units
+SMALLEST_STD = 1e-5  # in these units
 LARGEST_STD = WIDTH / 4.0
 TRUNCATION = 2.0  # standard deviations
 
@@ -100,9 +100,10 @@ def search_space(
     ranges: Mapping[str, tuple[float, float]],
     prior: Values,
 ) -> SearchSpace:
-    """Search ranges: those asked for, else the central 99 % of the prior, which like the paper's is inside the bounds.
+    """Search ranges: the given ranges, else the central 99 % of the prior, which lie inside the bounds, like the
+    paper's.
 
-    Hard bounds would not do: they exclude the impossible and span decades, where a search range is linear.
+    Hard bounds are not suitable: they exclude the impossible and span decades, whereas a search range is linear.
 
     Raises:
         InputError: an unknown parameter, or a range that is empty or outside the bounds.

@@ -1,1 +1,1 @@
-"""Sequential Monte Carlo: where it starts, how its particles move, and the bridge from optima to the posterior."""
+"""Sequential Monte Carlo: its starts, the moves of its particles, and the bridge from optima to the posterior."""

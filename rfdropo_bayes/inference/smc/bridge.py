@@ -1,17 +1,18 @@
 """The bridge: tempered SMC from Student-t distributions around known optima to the posterior.
 
 The start is close to the posterior, so few stages are needed, all at the full horizon: an evidence with a small
-deviation for a small part of the rollouts that a start at the prior takes. Modes that no climb found are seen by the
-particles that start at the prior, which are few.
+deviation for a small part of the rollouts that a start at the prior takes. Only the few particles that start at the
+prior can reach modes that no optimisation found.
 
 Particles move in logarithms of positive parameters. Data that determine a product or a ratio of parameters, such as
-stiffness over mass, leave a ridge as thin as the ratio is known well. In logarithms it is a straight line, which a
-covariance can describe; in coordinates that bend towards the bounds of a prior it is a curve, on which a sampler stays
-about where it began. The price is a wall at each bound: there is no density beyond it.
+stiffness over mass, leave a thin ridge. In logarithms it is a straight line, which a covariance can describe; in
+coordinates that bend towards the bounds of a prior it is a curve, on which a sampler hardly moves. The price is a wall
+at each bound: there is no density beyond it.
 
-At an optimum the curvature of the prior says little where the likelihood says nothing: along a ridge that ends at two
-bounds, the density falls off within a hair of the end on which the optimum lies. Each optimum therefore has a second
-distribution, with the likelihood as it is there and the prior by its mean and covariance, as long as the ridge.
+The curvature of the prior at an optimum says little about directions without information from the likelihood. Along a
+ridge between two bounds the optimum lies at an end, and the density falls off within a short distance of it. Each
+optimum therefore has a second distribution as long as the ridge, from the likelihood's curvature and the prior's mean
+and covariance.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from rfdropo_bayes.inference.smc.moves import StraightProblem, host_generator, s
 
 INFLATION = 1.5  # of the Student-t's scale over the Laplace standard deviation
 DEGREES = 5.0  # of freedom of the Student-t's
-PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for what no climb has found
+PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for modes that no optimisation found
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
@@ -54,15 +55,15 @@ NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, 
 
 @dataclass(frozen=True, repr=False)
 class BridgeConfig(MethodOptions, called="Bridge"):
-    """Bridge: posterior and an evidence that scatters little, by SMC from the optima to the posterior.
+    """Bridge: posterior and an evidence of small variance, by SMC from the optima to the posterior.
 
     Attributes:
         climb: settings of the search for optima.
         rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
-        particles: per replicate; None takes as many as the budget serves.
+        particles: number per replicate; None takes the largest number that the budget allows.
         replicates: independent repetitions.
         target_ess: share of effective particles kept from one target to the next.
-        draws: as of `SmcConfig`.
+        draws: see `SmcConfig`.
     """
 
     climb: LaplaceConfig = field(default_factory=LaplaceConfig)
@@ -117,7 +118,7 @@ class BridgedProblem(ProblemDefaults):
         return self.mixture.log_density(u)
 
     def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n 1"], Int[Any, " n"]]:
-        """What the mixture lacks to the posterior."""
+        """Log posterior less log density of the mixture, as a single row."""
         u = self.to_unconstrained(values)
         rows, status = self.problem.row_log_likelihood(
             self.problem.from_unconstrained(jnp.asarray(u)), self.problem.n_rows
@@ -126,8 +127,9 @@ class BridgedProblem(ProblemDefaults):
         return (density - self.mixture.log_density(u))[:, None], np.asarray(status)
 
     def carried_back(self, draws: Draws, names: tuple[str, ...]) -> tuple[Float[np.ndarray, "chain draw d"], Draws]:
-        """Draws from the bridge as points of the other problem, and as draws of its parameters, or of those that it is
-        a view of."""
+        """Draws from the bridge as points of the other problem, and as draws of its parameters, or of the parameters it
+        is a view of.
+        """
         u = np.stack([draws[name] for name in self.names], axis=-1)
         values = self.problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
         return u, {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in names}
@@ -154,7 +156,7 @@ def sample_from_modes(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """Sample from around optima that are known to the posterior; the climbs' cost is part of the result's."""
+    """Sample from around optima that are known to the posterior; the result includes the cost of the optimisations."""
     moment_key, run_key = jax.random.split(key)
     view: Problem = problem
     modes, ledger, sampling = found.modes, found.climbs.ledger, config.sampling
@@ -165,8 +167,8 @@ def sample_from_modes(
     sampled = sampler.run(bridged, sampling, run_key, logbook)
     _, draws = bridged.carried_back(sampled.draws, problem.names)
     spent = ledger + sampled.spent
-    # Several optima are what the mixture is for: no caution here, unlike in Laplace alone.
-    # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
+    # Several optima are normal for the mixture: no caution here, unlike in Laplace alone. The sampler's cautions about
+    # coordinates and its share of rollouts are restated below for parameters and the total.
     kept = stage_cautions(sampled.trace, sampling.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     first = found.climbs.trace[0]["horizon"]
@@ -196,15 +198,15 @@ def sample_from_modes(
 class ModeMixture:
     """Inflated Student-t distributions around modes, with a share of draws from the prior.
 
-    The prior's share is a defence: what no climb has found still has particles, and every weight of the posterior
-    against the mixture is bounded by the likelihood over that share.
+    The prior's share is a defence: modes that no optimisation found still have particles, and every weight of the
+    posterior against the mixture is bounded by the likelihood over that share.
 
     Args:
-        problem: whose prior is mixed in.
+        problem: problem whose prior is mixed in.
         modes: normal approximations; their evidences set the shares.
-        inflation: of the scale over the Laplace standard deviation.
-        degrees: of freedom.
-        prior_share: of the draws, 0 to below 1.
+        inflation: factor of the scale over the Laplace standard deviation.
+        degrees: degrees of freedom.
+        prior_share: share of draws from the prior, from 0 to below 1.
     """
 
     def __init__(
@@ -230,12 +232,12 @@ class ModeMixture:
         if from_prior.any():
             values = self.problem.sample_prior(key, int(from_prior.sum()))
             draws[from_prior] = np.asarray(self.problem.to_unconstrained(values), dtype=float)
-        # Halves of the particles move by what the other half looks like, which leaves the target alone only if a
-        # particle's half says nothing of where it is: no order by component.
+        # Halves of the particles move by the statistics of the other half, which preserves the target only if a
+        # particle's half is independent of its position: no order by component.
         return draws[generator.permutation(n)]
 
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
-        """Log density, normalised; minus infinity where coordinates are not finite."""
+        """Log density, normalised; minus infinity if coordinates are not finite."""
         u = np.asarray(u)
         held = np.isfinite(u).all(axis=1)
         u = np.where(held[:, None], u, 0.0)
@@ -253,8 +255,8 @@ def _student_t(
 ) -> Float[np.ndarray, " n"]:
     """Log density of a multivariate Student-t by the Cholesky factor of its scale.
 
-    scipy's takes eigenvalues below 4.5e-10 of the largest for zero and leaves their directions out of the density,
-    which parameters of unlike units (1e-4 beside 10), or a slope and an intercept far off, fall below.
+    scipy treats eigenvalues below 4.5e-10 of the largest as zero and drops their directions. Parameters of different
+    units (1e-4 and 10), or a slope with a distant intercept, fall below this limit.
     """
     d = len(mean)
     distance = squared_distance(factor, u - mean)
@@ -284,9 +286,9 @@ def joint_covariance(information: Float[np.ndarray, "d d"], prior: Float[np.ndar
     """Covariance of a normal posterior, by the likelihood's information and the prior's covariance.
 
     Differences across a cliff of the likelihood may promise 1e20 times the prior's precision. The sum of the two,
-    rounded, would know nothing of the prior, and its inverse have directions without a variance. What rounding leaves
-    of the largest information, and what is negative, is therefore none; and in deviations of the prior, no deviation
-    is less than `NARROWEST` of the largest.
+    rounded, would know nothing of the prior, and its inverse have directions without a variance. Information within the
+    rounding error of the largest, or negative, is therefore set to zero. In units of the prior's deviations, no
+    deviation is less than `NARROWEST` of the largest.
     """
     root = _root(prior)
     values, vectors = np.linalg.eigh(root.T @ information @ root)
@@ -296,7 +298,7 @@ def joint_covariance(information: Float[np.ndarray, "d d"], prior: Float[np.ndar
 
 
 def _root(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """A matrix R with R R' = covariance, regular where draws are linearly dependent, too."""
+    """A matrix R with R R' = covariance, also regular for linearly dependent draws."""
     sd = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
     return sd[:, None] * vectors * np.sqrt(np.maximum(values, NARROWEST**2))
@@ -311,6 +313,6 @@ def _with_prior_moments(
     root = _root(prior)
     of_prior = np.linalg.solve(root.T, np.linalg.solve(root, mean - mode.mean))
     centre = mode.mean + covariance @ (mode.slope + of_prior)
-    # Of the two neither is known to be the better: they get equal shares.
+    # Neither of the two is known to be better: they get equal shares.
     wide = Laplace(centre, covariance, 0.0)
     return wide._replace(log_density=mode.log_evidence - wide.log_evidence)

@@ -1,8 +1,8 @@
-"""How SMC moves its particles: proposals that the population tunes by itself, and coordinates that suit them.
+"""How SMC moves its particles: self-tuning proposals, and suitable coordinates.
 
 - `propose`: preconditioned Crank-Nicolson steps, shaped by the covariance of the particles.
 - `StraightProblem`: logarithms of positive parameters, in which ridges are straight.
-- `BlockProblem`: whole blocks of rows as rows, which a survey of modes tempers one after the other.
+- `BlockProblem`: whole blocks of rows as rows, which a pilot run tempers in sequence.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.problem import ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.inference.modes.climb import Laplace
 
-POSITIVE_DRAWS = 1000  # from the prior, which tell which parameters are positive
+POSITIVE_DRAWS = 1000  # from the prior, which show the positive parameters
 
 
 class Reference(NamedTuple):
@@ -39,8 +39,8 @@ class Reference(NamedTuple):
 def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> Reference:
     """Weighted mean and covariance.
 
-    Shrunk towards its diagonal only where too few particles are effective to span the space: a ridge, such as that of
-    stiffness and mass, is a correlation near one, and a little shrinkage makes proposals across it hopeless.
+    The covariance is shrunk towards its diagonal only if too few particles are effective to span the space. A ridge,
+    such as stiffness and mass, is a correlation near one; even a little shrinkage makes proposals across it fail.
     """
     d = position.shape[1]
     mean = weights @ position
@@ -48,7 +48,7 @@ def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
     covariance = (weights[:, None] * centred).T @ centred
     shrinkage = max(0.0, 1.0 - distinct_size(position, weights) / (2.0 * (d + 1)))
     diagonal = np.diag(covariance)
-    # Of each coordinate: units may differ by powers of ten. Copies of one particle spread by what is rounded off.
+    # Per coordinate: units may differ by powers of ten. Copies of one particle spread by rounding.
     rounding = np.finfo(float).eps * np.max(np.abs(position), axis=0)
     floor = np.maximum(1e-12 * diagonal, np.maximum(rounding**2, 1e-200))
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)
@@ -56,14 +56,14 @@ def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
 
 
 def distinct_size(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> float:
-    """Effective number of particles where copies of one, which resampling leaves, count together."""
+    """Effective number of particles with copies from resampling counted once."""
     _, group = np.unique(position, axis=0, return_inverse=True)
     merged = np.bincount(group.ravel(), weights)
     return float(merged.sum() ** 2 / np.sum(merged**2))
 
 
 def initial_scale(d: int) -> float:
-    """Step before anything is known of the acceptance: that of a random walk, 2.38 / sqrt(d), at most 1."""
+    """Initial step size: 2.38 / sqrt(d) as for a random walk, at most 1."""
     return float(min(2.38 / np.sqrt(d), 1.0))
 
 
@@ -90,10 +90,10 @@ def propose(
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
     """Propose for all particles at once.
 
-    ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible
-    with respect to a Student-t of the reference's location and spread (the t-preconditioned Crank-Nicolson proposal of
-    Grumitt, Karamanis and Seljak 2024). At scale 1 it nearly forgets where it came from, so that one move decorrelates
-    a population that is close to normal; at small scales it is a random walk.
+    ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible with respect to a
+    Student-t of the reference's location and spread (the t-preconditioned Crank-Nicolson proposal of Grumitt, Karamanis
+    and Seljak 2024). At scale 1 it is nearly independent of the old position, so a single move decorrelates a nearly
+    normal population; at small scales it is a random walk.
 
     Returns:
         proposals, and the log of the proposal's part of the acceptance ratio.
@@ -124,17 +124,16 @@ def slowest_correlation(
 
 
 def squared_distance(factor: Float[np.ndarray, "d d"], centred: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Of each point from the centre, in deviations of the covariance whose Cholesky factor is given."""
+    """Squared Mahalanobis distance of each point, from the Cholesky factor of the covariance."""
     return np.sum(solve_triangular(factor, centred.T, lower=True) ** 2, axis=0)
 
 
 class StraightProblem:
-    """The same posterior in other coordinates: logarithms of what is positive, the problem's own for the rest.
+    """The same posterior in other coordinates: logarithms of positive parameters, the problem's own for the others.
 
     Args:
-        problem: whose unconstrained coordinates belong to one parameter each, or to one in units of another that is
-            positive.
-        key: for the prior draws that tell which parameters are positive.
+        problem: problem whose coordinates belong to one parameter each, possibly in units of a positive parameter.
+        key: random key of the prior draws that show which parameters are positive.
     """
 
     def __init__(self, problem: ResidualProblem, key: PRNGKeyArray) -> None:
@@ -151,7 +150,7 @@ class StraightProblem:
         return self.problem.sample_prior(key, n)
 
     def to_unconstrained(self, values: Values) -> Float[Any, "n d"]:
-        """Logarithms where they are taken."""
+        """Coordinates of values: logarithms of positive parameters, the problem's own for the others."""
         own = jnp.asarray(self.problem.to_unconstrained(values))
         value = jnp.stack([jnp.asarray(values[name]) for name in self.names], axis=-1)
         return jnp.where(self.logarithmic, jnp.log(jnp.where(self.logarithmic, value, 1.0)), own)
@@ -161,7 +160,7 @@ class StraightProblem:
         v = jnp.asarray(v)
         rest = self.problem.from_unconstrained(jnp.where(self.logarithmic, 0.0, v))
         positive = {name: jnp.exp(v[:, j]) for j, name in enumerate(self.names) if self.logarithmic[j]}
-        # What is a deviation in units of a standard deviation has to know that one's own coordinate.
+        # A deviation in units of a standard deviation depends on that deviation's own coordinate.
         u = jnp.asarray(self.problem.to_unconstrained({**rest, **positive}))
         return {**self.problem.from_unconstrained(jnp.where(self.logarithmic, u, v)), **positive}
 
@@ -194,7 +193,7 @@ class StraightProblem:
         )
 
     def _own_and_slope(self, v: Float[Any, "n d"]) -> tuple[Float[Any, "n d"], Float[Any, "n d"]]:
-        """The problem's own coordinates, and the derivative of each by the one here."""
+        """The problem's own coordinates, and their derivatives by the coordinates of this problem."""
         return padded(self._compiled, v)
 
     @cached_property

@@ -1,7 +1,7 @@
 """Sequential Monte Carlo whose stages lengthen the horizon: prior, posterior given h1 rows, ..., given all rows.
 
-Inside a block of rows the path is followed row by row, a row being brought in by shares where it says too much at
-once, so that every target is the posterior of a prefix (or nearly), and the evidence of EVERY prefix falls out.
+Inside a block of rows the path is followed row by row, and a very informative row is added in shares. Every target is
+then (nearly) the posterior of a prefix, which yields the evidence of EVERY prefix.
 """
 
 from __future__ import annotations
@@ -53,19 +53,20 @@ FROM_PRIOR = "smc_from_prior"
 
 @dataclass(frozen=True, repr=False)
 class SmcConfig(MethodOptions, called="SMC"):
-    """Horizon SMC: posterior and evidence of every block of rows, by sampling ever longer prefixes.
+    """Horizon SMC: posterior and evidence of every block of rows, by sampling from growing prefixes.
 
     Attributes:
         rollouts: budget in full-length rollouts, of all replicates together; None for no limit.
-        particles: per replicate; None takes as many as the budget serves, or 1000 without one.
+        particles: number per replicate; None takes the largest number that the budget allows, or 1000 without a budget.
         replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation. None
-            takes as many as the budget serves, up to four, and one without a budget: see `decided`.
+            takes up to four as the budget allows, or 1 without a budget: see `decided`.
         blocks: number of times the horizon is lengthened.
-        spacing: of the blocks: "geometric" or "linear".
+        spacing: spacing of the blocks: "geometric" or "linear".
         target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
         max_moves: most moves in a stage.
         start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
-        draws: fewer particles, of all replicates together, move on with the rest of a budget: see `tempering.prolong`.
+        draws: least number of draws; fewer particles are moved further with the rest of a budget: see
+            `tempering.prolong`.
     """
 
     rollouts: float | None = None
@@ -102,7 +103,7 @@ class SmcConfig(MethodOptions, called="SMC"):
 
     @property
     def tuning(self) -> Tuning:
-        """What a stage needs of this."""
+        """Settings of a stage."""
         return Tuning(self.target_ess, self.max_moves)
 
 
@@ -147,7 +148,7 @@ class SmcState(NamedTuple):
 
 
 def decided(n_rows: int, config: SmcConfig) -> SmcConfig:
-    """The settings with a number of replicates: as many as the budget serves with enough particles each."""
+    """The settings with a number of replicates: the most that the budget allows with enough particles each."""
     if config.replicates is not None or config.rollouts is None:
         return config
     looks = sum(block_boundaries(n_rows, config.blocks, config.spacing)) / n_rows
@@ -263,8 +264,9 @@ def _evaluate(problem: Problem, horizon: int, ledger: Ledger, u: np.ndarray) -> 
 
 
 def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows: int, *, last: bool = False) -> int:
-    """Moves a stage may make. What the rest of the run cannot do without is held back first, and a stage takes at most
-    half of what is then left, so that later stages find something."""
+    """Moves a stage may make. The minimum for later stages is reserved first; a stage takes at most half of the
+    rest.
+    """
     if not np.isfinite(plan.budget):
         return 10**9
     looks = sum(plan.horizons[state.block + 1 :]) / n_rows
@@ -285,7 +287,7 @@ def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
         "the prior excludes the data: no parameter set has a positive likelihood "
         f"up to row {horizon} ({state.ledger.reasons})",
         where="[model.priors]",
-        remedy="widen the priors, or look at what the simulator reports for them",
+        remedy="widen the priors, or look at the simulator's reports for them",
     )
 
 

@@ -1,15 +1,15 @@
-"""Where SMC starts: at the prior where the budget covers that way, else at the optima of a sharp posterior.
+"""Starts of SMC: the prior if the budget covers the path, else the optima of a sharp posterior.
 
-From a prior that is thousands of times wider than the posterior the way takes dozens of stages, and a budget that is
-used up on it ends in a leap that leaves a few particles alive. Some fifty rollouts tell beforehand: the likelihood's
-information at the best of some prior draws says how many stages there are (`way_from_prior`). Where they cost too much,
-climbs look for the optima, and the sampler starts around these (`bridge`). What a start at the prior passes on its way,
-the evidence of the blocks of rows, is then taken by importance sampling around the optima of the prefixes.
+From a prior that is thousands of times wider than the posterior the path takes dozens of stages. An exhausted budget
+then ends in a leap that leaves a few particles alive. Some fifty rollouts predict the number of stages, from the
+likelihood's information at the best of some prior draws (`way_from_prior`). If the stages cost too much, optimisations
+find the optima, and the sampler starts around them (`bridge`). The evidence of the blocks of rows, a by-product of a
+start at the prior, then comes from importance sampling around the optima of the prefixes.
 
-**The length of the way.** A sampler that keeps a share e of effective particles between targets takes steps of length
-sqrt(ln 1/e) in the metric Var(log weight). In coordinates whitened by the prior, where direction j holds the
-information ``lambda_j`` about a value ``m_j`` prior deviations away, a likelihood brought in to the share b changes the
-log weights at the rate
+**The length of the path.** A sampler that keeps a share e of effective particles between targets takes steps of length
+sqrt(ln 1/e) in the metric Var(log weight). In coordinates whitened by the prior, direction j has the information
+``lambda_j`` about a value ``m_j`` prior deviations away. A likelihood with the exponent b changes the log weights at
+the rate
 
     g(b) = sum_j [ lambda_j^2 / (2 (1 + b lambda_j)^2) + lambda_j^2 m_j^2 / (1 + b lambda_j)^3 ],
 
@@ -41,23 +41,23 @@ from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATE
 from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
 
 FROM_OPTIMA = "smc_from_optima"
-CLIMBING = 0.25  # share of the budget that climbs to optima may take
+CLIMBING = 0.25  # share of the budget for optimisations
 SURVEY_OF_ALL = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
-# With fewer, more than half of the surveys of a rugged ridge missed the summit.
+# With fewer, more than half of the pilot runs on a rugged ridge missed the optimum.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
-SURVEYED_STEPS = 7.0  # of the length of the whole recording that a climb after a survey takes, typically
-CLOSE = 1e-2  # nats below its optimum that a climb may end: the sampler starts from a wider distribution
-STEPS = 12.0  # that a climb takes at each horizon, typically
-CLIMBED = 0.6  # share of the work that is done when climbs have ended, for a progress bar
+SURVEYED_STEPS = 7.0  # typical cost of an optimisation after a pilot run, in rollouts of the whole recording
+CLOSE = 1e-2  # nats below its optimum at which an optimisation may end: the sampler starts from a wider distribution
+STEPS = 12.0  # typical steps of an optimisation at each horizon
+CLIMBED = 0.6  # share of the work that is done after the optimisations, for a progress bar
 SCORING = 0.1  # share of the budget for the evidence of the blocks
 SCREEN = 64  # prior draws, the best of which tells the likelihood's information
-MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
+MARGIN = 3.0  # cost of real posteriors over the estimate, which assumes normality and even data
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
-MOVES = 4.0  # of a stage: about 3 where the posterior is normal, more where it is not
-FARTHEST = 5.0  # prior deviations that a value is taken to be away; farther ones are a prior at odds with the data
+MOVES = 4.0  # of a stage: about 3 if the posterior is normal, otherwise more
+FARTHEST = 5.0  # prior deviations of a value at most; farther values mean a conflict of prior and data
 INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # a short prefix says little: its posterior is near the prior
-MOST_STEPS = 12  # of the climb from the optimum of all rows to that of a prefix
+MOST_STEPS = 12  # of the optimisation from the optimum of all rows to the optimum of a prefix
 MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
@@ -76,7 +76,7 @@ def run(
         return sampler.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
         raise InputError(
-            'start = "optimum" is for problems with residuals, and this one has no residuals',
+            'start = "optimum" needs residuals, but this problem has no residuals',
             where="[inference] start",
             remedy='start = "prior", or method = "bridge"',
         )
@@ -93,7 +93,7 @@ def run(
     except NoLikelihoodError:
         if config.start == "optimum":
             raise
-        # No draw to climb from had a likelihood: whether the prior excludes the data is for more particles to say.
+        # No draw had a likelihood for an optimisation: more particles must show whether the prior excludes the data.
         left = replace(config, rollouts=_left(config, spent))
         return _with_cost(sampler.run(problem, left, key, logbook), spent)
     if found is not None:
@@ -109,8 +109,10 @@ def _left(config: SmcConfig, spent: Ledger) -> float | None:
 
 
 def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
-    """A survey, where the budget allows one and no earlier posterior knows where to start; and as many climbs as the
-    budget can bring to an optimum: one that stops on the way misleads what starts from it."""
+    """Settings of the search for optima. A pilot run is made if the budget allows it and no earlier posterior gives
+    starts. The number of optimisations is limited so that each can converge: an unconverged optimum misleads the
+    sampler.
+    """
     if config.rollouts is None:
         return LaplaceConfig()
     surveyors = min(int(SURVEY_OF_ALL * config.rollouts / PER_SURVEYOR), MOST_SURVEYORS)
@@ -125,7 +127,9 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
 
 
 def _worth_judging(problem: Problem, config: SmcConfig) -> bool:
-    """Without a budget a start at the prior never leaps; a small one is better spent on particles than on climbs."""
+    """Without a budget a start at the prior never leaps; a small budget is better spent on particles than on
+    optimisations.
+    """
     if not isinstance(problem, ResidualProblem) or config.rollouts is None:
         return False
     return config.rollouts >= 40.0 * config.chains * max(FEWEST_PARTICLES, len(problem.names))
@@ -138,7 +142,7 @@ def _affordable(way: Way, config: SmcConfig, left: float | None) -> bool:
 
 
 def _several(way: Way, config: SmcConfig, left: float | None) -> SmcConfig:
-    """Settings of a start at the prior: unless it is said how many, as many replicates as can go all the way."""
+    """Settings of a start at the prior: with the largest affordable number of replicates, unless given."""
     config = replace(config, rollouts=left)
     if config.replicates is not None or left is None:
         return config
@@ -150,7 +154,7 @@ def _several(way: Way, config: SmcConfig, left: float | None) -> SmcConfig:
 
 
 def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
-    """What was spent before the sampler began, too."""
+    """Add the cost before the sampler to a result."""
     return replace(result, **(result.spent + ledger).record())
 
 
@@ -297,19 +301,19 @@ def prefix_evidence(
     key: PRNGKeyArray,
     ledger: Ledger,
 ) -> list[PrefixEvidence]:
-    """Evidence of the prefixes ``horizons``, longest first in the work and shortest first in the answer.
+    """Evidence of the prefixes ``horizons``, computed from the longest, returned from the shortest.
 
     Args:
-        problem: with residuals.
-        mode: of all rows, from which the climbs to the prefixes' optima start.
+        problem: problem with residuals.
+        mode: mode for all rows, the start of the optimisations for the prefixes.
         noise: noise coordinates.
         horizons: prefix lengths.
-        budget: full-length rollouts for all of it, half for climbs and half for draws; None for no limit.
+        budget: full-length rollouts, half for optimisations and half for draws; None for no limit.
         key: random key.
-        ledger: is charged.
+        ledger: charged with the cost.
 
     Returns:
-        nothing where the budget does not allow it.
+        the evidences; empty if the budget is too small.
     """
     steps, draws = _affordable_scores(problem, noise, horizons, budget)
     if steps < 1 or draws < FEWEST_DRAWS:
@@ -329,10 +333,10 @@ def prefix_evidence(
 def _affordable_scores(
     problem: ResidualProblem, noise: np.ndarray, horizons: tuple[int, ...], budget: float | None
 ) -> tuple[int, int]:
-    """Steps of each climb, and draws for each prefix."""
+    """Steps of each optimisation, and draws for each prefix."""
     if budget is None or not horizons:
         return MOST_STEPS, MOST_DRAWS
-    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, climb and draws each
+    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, for optimisation and draws each
     d, k = len(noise), int(noise.sum())
     step = 4.0 * d + 7.0  # a Jacobian by differences, noise coordinates, six dampings
     around = 3.0 * step + 8.0 * k**2  # the normal approximation at the end, twice: the second along its own axes

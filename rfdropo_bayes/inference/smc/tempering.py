@@ -32,7 +32,7 @@ from rfdropo_bayes.inference.smc.moves import (
 
 DEGREES = 8.0  # of freedom of the Student-t behind proposals
 ACCEPTANCE = 0.3  # that step sizes are adapted to
-CORRELATION = 0.3  # moves go on until no direction is more correlated than this with where the stage began
+CORRELATION = 0.3  # moves continue until no direction has a larger correlation with the start of the stage
 
 Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -70,18 +70,18 @@ class Tuning(NamedTuple):
 
 
 class StageInfo(NamedTuple):
-    """What one stage did.
+    """Facts about one stage.
 
     Attributes:
-        progress: where on the path it arrived.
-        log_evidence_increment: of the stage.
+        progress: position on the path at its end.
+        log_evidence_increment: its increment of the log evidence.
         row_log_evidence: log evidence, relative to the start of the stage, at each whole row it passed.
-        passed: those rows, as prefix lengths.
+        passed: these rows, as prefix lengths.
         ess: effective sample size before resampling, as a share of all particles.
-        moves: number of moves of every particle, 0 when weights were carried on instead.
-        acceptance: mean acceptance over those moves.
+        moves: number of moves of every particle, 0 if weights were kept instead.
+        acceptance: mean acceptance over the moves.
         scale: step size at the end.
-        correlation: slowest correlation left by the moves.
+        correlation: slowest remaining correlation after the moves.
     """
 
     progress: float
@@ -112,15 +112,15 @@ def advance(
         population: particles at ``population.progress``.
         target_ess: share of effective particles to keep.
         stop: end of the path.
-        leap: go to the end whatever becomes of the weights (for a budget that is used up).
+        leap: go to the end with any weights (for an exhausted budget).
 
     Returns:
-        the reweighted population, what is known of the stage so far, and whether the end was reached with the
-        effective sample size kept.
+        the reweighted population, the facts about the stage so far, and whether the end was reached with the effective
+        sample size kept.
     """
     start = population.progress
     first = int(start)
-    # Columns: density at whole rows from the one at or before the start, relative to it.
+    # Columns: density at whole rows from the row at or before the start, relative to it.
     whole = np.cumsum(population.rows[:, first : int(np.ceil(stop))], axis=1)
     whole = np.concatenate([np.zeros((len(whole), 1)), whole], axis=1)
 
@@ -274,7 +274,7 @@ def refresh(
     resample_key, move_key = jax.random.split(key)
     references = cross_references(population)
     population, index = resample(resample_key, population)
-    # Each particle moves by what the OTHER half looks like: see cross_references.
+    # Each particle moves by the statistics of the OTHER half: see cross_references.
     halves = index >= len(index) // 2
     if moves == 0:
         return population, info
@@ -285,12 +285,12 @@ def refresh(
 def prolong(
     key: PRNGKeyArray, population: Population, evaluate: Evaluate, tuning: Tuning, moves: int, rounds: int
 ) -> Population:
-    """Equal-weight particles, and where each of some rounds of moves under the same target takes them.
+    """Equal-weight particles, with their positions after each round of moves under the same target.
 
-    All are draws of the target; a hundred particles alone make coarse quantiles, the more so as resampling left copies.
+    All are draws of the target; a hundred particles give coarse quantiles, even more so with copies from resampling.
 
-    The key must not be that of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``, and moves
-    by the same random numbers end near where they began.
+    The key must differ from the key of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``,
+    and moves with the same random numbers end near their start.
     """
     found = [population]
     for index in range(rounds):
@@ -310,7 +310,7 @@ def next_step(
     """Longest step along a path of targets that keeps the effective sample size.
 
     Args:
-        log_weights_at: log weights of the particles after a step of the given length; 0 gives the present ones.
+        log_weights_at: log weights of the particles after a step of the given length; 0 gives the present weights.
         longest: length of the step to the end of the path.
         target: effective sample size to keep, as a share of the particles that have weight at the end of the path.
 

@@ -1,8 +1,8 @@
-"""Simulators of others: what names them in an experiment, and how each becomes a `BlackBox`.
+"""Other simulators: their names in an experiment, and adapters that make each a `BlackBox`.
 
-An adapter is a callable that returns a `BlackBox`. One that comes with the package is chosen by the suffix of a model's
-file; any other one is named, ``package.module:attribute`` or ``file.py:attribute``, and gets the keys of the
-experiment's table [adapter]. A new engine needs nothing here: see docs/your_simulator.md.
+An adapter is a callable that returns a `BlackBox`. A bundled adapter is chosen by the suffix of a model's file; any
+other adapter is named, ``package.module:attribute`` or ``file.py:attribute``, and gets the keys of the experiment's
+table [adapter]. A new engine needs nothing here: see docs/your_simulator.md.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ BY_SUFFIX = {
 
 
 def is_adapted(name: str) -> bool:
-    """Whether a robot's name in an experiment is that of another simulator: a model's file, or an adapter."""
+    """Whether a robot's name in an experiment refers to another simulator: a model's file, or an adapter."""
     return Path(name).suffix in BY_SUFFIX or ":" in name[2:]
 
 
 def first_tables(path: Path, markers: Mapping[str, Any], channels: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """What an experiment with a model's file may begin with: the table [adapter], and what of it was assumed.
+    """First table [adapter] of an experiment with a model's file, and its assumptions.
 
     Args:
-        path: of the model.
-        markers: names of measured markers, and where each is first seen [m], None where that is not known.
+        path: path of the model.
+        markers: names of measured markers, and their first seen positions [m], None if unknown.
         channels: names of the commands.
 
     Raises:
-        InputError: a file that no adapter reads, or that cannot be read.
+        InputError: a file that no adapter reads, or an unreadable file.
     """
     module = BY_SUFFIX[path.suffix].partition(":")[0]
     return importlib.import_module(module).first_tables(path, markers, channels)
@@ -49,9 +49,9 @@ def adapted(name: str, folder: Path, options: Mapping[str, Any]) -> BlackBox:
     """The simulator that an experiment names.
 
     Args:
-        name: a model's file, ``package.module:attribute`` or ``file.py:attribute``. The attribute is a `BlackBox`, or
-            what returns one.
-        folder: that files are relative to.
+        name: a model's file, ``package.module:attribute`` or ``file.py:attribute``. The attribute is a `BlackBox`, or a
+            function that returns it.
+        folder: base of relative files.
         options: keys of the table [adapter]: further arguments.
 
     Raises:

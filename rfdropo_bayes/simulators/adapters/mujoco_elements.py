@@ -1,8 +1,8 @@
-"""What of a MuJoCo model may be a parameter: elements and attributes by address, with units, bounds and priors.
+"""Parameters of a MuJoCo model: elements and attributes by address, with units, bounds and priors.
 
-An address is ``kind/name/attribute``: ``joint/elbow/damping``. The number of an element, from zero, stands for its name
-where it has none, and ``*`` in a name for all that match: the parameter is then a factor on all of them. Options have
-no name: ``option/gravity_z``. The table of `ATTRIBUTES` is that of docs/your_simulator.md.
+An address is ``kind/name/attribute``: ``joint/elbow/damping``. The number of an element, from zero, replaces its name
+if it has none, and ``*`` in a name matches any text: the parameter is then a factor on all of them. Options have no
+name: ``option/gravity_z``. docs/your_simulator.md has the table of `ATTRIBUTES`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class Attribute(NamedTuple):
     """An attribute of a kind of element.
 
     Attributes:
-        fields: of MjModel that it stands in, each with a column (None for all of them) and the sign it enters with; all
-            of them change by the same factor.
-        unit: SI unit; of what moves linearly and of what turns, where these differ.
+        fields: its fields of MjModel, each with a column (None for all of them) and the sign it enters with; all of
+            them change by the same factor.
+        unit: SI unit; one for linear and one for rotational motion if these differ.
         signed: whether it may be negative.
         sigma: standard deviation of its logarithm under the default prior.
-        typical: scale of the default prior where its nominal value is zero or it may be negative; as ``unit``.
-        words: what it is.
+        typical: scale of the default prior if its nominal value is zero or it may be negative; in ``unit``.
+        words: its description.
     """
 
     fields: tuple[tuple[str, int | None, float], ...]
@@ -77,7 +77,7 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
     "tendon": {
         "stiffness": _plain("tendon_stiffness", "N/m", 0.5, 100.0, "stiffness"),
         "damping": _plain("tendon_damping", "N s/m", 0.7, 1.0, "damping"),
-        "armature": _plain("tendon_armature", "kg", 0.5, 0.1, "inertia of what winds it"),
+        "armature": _plain("tendon_armature", "kg", 0.5, 0.1, "inertia of its winch"),
         "frictionloss": _plain("tendon_frictionloss", "N", 0.7, 1.0, "dry friction"),
         "springlength": _plain("tendon_lengthspring", "m", 0.05, 0.01, "rest length of the spring"),
     },
@@ -120,7 +120,7 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
         "viscosity": _plain("opt.viscosity", "Pa s", 0.5, 2e-5, "viscosity of the medium"),
     },
 }
-"""What may be a parameter, by kind of element and attribute."""
+"""Possible parameters, by kind of element and attribute."""
 
 RELATIVE = (("body", "inertia"), ("flex", "stiffness"))
 """Attributes of one element that are factors, as no single number has a meaning."""
@@ -133,7 +133,7 @@ SEARCHED = {
     "actuator": ("gain", "kp", "kv", "time_constant"),
     "option": ("gravity_x", "gravity_y", "gravity_z"),
 }
-"""Attributes of all elements that an audit looks at where they are not inferred."""
+"""Attributes of all elements that an audit tests if they are not inferred."""
 
 
 class Place(NamedTuple):
@@ -145,13 +145,13 @@ class Place(NamedTuple):
 
 
 class Edit(NamedTuple):
-    """How one parameter changes a model.
+    """Effect of one parameter on a model.
 
     Attributes:
-        places: what it changes.
-        nominal: value that the model has.
-        form: "value"; "factor" on what the model has; or "offset", added to it.
-        elements: (kind, number, attribute) of what it changes, for the file of a calibrated model.
+        places: changed entries.
+        nominal: value in the model.
+        form: "value"; "factor" on the model's value; or "offset", added to it.
+        elements: (kind, number, attribute) of the changed elements, for the file of a calibrated model.
     """
 
     places: tuple[Place, ...]
@@ -220,15 +220,15 @@ def number_of(model: Any, kind: str, name: str | int, *, where: str) -> int:
 
 
 def edit_of(model: Any, address: str, *, form: str | None = None) -> tuple[Edit, Attribute, str]:
-    """What an address stands for: the edit, its attribute and its unit.
+    """The edit of an address, its attribute and its unit.
 
     Args:
         model: MjModel, unchanged.
         address: ``kind/name/attribute``, or ``option/attribute``.
-        form: of the edit; by default the value of one element, and a factor on several.
+        form: form of the edit; by default the value of one element, and a factor on several.
 
     Raises:
-        InputError: no such kind, element or attribute, with the nearest names; or a factor on what is zero.
+        InputError: no such kind, element or attribute, with the nearest names; or a factor on zero.
     """
     where = f"address {address!r}"
     kind, _, rest = address.partition("/")
@@ -319,7 +319,7 @@ def motion_of(model: Any, joint: int) -> str:
 
 
 def parameter_of(edit: Edit, attribute: Attribute, unit: str, words: str, given: Mapping[str, Any]) -> Parameter:
-    """A parameter with the bounds and the default prior of its kind, where ``given`` says nothing else."""
+    """A parameter with the bounds and the default prior of its kind, unless ``given`` has others."""
     typical = attribute.typical if isinstance(attribute.typical, float) else attribute.typical[unit in _OF_TURNING]
     nominal = {"value": edit.nominal, "factor": 1.0, "offset": 0.0}[edit.form]
     prior: dict[str, Any]
@@ -346,14 +346,14 @@ _OF_TURNING = {"N m/rad", "N m s/rad", "N m", "kg m2", "rad"}
 def searched(
     model: Any, taken: Sequence[tuple[str, int, str]], bodies: Sequence[int]
 ) -> Iterator[tuple[str, str, Edit, Parameter]]:
-    """What an audit asks for beside what is inferred: name, quantity, edit and parameter of each scalar of the model.
+    """Candidates of an audit that are not inferred: name, quantity, edit and parameter of each scalar of the model.
 
-    A quantity that is not zero changes by a factor, and gravity by an offset, so that one prior serves all places.
+    A nonzero quantity changes by a factor, and gravity by an offset, so that the same prior applies everywhere.
 
     Args:
         model: MjModel, unchanged.
-        taken: (kind, number, attribute) of what is inferred.
-        bodies: that are measured: bodies and joints of kinematic trees without any of them are left out.
+        taken: (kind, number, attribute) of inferred scalars.
+        bodies: measured bodies; bodies and joints of kinematic trees without any of them are left out.
     """
     trees = {int(model.body_rootid[body]) for body in bodies}
     for kind, attributes in SEARCHED.items():
@@ -372,7 +372,7 @@ def searched(
                     given = {"low": 1.0 / RANGE, "high": RANGE, "prior": dict(_FACTOR)}
                 family = "gravity" if kind == "option" else f"{kind}_{attribute}" + "_scale" * (edit.form == "factor")
                 if kind == "joint" and edit.form == "value" and motion_of(model, number) == SLIDING:
-                    family += "_sliding"  # in another unit than that of joints that turn
+                    family += "_sliding"  # in another unit than for rotational joints
                 own = attribute.removeprefix("gravity_") if kind == "option" else plain_name(name)
                 yield f"{family}_{own}", family, edit, parameter_of(edit, known, unit, words, given)
 
@@ -381,7 +381,7 @@ _FACTOR = {"distribution": "Normal", "loc": 1.0, "scale": FACTOR_SIGMA}
 
 
 def _matters(model: Any, kind: str, number: int, attribute: str, trees: Container[int]) -> bool:
-    """Whether an attribute of an element can be wrong: masses of what moves, gains of actuators that have them."""
+    """Whether an attribute of an element can be wrong: masses of moving bodies, gains of actuators that have them."""
     if kind == "body":
         moves = model.body_mass[number] > 0.0 and model.body_weldid[number] != 0
         return bool(moves) and int(model.body_rootid[number]) in trees

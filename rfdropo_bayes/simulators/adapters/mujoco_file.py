@@ -1,7 +1,7 @@
-"""A MuJoCo model with other values, as the text of its file: the user's own, with what was calibrated in its place.
+"""A MuJoCo model with other values, as the text of its file: the user's own, with calibrated values.
 
-Numbers are written in full. Where elements of the text are not those of the model one by one (replicated or composite
-ones, URDF), the text that MuJoCo writes of the model stands in its place, whose other numbers have six digits.
+Numbers are written in full. If elements of the text and of the model do not correspond (replicas, composites, URDF),
+MuJoCo's own text of the model is used, whose other numbers have six digits.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ TRANSPARENT = ("frame",)
 
 
 def model_text(rollouts: Any, model: Any, path: Path, names: Iterable[str], remarks: Sequence[str]) -> str:
-    """Text of an MJCF file of ``model``, which differs from that of ``rollouts`` by the parameters of these names.
+    """Text of an MJCF file of ``model``, which differs from the model of ``rollouts`` by the parameters of these names.
 
     Raises:
-        InputError: the file cannot say what the model is.
+        InputError: the file cannot describe the model.
     """
     elements = sorted({element for name in names for element in rollouts.edits[name].elements})
     for text in _texts(rollouts.spec, path):
@@ -34,12 +34,12 @@ def model_text(rollouts: Any, model: Any, path: Path, names: Iterable[str], rema
         if written is not None and _same(rollouts, model, written):
             return written
     raise InputError(
-        "its file cannot say what was calibrated", where=str(path), remedy="export --phi, and set it there"
+        "its file cannot contain the calibrated values", where=str(path), remedy="export --phi, and set it there"
     )
 
 
 def _texts(spec: Any, path: Path) -> Iterator[str]:
-    """The file's own text, with what it includes, then that which MuJoCo writes."""
+    """The file's own text with included files, then MuJoCo's text."""
     own = path.read_text(encoding="utf-8")
     if path.suffix == ".xml" and "<mujoco" in own:
         yield ET.tostring(_included(ET.fromstring(own), path.parent), encoding="unicode")
@@ -47,7 +47,7 @@ def _texts(spec: Any, path: Path) -> Iterator[str]:
 
 
 def _included(root: ET.Element, folder: Path) -> ET.Element:
-    """An element with its ``include`` elements replaced by what they name."""
+    """An element with its ``include`` elements replaced by the included files."""
     for parent in list(root.iter()):
         for place, child in reversed(list(enumerate(list(parent)))):
             if child.tag == "include":
@@ -59,7 +59,7 @@ def _included(root: ET.Element, folder: Path) -> ET.Element:
 def _edited(
     text: str, model: Any, elements: Iterable[tuple[str, int, str]], folder: Path, remarks: Sequence[str]
 ) -> str | None:
-    """The text with the values of a model; None where elements are not one by one those of the model."""
+    """The text with the values of a model; None if its elements do not correspond to the model's."""
     root = ET.fromstring(text)
     known = _elements_of(root)
     counts = {"joint": model.njnt, "geom": model.ngeom, "site": model.nsite, "body": model.nbody}
@@ -135,7 +135,7 @@ def _write(root: ET.Element, element: ET.Element, model: Any, kind: str, number:
 
 
 def _first_word(element: ET.Element, name: str, values: Any) -> None:
-    """Write a value in the place of the first ones of an attribute; what follows them, such as coefficients, stays."""
+    """Replace the first numbers of an attribute; later numbers, such as coefficients, are kept."""
     given = np.atleast_1d(values)
     rest = element.get(name, "").split()[len(given) :]
     element.set(name, " ".join([_words(given), *rest]))
@@ -154,7 +154,7 @@ def _write_joint(root: ET.Element, element: ET.Element, model: Any, number: int,
 
 
 def _write_inertial(root: ET.Element, body: ET.Element, model: Any, number: int) -> None:
-    """State mass and inertia of a body, which may have been those of its geoms."""
+    """State mass and inertia of a body, which may have come from its geoms."""
     compiler = root.find("compiler")
     if compiler is not None and compiler.get("inertiafromgeom") == "true":
         compiler.set("inertiafromgeom", "auto")

@@ -1,4 +1,4 @@
-"""Lanes of a MuJoCo model that go on from where they were left, each with parameters of its own."""
+"""Lanes of a MuJoCo model that continue from their state, each with its own parameters."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 class MuJoCoLanes:
     """Bodies of a session: see `simulators.body_lanes.BodyLanes`. The material of a lane is its parameters by name.
 
-    Motion is that of whole rollouts, to the tolerance of MuJoCo's solver where it has constraints: each period begins
-    its first solve anew.
+    Motion equals that in whole rollouts, to the tolerance of MuJoCo's solver if there are constraints, because each
+    period restarts the solver.
 
     Args:
-        rollouts: of the model.
-        count: how many lanes.
+        rollouts: rollouts of the model.
+        count: number of lanes.
     """
 
     def __init__(self, rollouts: MuJoCoRollouts, count: int) -> None:
@@ -82,7 +82,7 @@ class MuJoCoLanes:
             self._state[rows] = states[:, -2]
         late = states[:, -1, 0] - begun - (steps + 1) * clock
         self._failed[rows] |= ~((np.abs(late) < 0.5 * clock) & np.isfinite(states[:, -1]).all(axis=1))
-        position, tension = self.rollouts.shown(seen)  # the first row: what a new command exerts before it has moved
+        position, tension = self.rollouts.shown(seen)  # the first row: tensions of a new command before any motion
         diverged: Bool[np.ndarray, " row"] = self._failed[rows].copy()
         sound = ~diverged[:, None]
         return Motion(

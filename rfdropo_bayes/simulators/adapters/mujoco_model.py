@@ -1,8 +1,8 @@
 """A MuJoCo model, MJCF or URDF, in the robot's place: ``MuJoCo("arm.xml", markers=..., channels=..., parameters=...)``.
 
-A rollout takes the model as it is, sets the parameters of its lane (`mujoco_elements`), lets MuJoCo find again what
-follows from them (`mj_setConst`), and plays the commands as ``ctrl``, each in force over the step that ends with its
-row. All lanes run at once in `mujoco.rollout`, on all processors.
+A rollout takes the unchanged model, sets the parameters of its lane (`mujoco_elements`), lets MuJoCo recompute derived
+constants (`mj_setConst`), and plays the commands as ``ctrl``, each in force over the step that ends with its row. All
+lanes run at once in `mujoco.rollout`, on all processors.
 """
 
 from __future__ import annotations
@@ -67,27 +67,27 @@ def MuJoCo(
 
     Args:
         path: an MJCF or URDF file.
-        markers: what each marker is: ``{marker: site}``, or ``"body/NAME"`` or ``"geom/NAME"`` for the origin of a body
-            or the centre of a geom; a list where they have the same names; all sites by default.
+        markers: element of each marker: ``{marker: site}``, or ``"body/NAME"`` or ``"geom/NAME"`` for the origin of a
+            body or the centre of a geom; a list if they have the same names; all sites by default.
         channels: the actuator of each command: ``{command: actuator}``, by name or number; all of them by default.
             Actuators without a command keep the value of the keyframe, or zero.
-        parameters: what may be inferred: ``{parameter: address}``, see `mujoco_elements`; an address may stand in a
-            table with ``low``, ``high``, ``prior``, ``unit`` or ``nominal`` of one's own. What is not named is a
-            candidate of an audit, by kind.
+        parameters: parameters that may be inferred: ``{parameter: address}``, see `mujoco_elements`; an address may
+            stand in a table with ``low``, ``high``, ``prior``, ``unit`` or ``nominal`` of your own. Other attributes
+            are candidates of an audit, by kind.
         cables: actuators whose pull is measured as a tension [N]: ``{cable: actuator}``.
         start: "rest", the model's reference pose without speed; "settled", the equilibrium under the first command,
             found from there by letting it move and taking its kinetic energy away at each peak; or the name or
             number of a keyframe.
-        time_step: of the simulation [s]; that of the file by default.
-        command_unit: of the commands; that of what the actuators act on by default, "-" where they differ.
+        time_step: time step [s]; by default from the file.
+        command_unit: unit of the commands; by default from the actuators' targets, "-" if these differ.
         name: for reports; the model's own by default.
-        lanes: parameter sets that are simulated at once.
-        threads: one per processor by default.
+        lanes: number of parameter sets simulated at once.
+        threads: number of threads; one per processor by default.
         difference: see `BlackBox`.
 
     Raises:
-        InputError: no such file, one that MuJoCo does not read, or names and addresses that the model does not have,
-            with the nearest ones.
+        InputError: no such file, a file that MuJoCo cannot read, or unknown names and addresses, with the nearest
+            matches.
     """
     spec = _read(Path(path))
     if time_step is not None:
@@ -151,7 +151,9 @@ def _markers(spec: Any, markers: Mapping[str, str] | Sequence[str] | None) -> di
         markers = names["site"]
     if not markers:
         remedy = f'markers = {{tip = "body/NAME"}}; bodies: {", ".join(names["body"])}'
-        raise InputError("the model has no named site: say which elements are markers", where="markers", remedy=remedy)
+        raise InputError(
+            "the model has no named site: state the elements of the markers", where="markers", remedy=remedy
+        )
     given = dict(markers) if isinstance(markers, Mapping) else {each: each for each in markers}
     found = {}
     for marker, place in given.items():
@@ -180,7 +182,7 @@ def first_tables(path: Path, markers: Mapping[str, Any], channels: Sequence[str]
 
 
 def _check_actuators(model: Any, path: Path) -> None:
-    """Raise an InputError where a model has nothing to command, as every URDF."""
+    """Raise an InputError if a model has no actuator, as in every URDF."""
     if model.nu == 0:
         remedy = "add actuators to its file"
         if path.suffix == ".urdf":
@@ -279,7 +281,7 @@ class MuJoCoRollouts:
 
     @property
     def engine(self) -> str:
-        """What computes the motion."""
+        """Name and version of the engine."""
         import mujoco
 
         return f"mujoco {mujoco.__version__}"
@@ -305,20 +307,20 @@ class MuJoCoRollouts:
 
     @property
     def stroke(self) -> float:
-        """Size of usual commands: half the mean of their ranges, one where there is none."""
+        """Size of usual commands: half the mean of their ranges, 1 without ranges."""
         ranges = [np.ptp(self.model.actuator_ctrlrange[k]) for k in self.actuators.values()]
         return 0.5 * float(np.mean([r if r > 0.0 else 2.0 for r in ranges]))
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
-        """Range of each channel's command, where its actuator has one."""
+        """Range of each channel's command, if its actuator has a range."""
         ranges = {name: self.model.actuator_ctrlrange[k] for name, k in self.actuators.items()}
         limited = {name for name, k in self.actuators.items() if self.model.actuator_ctrllimited[k]}
         return {name: (float(low), float(high)) for name, (low, high) in ranges.items() if name in limited}
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the compiled model and of what is measured of it."""
+        """Digest of the compiled model and of its measured elements."""
         import mujoco
 
         content = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
@@ -348,8 +350,9 @@ class MuJoCoRollouts:
     def __call__(
         self, values: Mapping[str, Float[np.ndarray, " n"]], commands: Float[np.ndarray, "n row channel"]
     ) -> dict[str, np.ndarray]:
-        """Roll out a batch: positions (n, row, marker, 3) [m] and tensions (n, row, cable) [N], NaN where a rollout
-        diverged."""
+        """Roll out a batch: positions (n, row, marker, 3) [m] and tensions (n, row, cable) [N], NaN after a diverged
+        rollout.
+        """
         models = self.models(values, len(commands))
         ctrl = np.tile(self.first[1], (*commands.shape[:2], 1))
         ctrl[:, :, list(self.channels.values())] = commands
@@ -382,7 +385,7 @@ class MuJoCoRollouts:
         """The model under some values as a file: its suffix and its text, which begins with ``remarks``.
 
         Raises:
-            InputError: the file cannot say what the model is.
+            InputError: the file cannot describe the model.
         """
         (model,) = self.models({name: np.array([value]) for name, value in values.items()}, 1)
         return ".xml", model_text(self, model, self.path, values, remarks)
@@ -408,18 +411,18 @@ class MuJoCoRollouts:
     def rolled(
         self, models: list[Any], state: Float[np.ndarray, "n state"], ctrl: Float[np.ndarray, "n step ctrl"]
     ) -> tuple[Float[np.ndarray, "n step state"], Float[np.ndarray, "n step sensor"]]:
-        """States after each step, and what sensors told before it."""
+        """States after each step, and sensor values before it."""
         with _unheard():
             return self._pool.rollout(models, self._data, state, np.ascontiguousarray(ctrl))
 
     def shown(
         self, sensed: Float[np.ndarray, "n step sensor"]
     ) -> tuple[Float[np.ndarray, "n step marker 3"], Float[np.ndarray, "n step cable"]]:
-        """Positions of the markers [m] and pulls of the cables [N] in what sensors told."""
+        """Positions of the markers [m] and pulls of the cables [N] from sensor values."""
         return sensed[:, :, self._places], -sensed[:, :, self._pulls]
 
     def begin_lanes(self, count: int) -> MuJoCoLanes:
-        """So many models that go on from where they were left, for sessions; see `MuJoCoLanes`."""
+        """Lanes for a session, which continue from their state; see `MuJoCoLanes`."""
         return MuJoCoLanes(self, count)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""What an experiment with a MuJoCo model begins with: which elements are its markers, commands and parameters."""
+"""First table of an experiment with a MuJoCo model: elements of markers, commands and parameters."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ INFERRED = (
     ("tendon", "stiffness"),
     ("tendon", "damping"),
 )
-"""What is inferred of a model that has it: one factor on all of them."""
+"""Quantities inferred by default, each as a factor on all elements."""
 
 
 def adapter_tables(
     model: Any, markers: Mapping[str, Float[np.ndarray, "3"] | None], channels: Sequence[str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """The table [adapter] of a first experiment, and what of it was assumed, in words.
+    """The table [adapter] of a first experiment, and its assumptions, in words.
 
-    A marker is the site, body or geom of its name; else the site nearest to where it is first seen while the model is
-    in its reference pose, or the body where there is no site left.
+    A marker is the site, body or geom of its name; else the site nearest to its first seen position in the model's
+    reference pose, or the nearest body if no site remains.
 
     Args:
         model: MjModel.
-        markers: names of measured markers, and where each is first seen [m].
+        markers: names of measured markers, and their first seen positions [m].
         channels: names of the commands.
 
     Raises:
@@ -95,7 +95,7 @@ def _markers(model: Any, markers: Mapping[str, np.ndarray | None]) -> tuple[dict
 
 
 def _all_markers(model: Any, named: Mapping[tuple[str, str], int]) -> tuple[dict[str, str], list[str]]:
-    """All sites, or else all bodies that move, where no recording says what is measured."""
+    """All sites, or else all moving bodies, as markers without a recording."""
     sites = [name for kind, name in named if kind == "site" and not name.isdigit()]
     if sites:
         return {name: f"site/{name}" for name in sites}, []
@@ -108,7 +108,7 @@ def _all_markers(model: Any, named: Mapping[tuple[str, str], int]) -> tuple[dict
         raise InputError(
             "no site and no moving body has a name", where="markers", remedy="name sites in the model's file"
         )
-    told = f"markers are all bodies that move, {', '.join(bodies)}: keep those that are measured"
+    told = f"markers are all bodies that move, {', '.join(bodies)}: keep the measured bodies"
     return {name: f"body/{name}" for name in bodies}, [told]
 
 
@@ -126,10 +126,10 @@ def _channels(model: Any, channels: Sequence[str]) -> tuple[dict[str, str | int]
     own = [alike.get(plain_name(channel).lower()) for channel in channels]
     if all(own):
         return dict(zip(channels, map(_numbered, own), strict=True)), []
-    said = [f"commands are those of the first actuators, in order: {', '.join(names[: len(channels)])}"]
+    said = [f"commands belong to the first actuators, in order: {', '.join(names[: len(channels)])}"]
     return dict(zip(channels, map(_numbered, names), strict=False)), said
 
 
 def _numbered(name: Any) -> str | int:
-    """A number where an element has no name."""
+    """The number of an element without a name, otherwise its name."""
     return int(name) if str(name).isdigit() else name

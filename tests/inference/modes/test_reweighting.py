@@ -10,7 +10,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.modes.mixture import draw_mixture
-from rfdropo_bayes.inference.modes.reweighting import Reweighted, reweighted, reweighting_cautions
+from rfdropo_bayes.inference.modes.reweighting import FIRST, Reweighted, reweighted, reweighting_cautions
 
 from ..toys import LinearGaussian
 
@@ -76,13 +76,27 @@ def test_a_curved_ridge_is_what_quadrature_says():
     np.testing.assert_allclose(found.rows.sum(axis=1).max(), -ROWS * np.log(NOISE), atol=0.01)
 
 
-def test_a_normal_posterior_keeps_its_draws():
-    problem = LinearGaussian(d=2)
+@pytest.mark.parametrize("by_evidence", [False, True])
+def test_a_normal_posterior_needs_no_weights(by_evidence: bool):
+    """The first candidates say so: the draws are the normal's own, and nothing more is spent."""
+    problem, ledger = LinearGaussian(d=2), Ledger()
     mean, covariance = problem.posterior()
-    found = reweighted(problem, [Laplace(mean, covariance, 0.0)], np.ones(1), N, KEY, Ledger(), N)
-    assert found.effective > 0.4 * N  # half of the candidates are wider
-    assert len(np.unique(found.position[:, 0])) > 0.3 * N
+    found = reweighted(problem, [Laplace(mean, covariance, 0.0)], np.ones(1), N, KEY, ledger, N, by_evidence)
+    assert (ledger.evaluations, found.candidates, found.rows) == (FIRST, FIRST, None)
+    assert found.effective == pytest.approx(N, rel=1e-6)
+    assert len(np.unique(found.position[:, 0])) == N
+    np.testing.assert_allclose(np.cov(found.position.T), covariance, atol=0.1 * covariance.max())
     assert reweighting_cautions(found) == []
+
+
+def test_a_normal_of_half_the_width_is_weighted():
+    """Of one coordinate alone: its 100 first draws are worth about 60, which is not all of them."""
+    problem, ledger = LinearGaussian(d=2), Ledger()
+    mean, covariance = problem.posterior()
+    narrow = Laplace(mean, covariance / 4.0, 0.0)
+    found = reweighted(problem, [narrow], np.ones(1), N, KEY, ledger, N)
+    assert ledger.evaluations == N
+    np.testing.assert_allclose(np.sqrt(np.diag(np.cov(found.position.T))), np.sqrt(np.diag(covariance)), rtol=0.15)
 
 
 def test_failed_rollouts_get_no_draw_and_are_counted():

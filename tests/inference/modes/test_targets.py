@@ -13,6 +13,7 @@ from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.modes.climb import Laplace, maximise
 from rfdropo_bayes.inference.modes.mixture import draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
+from rfdropo_bayes.inference.modes.reweighting import FIRST
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig
@@ -35,7 +36,9 @@ def test_a_linear_model_has_its_closed_form_posterior_and_evidence():
     # 2000 independent draws: 5 standard errors of a mean are 0.11 sd, of a deviation 8 %.
     np.testing.assert_array_less(np.abs(draws.mean(axis=0) - mean), 0.11 * sd)
     np.testing.assert_allclose(draws.std(axis=0), sd, rtol=0.08)
-    assert result.rollouts < 64 * 1.5 + 150 + 2 * 2000  # two screenings, the climbs, and draws weighed at most twice
+    assert (
+        result.rollouts < 64 * 1.5 + 150 + FIRST
+    )  # two screenings, the climbs, and the draws that show the normal to fit
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -1,0 +1,181 @@
+"""The base model's noise and posterior mode, point after point: where a search has come to is an answer, too."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
+from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime, about
+from rfdropo_bayes.discrepancy.fit import (
+    WITHIN,
+    Fit,
+    FitTarget,
+    base_optimum,
+    better_nearby,
+    climb,
+    climb_rollouts,
+    optimum_rollouts,
+    poll_rollouts,
+    with_usable_differences,
+)
+from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
+from rfdropo_bayes.discrepancy.journal import Journal
+from rfdropo_bayes.errors import InputError
+
+AGAIN = 3  # times that a base fit is continued from a better point beside it, before it counts as not converged
+# White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
+GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3, "orientation": 0.01}
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Where the search for a base model has come to.
+
+    Attributes:
+        target: data, noise and simulator.
+        x: coordinates of all parameters.
+        fit: that ended there; None before a climb has ended.
+    """
+
+    target: FitTarget
+    x: Float[np.ndarray, " d"]
+    fit: Fit | None = None
+
+    @classmethod
+    def at(cls, target: FitTarget, fit: Fit) -> Reached:
+        """Where a fit ended."""
+        return cls(target, fit.x, fit)
+
+    def settled(self) -> tuple[FitTarget, Fit]:
+        """Target and fit; a point that no fit has ended at takes a rollout of each recording, counts as not converged,
+        and says no more of the base parameters than their prior."""
+        if self.fit is not None:
+            return self.target, self.fit
+        target, fit = self.target, _unfitted(self.target, self.x)
+        if target.noise.source == RESIDUALS:  # a first guess
+            target = replace(target, noise=residual_noise(target, fit))
+            fit = _unfitted(target, self.x)
+        return target, fit
+
+
+def _unfitted(target: FitTarget, x: Float[np.ndarray, " d"]) -> Fit:
+    free = np.arange(target.forward.coordinates.base)
+    residual = target.residual(x[None])[0]
+    covariance = np.diag(target.forward.coordinates.prior_sd[free] ** 2)
+    return Fit(x, free, residual, np.zeros((len(residual), len(free))), covariance, -np.inf, np.inf)
+
+
+def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | None = None) -> FitTarget:
+    """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
+    measurements = measurements_of(problem, range(len(problem.trajectories)), problem.trajectories)
+    noise = problem.stated_noise
+    if measurements.has_repeats:
+        noise = measurements.noise(measurements.spread, 0)
+    if noise is None:
+        scales = [np.full(c.valid.shape[-1], GUESSES[c.name]) for c in measurements.channels]
+        noise = Stacked(tuple(Autoregression(scale, np.ones(1), RESIDUALS, np.inf) for scale in scales))
+    firsts = [group[0] for group in measurements.members]
+    return FitTarget(simulated(problem, False, measurements, firsts, deadline), measurements, noise, journal)
+
+
+def beginning(problem: AuditProblem, target: FitTarget) -> Reached:
+    """Where the search begins: at an earlier calibration, or in the middle of the priors."""
+    coordinates = target.forward.coordinates
+    return Reached(target, coordinates.null if problem.start is None else coordinates.encode(problem.start))
+
+
+def base_fits(
+    problem: AuditProblem, begun: Reached, seed: int, report: Callable[[str], None] = lambda line: None
+) -> Iterator[Reached]:
+    """Better and better base models, from a given start or from where `calibrate`'s search leads; climbed on while
+    rollouts beside it are better. Where the noise is estimated from residuals, noise and fit in turn at the end."""
+    target = begun.target
+    _announce(target, problem.start is None, report)
+    coordinates, known = target.forward.coordinates, target.noise.source != RESIDUALS
+    free = np.arange(coordinates.base)
+    first = base_optimum(target, jax.random.key(seed)) if problem.start is None else begun.x
+    yield Reached(target, first)
+    smooth = with_usable_differences(target, first)
+    if smooth.forward.lanes.difference != target.forward.lanes.difference:
+        report(f"motion is rough: derivatives over relative steps of {smooth.forward.lanes.difference:g}")
+    judge, fit = fit_with_noise(smooth, first, free)
+    for _ in range(AGAIN):
+        yield Reached.at(judge, replace(fit, promise=np.inf))
+        better = better_nearby(judge, fit)
+        if better is None:  # for a motion with kinks, as with slack cables, slopes predict gains that do not exist
+            fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
+            break
+        report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
+        fit = climb(judge, better, free)
+    else:
+        fit = fit if better_nearby(judge, fit) is None else replace(fit, promise=np.inf)
+    yield Reached.at(judge, fit) if known else Reached.at(*under_residual_noise(judge, fit))
+
+
+def base_model(
+    problem: AuditProblem,
+    seed: int,
+    journal: Journal | None = None,
+    report: Callable[[str], None] = lambda line: None,
+    deadline: Deadline | None = None,
+) -> tuple[FitTarget, Fit]:
+    """Noise and base fit; where the noise is estimated from residuals, the two in turn.
+
+    Raises:
+        InputError: the time was up before the base model was fitted.
+    """
+    begun = beginning(problem, first_target(problem, journal or Journal(), deadline))
+    try:
+        *_, last = base_fits(problem, begun, seed, report)
+    except OutOfTime:
+        raise InputError(
+            "the time was up before the base model was fitted",
+            where=(deadline or Deadline()).where,
+            remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--from)",
+        ) from None
+    return last.settled()
+
+
+def under_residual_noise(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
+    """Noise and fit in turn."""
+    converged = fit.converged
+    for _ in range(2):
+        target = replace(target, noise=residual_noise(target, fit))
+        fit = climb(target, fit.x, fit.free)
+    return target, fit if converged else replace(fit, promise=np.inf)
+
+
+def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
+    """Autoregressions fitted to what a model leaves of every recording."""
+    measured = target.measurements
+    left = np.array(measured.spread)
+    for group, error in zip(measured.members, target.errors(fit.x), strict=True):
+        left[list(group)] += error
+    return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+
+
+def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) -> None:
+    """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
+    derivatives, which take as long to compile as rollouts did."""
+    forward, own = target.forward, target.forward.coordinates
+    counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
+    points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)
+    points[:, : own.base] += np.linspace(-0.5, 0.5, len(points))[:, None] * own.prior_sd[: own.base]
+    took = []
+    for _ in range(2):  # the first call compiles
+        began = time.monotonic()
+        forward.observe(np.clip(points, *own.bounds))
+        took.append(time.monotonic() - began)
+    rollouts = climb_rollouts(target, own.base) + poll_rollouts(target)
+    rollouts += optimum_rollouts(target) if searches else 0
+    words = about(rollouts * forward.pace + max(took[0] - took[1], 0.0))
+    report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")

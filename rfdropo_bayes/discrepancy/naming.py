@@ -1,0 +1,157 @@
+"""Naming of causes, step by step; each step is a complete result.
+
+`name_causes` is a generator. A caller that stops early, by the time limit or by the user, has the last `Named` with all
+findings so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
+from rfdropo_bayes.discrepancy.repairs import climbed_again, paying_pair, without_needless
+from rfdropo_bayes.discrepancy.screen import Screen, p_in_words
+
+
+@dataclass(frozen=True)
+class Named:
+    """The base model, and the causes named so far.
+
+    Attributes:
+        search: search beside the base model.
+        base: its fit.
+        steps: mechanisms added to it.
+        screen: score tests of the model with all steps; None if not tested yet.
+        tried: candidates refitted beside that model; None before the first.
+    """
+
+    search: ExtensionSearch
+    base: Fit
+    steps: tuple[Added, ...] = ()
+    screen: Screen | None = None
+    tried: Refits | None = None
+
+    @property
+    def judge(self) -> FitTarget:
+        """The target with the noise of the last model."""
+        return self.steps[-1].judge if self.steps else self.search.target
+
+    @property
+    def fit(self) -> Fit:
+        """The last model."""
+        return self.steps[-1].fit if self.steps else self.base
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the added mechanisms."""
+        return [step.name for step in self.steps]
+
+    @property
+    def asked(self) -> ExtensionSearch:
+        """Search beside the last model."""
+        return self.search.under(self.judge)
+
+    @property
+    def screens(self) -> list[Screen]:
+        """Score tests of the base model and after each step; for the last model only if tested."""
+        return [*(step.before for step in self.steps), *([] if self.screen is None else [self.screen])]
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """Log Bayes factors of the candidates that were refitted beside the last model."""
+        return {} if self.tried is None else self.tried.gains(self.fit)
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Leading candidates that have not been refitted."""
+        return () if self.tried is None else self.tried.waiting
+
+    @property
+    def best(self) -> Added | None:
+        """The best of the candidates that were refitted; None if none is worth it."""
+        if self.screen is None or self.tried is None:
+            return None
+        return self.asked.best(self.screen, self.tried, bool(self.steps))
+
+    def extended(self, steps: Sequence[Added]) -> Named:
+        """The same with other steps, which are yet to be screened."""
+        return replace(self, steps=tuple(steps), screen=None, tried=None)
+
+    def with_best(self) -> Named:
+        """The model with the best refitted candidate, if it has enough evidence."""
+        step = self.best
+        return self if step is None else self.extended([*self.steps, step])
+
+    def with_better(self, fit: Fit) -> Named:
+        """The last model at a better optimum."""
+        if not self.steps:
+            return Named(self.search, fit)
+        last = self.steps[-1]
+        gained = last.log_bayes_factor + fit.log_evidence - last.fit.log_evidence
+        return self.extended([*self.steps[:-1], replace(last, fit=fit, log_bayes_factor=gained)])
+
+
+def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
+    """Forward-stepwise extension of a base model; the last result has the score tests of the final model.
+
+    The base model is replaced if a candidate has led to a better optimum of it.
+    """
+    clock, report, rules = search.target.forward.deadline, search.report, search.rules
+    named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
+    while True:
+        named = _judged(named)
+        found = named.asked.screened(named.fit, named.names)
+        named = replace(named, screen=found)
+        yield named
+        p = found.omnibus.p
+        if not named.steps and p > rules.base_passes:
+            return
+        first = found.rows[0].name if found.rows else "none"
+        report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")
+        if named.asked.room(len(named.steps)) < 1 or p > rules.extended_passes:
+            return
+        with clock.stage("refits"):
+            for tried in named.asked.refits(found):
+                named = replace(named, tried=tried)
+                yield named
+            step = named.best
+            pair = paying_pair(named.asked, found, named.names, step)
+            if pair:
+                named = named.extended([*named.steps, *pair])
+                yield named
+                named = without_needless_steps(named)
+                continue
+            if step is None:
+                return
+            again = climbed_again(named.asked, step) if len(named.steps) not in renewed else None
+            if again is not None:
+                renewed.add(len(named.steps))
+                report(f"without {step.name}, a better optimum than before: the question once more")
+                named = named.with_better(again)
+                continue
+            named = named.with_best()
+            yield named
+            named = without_needless_steps(named)
+
+
+def _judged(named: Named) -> Named:
+    """The last model with the noise of its present residuals."""
+    if not named.steps:
+        return named
+    judge, fit = fit_with_noise(named.judge.measured, named.fit.x, named.fit.free)
+    return named.extended([*named.steps[:-1], replace(named.steps[-1], fit=fit, judge=judge)])
+
+
+def without_needless_steps(named: Named) -> Named:
+    """Without steps that later steps made redundant."""
+    return named.extended(without_needless(named.asked, named.base, named.steps))
+
+
+def without_each_other(steps: Sequence[Added]) -> tuple[Added, ...]:
+    """Steps whose classes do not have mechanisms that are steps themselves: both are in the model, which tells them
+    apart."""
+    named = {step.name for step in steps}
+    return tuple(replace(s, members=tuple(n for n in s.members if n == s.name or n not in named)) for s in steps)

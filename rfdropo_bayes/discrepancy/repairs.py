@@ -1,0 +1,145 @@
+"""Repairs of errors of a stepwise search.
+
+`paying_pair`, if the best step leaves more than twice the noise's variance: compliance and pretension of cables pay
+    only together. `climbed_again`, before a step joins: a candidate must not be named for an effect of base parameters,
+    or for continuing an optimisation that stopped early. `without_needless`, after a further step: a first lag may
+    vanish after a delay and another lag are found, since a mixture of two causes may be named before either.
+
+Two more concern single refits, see `ExtensionSearch`: all sizes of an amplitude are tried, as time shifts have an
+optimum at every jump of a command; and a misspecified model is also optimised from a distant start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.discrepancy.candidates import start_together
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, WIDER, Added, ExtensionSearch
+from rfdropo_bayes.discrepancy.fit import Fit, best_between, climb, heights
+from rfdropo_bayes.discrepancy.inadequacy import far_off
+from rfdropo_bayes.discrepancy.score import joint_statistic
+from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
+
+PAIRS = 3  # that are refitted
+
+
+def paying_pair(search: ExtensionSearch, found: Screen, named: Sequence[str], single: Added | None) -> list[Added]:
+    """Two mechanisms at once, if the best leaves most of a large misfit; empty if they do not pay.
+
+    Pairs are ranked by the linear model, and the leading pairs are refitted.
+
+    Args:
+        search: search beside the present model.
+        found: its score tests.
+        named: mechanisms in it.
+        single: the best single mechanism; None without it.
+    """
+    if search.room(len(named)) < 2:
+        return []
+    fit, last, target = found.fit, single.fit if single else found.fit, search.target
+    taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
+    if not far_off(single.judge if single else target, last.x):
+        return []
+    rows = {row.name: row for row in found.rows if row.probe is not None and row.name != DISCRETISATION}
+    heads = sorted(rows.values(), key=lambda row: -row.lm)[: search.rules.members]
+    drops = {
+        tuple(sorted((a.name, b.name))): joint_statistic(a.probe.mark, b.probe.mark, fit.residual)
+        for a in heads
+        for b in rows.values()
+        if a.name != b.name and a.probe and b.probe
+    }
+    worth = search.rules.evidence + np.log(len(search.candidates))
+    leading = sorted((p for p in drops if drops[p] > taken + 2.0 * worth), key=lambda p: -drops[p])[:PAIRS]
+    fits = {}
+    for names in leading:
+        fits[names] = _refit_pair(search, fit, [rows[name] for name in names])
+        gained = fits[names].log_evidence - fit.log_evidence
+        search.report(f"refit with {' and '.join(names)}: log Bayes factor {gained:.1f}")
+    if not fits:
+        return []
+    best = max(fits, key=lambda names: fits[names].log_evidence - WIDER * len(fits[names].free))
+    enough = search.surpasses(fits[best], single.fit, worth) if single else True
+    if not enough or fits[best].log_evidence < fit.log_evidence + worth:
+        return []
+    alone = {name: search.refit(fit, rows[name]) for name in best}
+    first, second = sorted(best, key=lambda name: -alone[name].log_evidence)
+    between = search.screened(alone[first], [*named, first])
+    gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
+    return [
+        Added(first, (first,), found, alone[first], gains[0], single.refits if single else {}, target),
+        Added(second, (second,), between, fits[best], gains[1], {}, target),
+    ]
+
+
+def _refit_pair(search: ExtensionSearch, fit: Fit, rows: Sequence[ScreenRow]) -> Fit:
+    """The model of a fit with two candidates in it."""
+    probes = [row.probe for row in rows if row.probe is not None]
+    chosen = [c.indices for c in search.candidates if c.name in [row.name for row in rows]]
+    held = [index for probe in probes for index in probe.point]
+    start = best_between(search.target, fit.x, start_together(fit, probes), held, SHARES)
+    return climb(search.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
+
+
+def climbed_again(search: ExtensionSearch, step: Added) -> Fit | None:
+    """The model before a step, optimised again from the step's result; None if that is no better."""
+    before, target = step.before.fit, search.target
+    free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
+    emptied = step.fit.x.copy()
+    emptied[added] = before.x[added]
+    # An effect that base parameters can also explain belongs to them, such as a gain of all cables and the radius of
+    # their drums. Otherwise it would be credited to the candidate.
+    place = {index: k for k, index in enumerate(free)}
+    own, others = ([place[index] for index in chosen] for chosen in (before.free, added))
+    done = step.fit.jacobian[:, others] @ (step.fit.x[added] - before.x[added])
+    imitated = emptied.copy()
+    imitated[before.free] += np.linalg.lstsq(step.fit.jacobian[:, own], done, rcond=1e-6)[0]
+    starts = np.clip(np.stack([emptied, imitated]), *target.forward.coordinates.bounds)
+    again = climb(target, starts[int(np.argmax(heights(target, starts, "without")))], before.free)
+    return again if again.log_evidence > before.log_evidence + 1.0 else None
+
+
+def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tuple[Added, ...]:
+    """Steps without redundant steps: the last model has equal evidence without their parameters."""
+    if len(steps) < 2:
+        return tuple(steps)
+    last, null = steps[-1], search.target.forward.coordinates.null
+    for index in range(len(steps) - 1):
+        if steps[index].name == DISCRETISATION:
+            continue
+        before = steps[index - 1].fit if index else base
+        gone = np.setdiff1d(steps[index].fit.free, before.free)
+        emptied = last.fit.x.copy()
+        emptied[gone] = null[gone]
+        if _nats_to(last.fit, emptied, gone) > TOLD_APART:
+            continue
+        if climb(last.judge, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
+            search.report(f"{steps[index].name} is no longer needed")
+            return without_needless(search, base, without(search, steps, index, base))
+    return tuple(steps)
+
+
+def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: Fit) -> tuple[Added, ...]:
+    """Steps without one step with parameters; later steps are refitted without it."""
+    candidate, null = search.candidate(steps[index].name), search.target.forward.coordinates.null
+    assert candidate is not None
+    gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
+    found, judges = list(steps[:index]), [step.judge for step in steps[: index + 1]]
+    for step in steps[index + 1 :]:
+        before, start = found[-1].fit if found else base, step.fit.x.copy()
+        start[gone] = null[gone]
+        fit = climb(step.judge, start, np.setdiff1d(step.fit.free, gone))
+        under = climb(step.judge.on(judges[-1].forward), before.x, before.free)
+        judges.append(step.judge)
+        found.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
+    return tuple(found)
+
+
+def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:
+    """Least loss [nat] of a model with some coordinates fixed at a point, by the fit's normal approximation."""
+    place = [int(np.flatnonzero(fit.free == index)[0]) for index in moved]
+    apart = fit.x[moved] - point[moved]
+    return 0.5 * float(apart @ np.linalg.solve(fit.covariance[np.ix_(place, place)], apart))
