@@ -130,8 +130,9 @@ def material(
 
 def without_cables() -> CableLayout:
     """Layout of a body that no cable pulls."""
-    none = np.zeros((0, 1, 2))
-    return CableLayout(np.zeros((0, 3)), none.astype(int), none, np.zeros((0, 1, 2, 3)), np.zeros((0, 1), bool))
+    none, guides, piece = np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 1, 1))
+    arm, used = np.zeros((0, 1, 2, 3)), guides.astype(bool)
+    return CableLayout(np.zeros((0, 3)), none.astype(int), none, arm, used, guides, piece.astype(int), piece, piece)
 
 
 def prepare(system: System, material: Material) -> Prepared:

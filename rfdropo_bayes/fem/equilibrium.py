@@ -149,8 +149,9 @@ def _unbalanced(
     place = displaced(task.start._replace(position=found.position, orientation=found.orientation), change)
     body, cables = _body(system, task, place), len(found.softness)
     bonds = _bonds(system, task, place, found.impulse[:cables])
-    line, way = linearised(body), Way(system.clamped_stations, True, system.cables)
-    rows, reached = all_rows(way, body, bonds, line.frame)
+    way = Way(system.clamped_stations, True, system.cables)
+    line = linearised(way, body, bonds.thread, bonds.previous)
+    rows, reached = all_rows(way, body, bonds, line.course)
     forces = line.right + jnp.einsum("sir,r->is", rows, impulse)
     tension = impulse[:cables]
     slack = bonds.reach - reached + (bonds.give + found.softness) * tension

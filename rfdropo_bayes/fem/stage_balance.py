@@ -34,7 +34,7 @@ from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rod_elements import strain_rates
 from rfdropo_bayes.fem.sections import linear
-from rfdropo_bayes.fem.stage_solve import inertia_times, linearised, matrix_times
+from rfdropo_bayes.fem.stage_solve import Way, inertia_times, linearised, matrix_times
 
 
 class _Done(NamedTuple):
@@ -65,7 +65,9 @@ def cable_wrench(system: System, state: State, tension: Float[Array, " cables"])
 def _done(system: System, prepared: Prepared, before: State, after: State, begun: StageBegun, length: Scalar) -> _Done:
     """What a stage did, of this length [s]."""
     body, twist = begun.body, twist_of(after)
-    line, cable = linearised(body), length * cable_wrench(system, begun.at, after.tension)
+    way = Way(system.clamped_stations, begun.stage.predicted, system.cables)
+    line = linearised(way, body, threads(system.cables), begun.at.tension)
+    cable = length * cable_wrench(system, begun.at, after.tension)
     change = (twist - twist_of(before)).T
     residual = (matrix_times(body, line, change) - line.right).T - cable
     rates = strain_rates(line.elements, twist.T)
@@ -133,7 +135,9 @@ def stepped_balance(
         1
     ]
     body = stage_body(system, prepared, first, time_step)
-    still = -linearised(body).right.T / time_step - cable_wrench(system, first, first.tension)
+    way = Way(system.clamped_stations, True, system.cables)
+    right = linearised(way, body, threads(system.cables), first.tension).right
+    still = -right.T / time_step - cable_wrench(system, first, first.tension)
     held = (jnp.arange(len(still)) < system.clamped_stations)[:, None]
     acting = jnp.concatenate([still[None], reached.done.residual / time_step])
     clamp = jnp.where(held, acting, 0.0)

@@ -6,15 +6,8 @@ skipped by flags that are the same for all lanes; cables and softening are a few
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL
-from rfdropo_bayes.fem.native.rod_records import (
-    FIRM,
-    RATE,
-    SLOPE,
-    STRAIN,
-    STRESS,
-    TILTED,
-)
+from rfdropo_bayes.fem.native.chain_cholesky import BLOCK
+from rfdropo_bayes.fem.native.rod_records import FIRM, RATE, SLOPE, STRAIN, STRESS
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.vectors import add_to, added, dot, minus, put, scaled
@@ -109,33 +102,6 @@ def follow_branch(factors, element, work, token):
         behind = load(work.branch, SIZE * element + i, token)
         strain = load(work.element, STRAIN + i, token)
         store(work.branch, SIZE * element + i, fma(share, strain - behind, behind))
-
-
-@kernel
-def _add_dyads(tile, t, a, b, token):
-    """Add a b' to a tile."""
-    for c in range(3):
-        add_to(tile, t + 3 * c, scaled(a, b[c]), token)
-
-
-@kernel
-def add_law_tangent(factors, element, work, whole, token):
-    """Add to the tangent of an element what its bending law has beside the diagonal; ``whole`` as in
-    ``rod_assembly.add_element_tangent``."""
-    rows, upper, elasticity = work.element, (element + 1) * BLOCK, load(factors.elasticity, 0, token)
-    diagonal = upper + PANEL + 9
-    for k in range(3):
-        i, j, entry = (0 if k < 2 else 1), (1 if k < 1 else 2), SLOPE + 3 + (k if k < 2 else 3)
-        scale = elasticity * load(rows, entry, token)
-        a, b = scaled(load3(rows, TILTED + 3 * i, token), scale), load3(rows, TILTED + 3 * j, token)
-        _add_dyads(work.pivot, diagonal, a, b, token)
-        _add_dyads(work.pivot, diagonal, b, a, token)
-        if whole:
-            _add_dyads(work.pivot, diagonal - BLOCK, a, b, token)
-            _add_dyads(work.pivot, diagonal - BLOCK, b, a, token)
-            back = -a[0], -a[1], -a[2]
-            _add_dyads(work.coupling, diagonal, back, b, token)
-            _add_dyads(work.coupling, diagonal, b, back, token)
 
 
 @kernel

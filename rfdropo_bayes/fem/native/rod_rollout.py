@@ -111,7 +111,8 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
     work = rows(
         turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
         border=PANEL * panels * stations, condensed=9 * panels**2, weight=3 * panels, element=ELEMENT,
-        lever=3 * len(tables.guide_station), direction=3 * guides, course=guides, slack=cables, tension=cables,
+        lever=3 * len(tables.guide_station), offset=3 * guides, direction=3 * guides,
+        course=guides, inverse=guides, sharp=guides, slack=cables, tension=cables,
         commanded=cables, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state, **once,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
