@@ -16,7 +16,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
-WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
+WAY = np.geomspace(0.05, 1.5, 12)  # shares of the path from null to a trial shape
 NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
 NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
@@ -136,7 +136,7 @@ def _shapes(target: FitTarget, candidate: Candidate, size: dict[int, float]) -> 
     coordinates = target.forward.coordinates
     seen = [i for i in candidate.indices if size[i] >= UNSEEN]
     unseen = [i for i in candidate.indices if size[i] < UNSEEN]
-    # Beside an amplitude that is seen, another one without effect (a tilt about gravity itself) is no shape.
+    # If an amplitude has an effect, another amplitude without effect (a tilt about gravity itself) is no shape.
     return [i for i in unseen if not seen or not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
 
 
@@ -211,8 +211,8 @@ def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, F
     while True:
         drop, start, best = _best_of(target, fit, _on_the_way(target, fit, probe, ladder))
         low, high = ladder[max(best - 1, 0)], ladder[min(best + 1, len(ladder) - 1)]
-        # Of a stop that cables seldom reach, one rung does nothing and the next one far too much: the data are met
-        # between them.
+        # For a stop that cables seldom reach, a rung has no effect and the next far too much: the optimum lies between
+        # them.
         if drop > NOTHING or high < NEIGHBOURS * low:
             return drop, start
         ladder = np.geomspace(low, high, len(WAY))

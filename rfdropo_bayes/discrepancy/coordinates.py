@@ -251,7 +251,7 @@ class Coordinates:
         for recording, places in enumerate(slots):
             own = (places >= 0) & ~added
             theta[:, recording, places[own]] = values[:, own]
-            for i in np.flatnonzero((places >= 0) & added):  # what a group's value is off the shared one
+            for i in np.flatnonzero((places >= 0) & added):  # deviation of a group's value from the shared value
                 theta[:, recording, places[i]] += values[:, i]
         return theta
 

@@ -111,7 +111,8 @@ def with_differences(
         for family in families([spec for spec in specs if spec.name in own]):
             candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
         candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
-    for scope in groups.complements:  # an effect of either sign is added to what all share, and so may be absent in one
+    # an effect of either sign is added to the shared value, and so may be absent in one
+    for scope in groups.complements:
         candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
     return replace(space, parameters=tuple(found.parameters)), candidates
 

@@ -184,7 +184,7 @@ def signals_of(ports: PortMap, acting: Sequence[tuple[Port, Signals]]) -> Any:
     given = [(port, w) for port, w in acting if port.stage != "sensing"]
     if not given:
         return None
-    # Ports are hashable without the mapping of what is left out.
+    # Ports are hashable without the mapping of excluded ports.
     plain = ports._replace(left_out=())  # type: ignore[arg-type]
     found = [_port_signals(plain, port, w) for port, w in given]
     return jax.tree.map(lambda *parts: np.sum([np.asarray(part) for part in parts], axis=0), *found)

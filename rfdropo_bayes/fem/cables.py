@@ -128,8 +128,8 @@ class Threads(NamedTuple):
 class Courses(NamedTuple):
     """Courses of cables."""
 
-    length: Float[Array, "cables guides ..."]  # from the point before to each guide [m]; zero where unused
-    direction: Float[Array, "3 cables guides ..."]  # derivative of that by the guide's place, zero where unused
+    length: Float[Array, "cables guides ..."]  # from the previous point to each guide [m]; zero if unused
+    direction: Float[Array, "3 cables guides ..."]  # its derivative by the guide's place, zero if unused
     inverse: Float[Array, "cables guides ..."]  # its second derivative is inverse - sharp * direction direction' [1/m]
     sharp: Float[Array, "cables guides ..."]
     lever: Float[Array, "3 cables guides sides ..."]  # of the guides, in space [m]

@@ -373,7 +373,7 @@ def _nothing_carried(state: State) -> Carried:
 class StageBegun(NamedTuple):
     """The linear system of a stage, before its constraints."""
 
-    at: State  # where forces are taken, with the memory of the stage
+    at: State  # state at which forces are taken, with the memory of the stage
     push: Push | None
     stage: Stage  # made longer by impacts
     body: StageBody

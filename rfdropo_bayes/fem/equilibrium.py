@@ -49,7 +49,7 @@ class Task(NamedTuple):
     """Inputs of an equilibrium."""
 
     prepared: Prepared
-    start: State  # where the iterations start; the slip of cables counts from there
+    start: State  # start of the iterations; the slip of cables counts from it
     displacement: Float[Array, " cables"]
     external: Float[Array, "stations 6"]
     slip: Slip | None

@@ -40,7 +40,7 @@ from rfdropo_bayes.fem.stage_solve import Way, inertia_times, linearised, matrix
 class _Done(NamedTuple):
     """Impulses [N s], [N m s] and work [J] of a stage, or of a step."""
 
-    residual: Float[Array, "stations 6"]  # of what holds and touches the body
+    residual: Float[Array, "stations 6"]  # of holding and touching bodies
     held: Float[Array, ""]  # its work
     pulled: Float[Array, ""]  # work of the cables
     lost: Float[Array, ""]  # to Rayleigh damping

@@ -49,9 +49,9 @@ class StageBody(NamedTuple):
     section: Sections
     mass: Float[Array, "stations ..."]  # [kg]
     inertia: Float[Array, "3 stations ..."]  # about the sections' axes [kg m2]
-    position: Vector  # where forces are taken [m]
+    position: Vector  # points at which forces are taken [m]
     orientation: Quaternion
-    twist: Six  # velocities and spins where the stage starts
+    twist: Six  # velocities and spins at the start of the stage
     load: Six  # forces and moments besides [N], [N m]
     span: Scalar  # p [s]
     lookahead: Scalar  # [s] times the tangent times the change of velocity is the change of force
@@ -70,7 +70,7 @@ class Bonds(NamedTuple):
     reach: Float[Array, " cables"]  # commanded lengths [m]
     previous: Float[Array, " cables"]  # impulses that the iterations start from [N s]
     give: Scalar  # of every cable's length per tension [m/N]
-    follows: Scalar  # length of the stage for what has a memory [s]
+    follows: Scalar  # length of the stage for variables with memory [s]
     rows: Float[Array, "stations 6 others"] | None = None  # of friction and contacts
     base: Float[Array, " others"] | None = None  # velocities in these rows besides the body's
     compliance: Float[Array, "others others"] | None = None  # in these rows besides the body's
@@ -89,7 +89,7 @@ class Way(NamedTuple):
 class Solution(NamedTuple):
     """Solution of a stage."""
 
-    change: Float[Array, "6 stations"]  # of velocities and spins; zero where the body is held
+    change: Float[Array, "6 stations"]  # of velocities and spins; zero at held stations
     impulse: Float[Array, " rows"]  # of all constraints [N s]
     converged: Float[Array, ""]  # 1 if the impulses were found, else 0
 

@@ -143,7 +143,7 @@ def _with_offsets(
         valid = recordings.line.valid[index, 0]
         own = [p for p in offsets if p.scope.owner == name]
         if not own or not recordings.line.valid[index].any():
-            continue  # commands alone: where the frame lies is as uncertain as it was among the fitted recordings
+            continue  # commands alone: the position of the frame is as uncertain as among the fitted recordings
         if not valid.any():
             raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
         error = recordings.position[index, 0, valid] - position[:, index, valid]

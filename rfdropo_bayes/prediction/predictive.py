@@ -39,10 +39,10 @@ from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, 
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
-# Among the attributes of a posterior.
+# Keys of a posterior's attributes.
 FITTED = "fitted_recordings"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
-KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
+KNOWN_NOISE = "known_noise"  # of the positions, if its parameters are not inferred
 SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
 PLACE = ("cube_x", "cube_y", "cube_z", "cube_yaw")
 

@@ -33,8 +33,8 @@ from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.budget import budget_within
 
-# Of a derivative, in prior standard deviations. Of the paper's trunk a draw of four snaps within 2e-3, which hides the
-# scale of its modulus and mass; 2e-4 and 2e-5 give the same slopes to five digits.
+# Step of a derivative, in prior standard deviations. A quarter of the draws of the paper's trunk snap within 2e-3,
+# which hides the scale of its modulus and mass; 2e-4 and 2e-5 give the same slopes to five digits.
 STEP = 2e-4
 SETS = 128  # parameter sets that are rolled out in all, about
 PATIENCE = 10.0  # [s]: no more rollouts are begun after these

@@ -46,13 +46,13 @@ class Batch(NamedTuple):
     law: Float[np.ndarray, "batch element_rows"]
     effects: Float[np.ndarray, "batch rows"]
     present: Int[np.ndarray, " flags"]
-    start: Float[np.ndarray, "rows cables"]  # displacements before the first step, those of the initial equilibrium
+    start: Float[np.ndarray, "rows cables"]  # displacements before the first step, of the initial equilibrium
     displacement: Float[np.ndarray, "rows steps cables"]
     loads: Float[np.ndarray, "rows values"]  # forces at the places, two factors and gravity, of each step
     place: Int[np.ndarray, " places"]  # stations that forces act on
     places: int
     count: int
-    start_pitch: int  # from one row to the next, 0 where one serves all
+    start_pitch: int  # from one row to the next, 0 if a single row serves all
     displacement_pitch: int
     loads_pitch: int
 
@@ -63,9 +63,7 @@ class RodOutput(NamedTuple):
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
-    converged: UInt8[
-        np.ndarray, " batch"
-    ]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
+    converged: UInt8[np.ndarray, " batch"]  # 0 if the impulses of a step, or the equilibrium of a row, were not found
     imbalance: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium
     solves: Float[np.ndarray, " batch"]  # of the equilibria of all rows
     records: int
