@@ -31,6 +31,7 @@ from rfdropo_bayes.verbs.slow_motion import slow_motion
 from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
+NO_MOTION = "rows have no times, so each is taken for a robot at rest"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
 """Formats that come from motion capture, which loses markers now and then."""
 FAR_ORIGIN = 0.1
@@ -185,7 +186,8 @@ def write_first_files(
     outline = replace(outline, usual_command=usual or None)
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
-    frame, slow = _frame(plain, made, guess), slow_motion(made, first)
+    timed = guess.time is not None or guess.sample_time is not None
+    frame, slow = _frame(plain, made, guess), slow_motion(made, first) if timed else NO_MOTION
     rows = rows_to_fit(first) if len(recordings) == 1 else None
     placed = write(tables(frame=frame, rows=rows), slow, first)
     seen = _first_recording(placed, folder)
@@ -416,7 +418,7 @@ def _model(
     """The tables [model] and [inference]; ``seen`` is the frame in which a rod at rest explains the recording."""
     mechanisms, tensions = installed_mechanisms(robot, outline.assumed), guess is not None and bool(guess.tensions)
     wanted = ["young_modulus = {}  # over the body's weight: how stiff it is"]
-    if tensions:
+    if tensions or robot.command_unit in ("N", "N m"):
         wanted.append("trunk_mass = {}  # weigh it, and state it under [[model.weighed]]")
     if robot.command_unit == "rad":
         wanted.append("spool_radius = {}  # cable wound up per angle")
