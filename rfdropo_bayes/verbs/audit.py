@@ -14,7 +14,7 @@ import numpy as np
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
+from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
@@ -39,11 +39,10 @@ from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import source_of
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
+    build_model,
     build_simulator,
     expand_groups,
-    gather_channels,
     measurement_specs,
-    model_scopes,
     stated_noise,
 )
 from rfdropo_bayes.model.experiment import AuditTable, NoiseTable
@@ -425,15 +424,15 @@ def _model(
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and how many of its parameters are of the base model, which come
     first. The noise of its channels is known, so that its parameters are not among them."""
-    recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
+    added = simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
-    specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
-    scopes = model_scopes(spec, simulator, specs, *groups, later=added)
-    scopes = scopes.holding(scopes.typical_scales)  # evidences are compared at one spread between groups
+    model = build_model(
+        spec, simulator, trajectories, specs=(*simulator.parameters, *gains), fitted=fitted, later=added
+    )
+    # Evidences are compared at one spread between groups.
+    model = replace(model, scopes=model.scopes.holding(model.scopes.typical_scales))
     of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
-    base = sum(p.spec.name not in of_candidates for p in scopes.parameters)
-    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
-    return TrajectoryModel(simulator, scopes, recordings, channels), base
+    return model, sum(p.spec.name not in of_candidates for p in model.scopes.parameters)
 
 
 def _fields(model: TrajectoryModel) -> list[str]:
