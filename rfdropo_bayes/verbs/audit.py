@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from pydantic import field_validator
 
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
@@ -58,7 +59,7 @@ from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import as_options, stated
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
@@ -76,10 +77,20 @@ JOURNAL = "checkpoints/audit"
 FINER = 2
 
 
-@with_keys_of(AuditTable)
+@as_options
+class AuditOptions(AuditTable):
+    """Options of `rb.audit`: keys of an experiment file's [audit]. Candidates may be classes of one's own."""
+
+    @field_validator("candidates", mode="before")
+    @classmethod
+    def _sources(cls, given: Sequence[Any]) -> list[str]:
+        return [source_of(candidate) for candidate in given]
+
+
 def audit(
     model: Model,
     runs: Sequence[Trajectory] | None = None,
+    options: AuditOptions | None = None,
     *,
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
@@ -91,7 +102,6 @@ def audit(
     workshop: Workshop | None = None,
     show: bool | None = None,
     between: Between | None = None,
-    **keys: Any,
 ) -> Audit:
     """Say what a model lacks, by name, and measure what it gains with that. What is not given is as the experiment file
     of the model has it.
@@ -99,6 +109,7 @@ def audit(
     Args:
         model: what is simulated and inferred.
         runs: recordings that are fitted and screened.
+        options: keys of [audit] that override the model's own file.
         test: unseen recordings, which measure the gain.
         seed: of all that is random, 0 where no file says. The same seed gives the same answer.
         fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
@@ -112,13 +123,11 @@ def audit(
         between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
             Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
             What both lack is named, too.
-        keys: of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
-            ``bootstraps``, ``minutes``.
 
     Raises:
         InputError: bad input, before anything long has started.
     """
-    model = _asked(given_model(model, "audit"), noise, keys)
+    model = _asked(given_model(model, "audit"), noise, stated(options, AuditOptions))
     runs, test = model.runs(runs, test)
     chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)
@@ -190,8 +199,6 @@ def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str
     spec, settings = model.spec, model.settings
     if options:
         chosen = {**settings.audit.model_dump(exclude_unset=True), **options}
-        if "candidates" in chosen:
-            chosen["candidates"] = [source_of(candidate) for candidate in chosen["candidates"]]
         settings = replace(settings, audit=parse_table(AuditTable, chosen, where="audit"))
     if noise is not None:
         spec = replace(spec, stated=parse_table(NoiseTable, noise, where="audit, noise"))
