@@ -26,20 +26,20 @@ Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
 class CalibrationProblem:
     """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a few sizes.
 
-    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is
-    cut into chunks of at most ``chunk`` parameter sets, the last one padded to one of `chunk_sizes`, so that a few
-    compilations serve every batch size, and the number of simulated steps is a run-time argument, so that they serve
+    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is cut
+    into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
+    compilations serve every batch size. The number of simulated steps is a run-time argument, so that they also serve
     every horizon. Problems of one model share its compiled programs.
 
     Attributes:
         model: priors, simulator and data.
         chunk: most parameter sets in one compiled call.
-        earlier: draws of the posterior of another model of the same robot, from which climbs may start; parameters that
-            it lacks start from their priors.
-        other: measured data in place of the model's own; None for these.
-        counted: factors of the log likelihood of some channels; the others count once.
-        jacobian: how Jacobians are taken, see `ResidualProblem`.
-        told: is told of rollouts, in full-length ones, as they are done.
+        earlier: draws of the posterior of another model of the same robot, from which optimisations may start; missing
+            parameters start from their priors.
+        other: measured data in place of the model's data; None for the model's.
+        counted: factors of the log likelihood of some channels; the other factors are 1.
+        jacobian: method of Jacobians, see `ResidualProblem`.
+        told: called with the number of rollouts, in full-length equivalents, after each chunk.
     """
 
     model: TrajectoryModel
@@ -138,19 +138,19 @@ class CalibrationProblem:
         return digest.hexdigest()
 
     def holding(self, values: Mapping[str, float]) -> CalibrationProblem:
-        """The same problem with some parameters known, and no longer inferred; itself where none is."""
+        """The same problem with some parameters fixed; itself if ``values`` is empty."""
         if not values:
             return self
         return replace(self, model=replace(self.model, scopes=self.model.scopes.holding(values)))
 
     def telling(self, spent: Callable[[float], None]) -> CalibrationProblem:
-        """The same problem, which tells of rollouts, in full-length ones, as they are done."""
+        """The same problem, which reports rollouts in full-length equivalents to ``spent``."""
         return replace(self, told=spent)
 
     def with_measured(self, measured: Measured) -> CalibrationProblem:
         """The same problem with other data.
 
-        Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
+        Its Jacobians are central differences of compiled rollouts, because a derivative would be compiled anew.
         """
         return replace(self, other=measured, jacobian="central")
 
@@ -168,7 +168,7 @@ class CalibrationProblem:
         return self.model.scopes.sample(key, n)
 
     def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
-        """Where climbs may start: the prior, with what an earlier posterior knows in its place."""
+        """Starts of optimisations: the prior, with draws of an earlier posterior for its parameters."""
         return self.model.scopes.sample_around(self.earlier, key, n)
 
     def to_unconstrained(self, values: Batch) -> Float[Any, "n d"]:
@@ -203,10 +203,10 @@ class CalibrationProblem:
     def row_log_likelihood(
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon"], Int[np.ndarray, " n"]]:
-        """Log density of each of the first ``horizon`` rows given those before it, summed over recordings.
+        """Log density of each of the first ``horizon`` rows given the earlier rows, summed over recordings.
 
         Returns:
-            rows, minus infinity throughout where the rollout did not end well, and the `Result` code of each set.
+            rows, minus infinity throughout after a failed rollout, and the `Result` code of each set.
         """
         rows, status = self._chunked(self.model.programs.rows, values, horizon, self.measured, self.shares)
         rows = rows[:, :horizon]
@@ -215,9 +215,9 @@ class CalibrationProblem:
         return np.where((status == Result.OK)[:, None], rows, -np.inf), status
 
     def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
-        """Log likelihood of all rows at one unconstrained point; minus infinity where the rollout does not end well.
+        """Log likelihood of all rows at one unconstrained point; minus infinity after a failed rollout.
 
-        Traceable; differentiable backwards where the engine is.
+        Traceable; differentiable in reverse mode if the engine is.
         """
         values = {name: value[0] for name, value in self.from_unconstrained(u[None]).items()}
         rows, status = self.model.row_log_likelihood(values, None, self.measured, self.shares)
@@ -264,14 +264,14 @@ class CalibrationProblem:
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
-        """True where ``observed`` may be used."""
+        """True for usable entries of ``observed``."""
         return self._side_by_side(np.concatenate([c.feature_valid for c in self.model.compared], axis=-1)[None])[0]
 
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
-        """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
+        """Whitened residuals of the first ``horizon`` rows (zero if masked); traceable, for one set of values."""
         white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured, self.shares)
         return self._flat({name: part[None] for name, part in white.items()}, horizon)[0]
 
@@ -281,7 +281,7 @@ class CalibrationProblem:
         return np.asarray(self._flat(white, horizon))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
-        """Whitened residuals of the markers at one set of values, NaN where masked."""
+        """Whitened residuals of the markers at one set of values, NaN if masked."""
         single = {name: np.array([values[name]]) for name in self.names}
         white = self._chunked(
             self.model.programs.white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0)
@@ -326,7 +326,9 @@ class CalibrationProblem:
         return self._chunked(self.model.programs.positions, values, self.n_rows)
 
     def observe(self, values: Batch) -> Observation:
-        """What every recording would show, without observation noise: fields (n, recording, time, ...), status (n,)."""
+        """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),
+        status (n,).
+        """
         return Observation(*self._chunked(self.model.programs.observations, values, self.n_rows))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
@@ -334,7 +336,7 @@ class CalibrationProblem:
         return self._realised(self.model.markers.draw_noise, key, values)
 
     def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:
-        """What ``draw`` makes of a key, the times of a recording and a set of values, for all of both."""
+        """Results of ``draw`` for a key, the times of a recording and a set of values, for all recordings and sets."""
 
         def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             keys = jax.random.split(key, self.n_recordings)
@@ -356,9 +358,9 @@ class CalibrationProblem:
         return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=after)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
-        """Residuals by rollout, cut to the horizon where they have a time axis, and flattened.
+        """Residuals by rollout, cut to the horizon if they have a time axis, and flattened.
 
-        Channels come in the order of the model; a dictionary that JAX returns has another.
+        Channels come in the order of the model; a dictionary that JAX returns has another order.
         """
         cut = []
         for channel in self.model.channels:
@@ -368,7 +370,7 @@ class CalibrationProblem:
 
 
 def _plain(channel: Channel) -> str:
-    """What beside its readings tells a channel from another one."""
+    """Digest of a channel's settings, without its readings."""
     if isinstance(channel, Series):
         known = channel.known
         return repr(None if known is None else (known.scale, known.autocorrelation, known.correlation))

@@ -29,12 +29,12 @@ class InferredParameter:
     """One inferred parameter.
 
     Attributes:
-        spec: name, unit, hard bounds and meaning of the parameter, whoever has it.
+        spec: name, unit, hard bounds and meaning of the parameter, in any scope.
         prior: numpyro distribution, in the parameter's unit, within its hard bounds.
-        table: the prior as it was written, for the record.
-        scope: whose it is. The coordinate of a scaled one in the unconstrained space is its ratio to what scales it (a
-            non-centred parametrisation).
-        members: recordings that it holds for, where it has an owner.
+        table: the prior as written, for the record.
+        scope: its owner. The unconstrained coordinate of a scaled parameter is its ratio to the scale (a non-centred
+            parametrisation).
+        members: recordings for which it holds, if it has an owner.
     """
 
     spec: ParameterSpec
@@ -53,7 +53,7 @@ class InferredParameter:
         *,
         where: str,
     ) -> InferredParameter:
-        """A parameter under a prior, or under its default one where the table is empty."""
+        """A parameter under a prior, or under its default prior if the table is empty."""
         chosen = dict(table) if table else dict(spec.prior)
         prior = prior_from_table(spec, chosen, where=f"{where} {spec.name}")
         return cls(confined(spec, chosen), prior, chosen, scope, members)
@@ -76,7 +76,7 @@ class InferredParameter:
 
     @property
     def of_recording(self) -> bool:
-        """Whether one recording alone has it."""
+        """Whether it belongs to a single recording."""
         return bool(self.scope.owner) and not self.scope.group
 
     def holds_for(self, recording: str) -> bool:
@@ -90,7 +90,7 @@ class InferredParameter:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Where the prior ends, see `ParameterInfo.ends`."""
+        """Ends of the prior, see `ParameterInfo.ends`."""
         support = self.prior.support
         if self.scope.spread:
             return -np.inf, self.spec.high
@@ -98,14 +98,14 @@ class InferredParameter:
         return max(self.spec.low, float(low)), min(self.spec.high, float(high))
 
     def scaled(self, spread: float) -> InferredParameter:
-        """The same parameter where its standard deviation is known."""
+        """The same parameter with a fixed standard deviation."""
         table = {**self.table, "scale": float(spread)}
         return replace(
             self, prior=dist.Normal(0.0, float(spread)), table=table, scope=replace(self.scope, scaled_by="")
         )
 
     def inside(self, values: Float[Array, " n"], otherwise: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Values, those on the edge of the support moved inside, and ``otherwise`` for those beyond it."""
+        """Values, moved inside if on the edge of the support, and ``otherwise`` if beyond it."""
         u = self.transform.inv(values)
         u = jnp.where(jnp.isnan(u), self.transform.inv(otherwise), u)
         return self.transform(jnp.where(jnp.isinf(u), jnp.sign(u) * INTERIOR, u))
@@ -117,9 +117,9 @@ class Pooled:
 
     Attributes:
         spread: standard deviation between groups, in the parameter's unit: the scale of its half-normal prior, or its
-            value where it is known.
+            value if known.
         groups: recordings of each group, by the group's name.
-        family: parameters with the same family have one spread, ``<family>_spread``; empty where the spread is known.
+        family: parameters with the same family have one spread, ``<family>_spread``; empty if the spread is known.
     """
 
     spread: float
@@ -128,7 +128,7 @@ class Pooled:
 
 
 def spread_of(spec: ParameterSpec, pooled: Pooled) -> list[InferredParameter]:
-    """The standard deviation between groups of all parameters of a family, where it is inferred.
+    """The standard deviation between groups of all parameters of a family, if it is inferred.
 
     Half-normal, because two or three groups leave the upper end to the prior (Gelman 2006).
 
@@ -145,7 +145,7 @@ def spread_of(spec: ParameterSpec, pooled: Pooled) -> list[InferredParameter]:
 
 
 def deviations(spec: ParameterSpec, pooled: Pooled) -> list[InferredParameter]:
-    """What each group's value of a parameter is off the shared one."""
+    """Deviations of each group's value of a parameter from the shared value."""
     scale = _spread_name(pooled.family) if pooled.family else ""
     return [
         deviation(spec, pooled.spread, Scope(group, True, spec.name, scale), tuple(members), where="[model.per_group]")
@@ -162,7 +162,7 @@ def deviation(
     *,
     where: str,
 ) -> InferredParameter:
-    """What a group's value of a parameter is off the shared one, Normal(0, ``spread``), in the parameter's unit.
+    """Deviation of a group's value from the shared value, Normal(0, ``spread``), in the parameter's unit.
 
     Raises:
         InputError: a spread that is not positive.

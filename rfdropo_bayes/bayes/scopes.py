@@ -1,4 +1,4 @@
-"""Which value each parameter has in each recording: what is inferred, what is known, and whose each value is."""
+"""Value of each parameter in each recording: inferred and fixed values, and the owner of each."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ HALF_NORMAL_MEDIAN = 0.6745
 
 @dataclass(frozen=True)
 class Scopes:
-    """The parameters of a model, and which value each has in each recording.
+    """The parameters of a model, and the value of each in each recording.
 
     Values and draws are mappings from labels, see `InferredParameter.name`.
 
     Attributes:
-        parameters: those that are inferred, in sampling order; a spread comes before what it is the spread of.
+        parameters: inferred parameters in sampling order; a spread precedes its parameters.
         specs: every parameter that a recording may have, by name.
-        fixed: values that are known, by label.
-        known: parameters that were inferred, and whose values are among ``fixed`` now.
+        fixed: fixed values, by label.
+        known: formerly inferred parameters whose values are now in ``fixed``.
     """
 
     parameters: tuple[InferredParameter, ...]
@@ -83,17 +83,17 @@ class Scopes:
 
     @property
     def infos(self) -> tuple[ParameterInfo, ...]:
-        """What the record says of the inferred parameters."""
+        """Facts about the inferred parameters for the record."""
         return tuple(parameter.info for parameter in self.parameters)
 
     def __getitem__(self, name: str) -> InferredParameter:
         return self.parameters[self.names.index(name)]
 
     def values_in(self, recording: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The values that hold in one recording, by parameter; those that have their nominal value everywhere left out.
+        """The values that hold in one recording, by parameter; without parameters that are nominal everywhere.
 
-        What other recordings alone have is nominal. The sum of a shared value and a group's deviation ends at the hard
-        bounds of the parameter.
+        Parameters of other recordings are nominal. The sum of a shared value and a group's deviation is clipped to the
+        parameter's hard bounds.
         """
         found = {name: self.specs[name].nominal for name in self._partly if name in self.specs}
         labels = {p.name for p in self.known}
@@ -121,7 +121,7 @@ class Scopes:
 
     @cached_property
     def scales(self) -> dict[str, tuple[str, ...]]:
-        """Labels of the parameters that are standard deviations of others, with those of the others."""
+        """Labels of the parameters that are standard deviations of others, with the labels of these others."""
         found = dict.fromkeys(p.scope.scaled_by for p in self.parameters if p.scope.scaled_by)
         return {name: tuple(p.name for p in self.parameters if p.scope.scaled_by == name) for name in found}
 
@@ -141,7 +141,7 @@ class Scopes:
 
     @property
     def deviating(self) -> tuple[InferredParameter, ...]:
-        """What groups of recordings are off the values that all share."""
+        """Deviations of groups of recordings from the shared values."""
         return tuple(p for p in self.parameters if p.scope.added_to)
 
     def recordings_known(self, fitted: Sequence[str]) -> set[str]:
@@ -162,14 +162,14 @@ class Scopes:
     def extended(self, recordings: Sequence[str], fitted: Sequence[str], groups: Patterns) -> Extension:
         """The parameters of new recordings.
 
-        A parameter that every fitted recording had of its own is like that of any of them in a new one. One that some
-        of them only had, as the payload of one, is theirs alone, and that of further pieces of theirs. A parameter that
-        some groups alone have is that of their new recordings as well. Each group deviates from what all share, whether
-        any of its recordings was fitted or not.
+        A parameter that every fitted recording had separately takes, in a new recording, the value of any of them. A
+        parameter of some fitted recordings only, such as a payload, applies to them and their further pieces. A
+        parameter of some groups also applies to their new recordings. Each group, fitted or not, deviates from the
+        shared values.
 
         Args:
-            recordings: names of the new ones; fitted: of those that were fitted.
-            groups: which recordings belong together; each is a group of its own without.
+            recordings: names of the new recordings; fitted: names of the fitted recordings.
+            groups: recordings that belong together; by default each is its own group.
         """
         known, shared = self.recordings_known(fitted), [p for p in self.parameters if not p.scope.owner]
         like: dict[str, tuple[str, ...]] = {p.name: (p.name,) for p in shared}
@@ -206,12 +206,12 @@ class Scopes:
     def of_day(
         self, day: str, recordings: Sequence[str], fitted: Sequence[str], pooled: Mapping[str, Pooled]
     ) -> Scopes:
-        """The shared parameters, and those of a day and of its recordings.
+        """The shared parameters, and the parameters of a session and its recordings.
 
         Args:
-            day: its name; recordings: those of it.
-            fitted: names of the recordings that were fitted.
-            pooled: parameters that differ between days, whether they did in the fit or not.
+            day: name of the session; recordings: its recordings.
+            fitted: names of the fitted recordings.
+            pooled: parameters that vary between sessions, also if they were shared in the fit.
 
         Raises:
             InputError: a pooled parameter that the recordings do not share.
@@ -255,11 +255,11 @@ class Scopes:
         return {p.name: drawn[p.name] * _ratio(p, drawn) for p in self.parameters}
 
     def sample_around(self, earlier: DrawsByOwner, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
-        """Prior draws with draws of an earlier posterior in the place of the parameters that it holds.
+        """Prior draws, with draws of an earlier posterior for its parameters.
 
-        The first takes the first of these, the others take them at random. A parameter of one recording takes the value
-        of the same recording, else that which all recordings shared, else that of another recording; a deviation of one
-        group takes that of the same group or none.
+        The first draw takes the first earlier draw, the others take random draws. A parameter of one recording takes
+        the value of the same recording, else the shared value, else the value of another recording. A deviation of a
+        group takes the value of the same group or none.
         """
         prior_key, choice = jax.random.split(key)
         values = self.sample(prior_key, n)
@@ -304,8 +304,8 @@ class Extension(NamedTuple):
     """The parameters of new recordings.
 
     Attributes:
-        scopes: with them in the place of those of the fitted recordings.
-        like: labels of the fitted parameters, any of which each is like; none for the deviation of a new group.
+        scopes: scopes with them instead of the fitted recordings' parameters.
+        like: labels of fitted parameters from which each takes its values; none for the deviation of a new group.
     """
 
     scopes: Scopes
@@ -313,7 +313,7 @@ class Extension(NamedTuple):
 
 
 def _ratio(parameter: InferredParameter, values: Mapping[str, Any]) -> Any:
-    """Standard deviation of a parameter over that of its prior; one where it is that of its prior."""
+    """Standard deviation of a parameter over its prior's; 1 if it is the prior's."""
     scale = parameter.scope.scaled_by
     return values[scale] / parameter.prior.scale if scale else 1.0
 
@@ -329,16 +329,16 @@ def build_scopes(
     fixed: Mapping[str, float] | None = None,
     where: str = "[model.priors]",
 ) -> Scopes:
-    """Join specifications, prior tables and what recordings have to themselves.
+    """Combine specifications, prior tables and parameters of single recordings.
 
     Args:
         specs: every parameter of the model.
-        priors: which are inferred, and their prior tables; ``{}`` asks for the default prior.
+        priors: inferred parameters with their prior tables; ``{}`` is the default prior.
         per_recording: parameters that are free in the named recordings only.
         recordings: names of all recordings.
-        pooled: parameters that differ between groups of recordings, about a value that all share.
+        pooled: parameters that differ between groups of recordings, about a shared value.
         only_in: parameters that some groups have and others do not: recordings by group.
-        fixed: values that are known.
+        fixed: fixed values.
 
     Raises:
         InputError: an unknown name, an unusable prior, nothing to infer, or a pooled parameter without a shared value.
@@ -352,7 +352,7 @@ def build_scopes(
             raise InputError(
                 f"{name} differs between groups about a value that all share, and has none",
                 where="[model.per_group]",
-                remedy="take it out of [model.per_recording]" if alone else "name it under [model.priors], too",
+                remedy="take it out of [model.per_recording]" if alone else "also name it under [model.priors]",
             )
     parameters: list[InferredParameter] = []
     for name, table in priors.items():

@@ -26,7 +26,7 @@ from rfdropo_bayes.simulators.protocol import Observation, Simulator
 
 Values = Mapping[str, Float[Array, "..."]]
 Measured = Mapping[str, Float[Any, "..."]]
-"""What was measured, by channel, apart from when and where: another set of numbers is another data set."""
+"""Measured arrays by channel, without times and places: other numbers are another data set."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class TrajectoryModel:
 
     Attributes:
         simulator: anything that satisfies `Simulator`, mechanisms included.
-        scopes: what is inferred and what is known, parameters of the channels among them.
-        recordings: what was commanded, and when it was observed.
-        channels: what was measured, `Markers` first.
+        scopes: inferred and fixed parameters, including the channels'.
+        recordings: commands and times of observation.
+        channels: measurement channels, `Markers` first.
     """
 
     simulator: Simulator
@@ -84,12 +84,12 @@ class TrajectoryModel:
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """What was measured."""
+        """Names of the measurement channels."""
         return tuple(channel.name for channel in self.channels)
 
     @cached_property
     def measured(self) -> Measured:
-        """What was measured."""
+        """Measured arrays by channel."""
         return {channel.name: channel.measured for channel in self.channels}
 
     @cached_property
@@ -123,7 +123,7 @@ class TrajectoryModel:
         return self.simulator.with_object_at(physical, self._poses.measured[self.recordings.names.index(recording), 0])
 
     def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:
-        """Roll out every recording under one set of values.
+        """Roll out every recording under a set of values.
 
         Args:
             values: inferred parameters, scalars.
@@ -150,9 +150,9 @@ class TrajectoryModel:
         measured: Measured | None = None,
         shares: Mapping[str, Any] | None = None,
     ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
-        """Log density of each row given those before it, summed over recordings, and the worst result code.
+        """Log density of each row given the earlier rows, summed over recordings, and the worst result code.
 
-        ``measured`` puts other data in the place of the model's own; ``shares`` says how much each channel counts.
+        ``measured`` replaces the model's own data; ``shares`` are the weights of channels.
         """
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
@@ -170,7 +170,7 @@ class TrajectoryModel:
         measured: Measured | None = None,
         shares: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, "..."]]:
-        """Whitened residuals by channel, zero where masked; see `Channel.residuals` and `row_log_likelihood`."""
+        """Whitened residuals by channel, zero if masked; see `Channel.residuals` and `row_log_likelihood`."""
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
         white = {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}

@@ -80,7 +80,7 @@ class Drive:
         motor: motor of the axis.
         offset: counts at length zero.
         identifiers: identifiers of its frames.
-        units: units of those objects that differ between vendors.
+        units: units of the objects that differ between vendors.
         unguarded: guards that it may lack, by object index.
     """
 

@@ -1,10 +1,9 @@
-"""What may differ between groups of recordings, such as days: candidates of an audit that compares two of them, and of
-every audit of recordings that belong to groups.
+"""Possible differences between groups of recordings, such as sessions: candidates of an audit that compares two groups,
+and of every audit of recordings in groups.
 
 A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
-mechanism is there, or is larger, in one group only, or is absent there. A mechanism that all groups lack is a candidate
-as well, under its plain name: without it, an error of the base model would pass for a difference wherever it pays more
-in one group.
+mechanism is present or larger in one group only, or absent there. A mechanism that all groups lack is a candidate as
+well, under its plain name: without it, an error of the base model could be taken for a difference between groups.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ class Groups:
 
     Attributes:
         members: fitted and unseen recordings of each, by the group's name.
-        left_out: recordings that belong to none; where two groups are compared, these are not looked at.
-        compared: whether an audit asks for the differences between two groups, and for no others.
-        complements: recordings outside a group, by "all but NAME", where the fitted ones of them are no group.
+        left_out: recordings without a group; ignored if two groups are compared.
+        compared: whether an audit tests only differences between two groups.
+        complements: recordings outside a group, by "all but NAME", if their fitted recordings are not a group.
     """
 
     members: Mapping[str, tuple[str, ...]]
@@ -45,7 +44,7 @@ class Groups:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the groups."""
+        """Names of the groups."""
         return tuple(self.members)
 
     @property
@@ -55,7 +54,7 @@ class Groups:
         return self.names[1:] if len(self.members) == 2 and not self.complements else self.names
 
     def recordings(self, scope: str) -> tuple[str, ...]:
-        """Of a group, or of all groups but one."""
+        """Recordings of a group, or of all groups but one."""
         return self.members[scope] if scope in self.members else self.complements[scope]
 
     def group_of(self, recording: str) -> str:
@@ -65,7 +64,7 @@ class Groups:
 
 @dataclass
 class _Space:
-    """Parameters that are found one after the other, and where each of them is."""
+    """Parameters in order of addition, with the index of each."""
 
     parameters: list[InferredParameter]
 
@@ -84,16 +83,16 @@ def with_differences(
     spreads: Mapping[str, float],
     held: Sequence[str] = (),
 ) -> tuple[Scopes, list[Candidate]]:
-    """Parameters and candidates, those that may differ between groups among them.
+    """Parameters and candidates, including possible differences between groups.
 
     Args:
-        space: base parameters, then those of the library.
-        base: how many belong to the base model.
+        space: base parameters, then the library's.
+        base: number of base parameters.
         simulated: every parameter of the base simulator.
         library: candidates that all groups may lack.
-        groups: of the recordings.
+        groups: groups of the recordings.
         spreads: standard deviations between groups that the model states, by parameter [its unit].
-        held: parameters whose values are known, and which therefore do not differ.
+        held: fixed parameters, which therefore do not differ.
     """
     found = _Space(list(space.parameters))
     candidates = list(library)
@@ -112,20 +111,21 @@ def with_differences(
         for family in families([spec for spec in specs if spec.name in own]):
             candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
         candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
-    for scope in groups.complements:  # an effect of either sign is added to what all share, and so may be absent in one
+    # an effect of either sign is added to the shared value, and so may be absent in one
+    for scope in groups.complements:
         candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
     return replace(space, parameters=tuple(found.parameters)), candidates
 
 
 def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) -> float:
-    """Standard deviation of a parameter's prior: what the model allows the parameter, it allows the difference."""
+    """Standard deviation of a parameter's prior: the difference has the same scale as the parameter."""
     known = shared.get(spec.name)
     prior = known.prior if known else prior_from_table(spec, dict(spec.prior), where=f"{WHERE} {spec.name}")
     return float(np.std(np.asarray(prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
 
 
 def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> InferredParameter:
-    """What one group's value is off that of the others, Normal(0, ``spread``)."""
+    """Deviation of one group's value from the others', Normal(0, ``spread``)."""
     width = spec.high - spec.low
     scope = Scope(group, group=True, added_to=spec.name)
     return deviation(spec, spread, scope, groups.recordings(group), width, where=WHERE)
@@ -142,7 +142,7 @@ def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, 
 
 
 def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Space) -> Candidate:
-    """A mechanism of the library in one group only. Shapes, which mean nothing where it is absent, are shared."""
+    """A mechanism of the library in one group only. Shapes, which have no effect without it, are shared."""
     parameters = [found.parameters[i] for i in candidate.indices]
     sized = [p.table.get("distribution") in MEASURED_FROM_NULL for p in parameters]
     indices = []
@@ -164,7 +164,7 @@ def _one_sided(candidate: Candidate, found: _Space) -> bool:
 
 
 def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
-    """The size of a mechanism in one group, measured from its null value and added to what all share."""
+    """The size of a mechanism in one group, measured from its null value and added to the shared value."""
     spec, table = parameter.spec, dict(parameter.table)
     for key in ("loc", "low", "high"):
         if key in table:

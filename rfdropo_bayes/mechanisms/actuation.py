@@ -28,7 +28,7 @@ class InCommandUnit:
 
     Args:
         unit: unit of the commands.
-        usual: size of usual commands, in their unit; those of a usual trunk if it is not known.
+        usual: size of usual commands, in their unit; a usual trunk's if unknown.
     """
 
     parameters: tuple[ParameterSpec, ...]

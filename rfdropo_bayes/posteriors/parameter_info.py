@@ -14,13 +14,13 @@ Draws = Mapping[str, Float[np.ndarray, " n"]]
 
 @dataclass(frozen=True)
 class Scope:
-    """Whose a parameter is, and what its value is there.
+    """Owner of a parameter, and the composition of its value.
 
     Attributes:
-        owner: the recording, or group of recordings, that alone has it; empty if all recordings share it.
+        owner: the recording or group of recordings that has it; empty if all recordings share it.
         group: whether the owner is a group, whose further recordings have it as well.
         added_to: the parameter that it is added to; empty if it is a value of its own.
-        scaled_by: the parameter that is its standard deviation, in place of that of its prior; empty if none is.
+        scaled_by: the parameter that is its standard deviation, instead of its prior's; empty if there is none.
         spread: whether it is the standard deviation of others, between groups.
     """
 
@@ -91,7 +91,7 @@ class ParameterInfo:
         return max(self.low, low), min(self.high, self.prior.get("high", np.inf))
 
     def spread_of(self, values: Draws, count: int) -> Float[np.ndarray, " n"]:
-        """Standard deviation between groups of what a deviation is added to, for each of ``count`` draws."""
+        """Standard deviation between groups of a deviation's parameter, for each of ``count`` draws."""
         if self.scope.scaled_by:
             return np.asarray(values[self.scope.scaled_by])
         return np.full(count, float(self.prior["scale"]))

@@ -27,14 +27,14 @@ class DayDeviation(NamedTuple):
 
 
 def day_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> dict[str, DayDeviation]:
-    """How the day that a posterior is for deviates: the day it was adapted to, else any day that no fit has seen.
+    """Deviations of the session that a posterior describes: the adapted session, else any unseen session.
 
     Args:
         record: the posterior.
-        specs: parameters of the model; others are left out.
+        specs: parameters of the model; others are ignored.
 
     Returns:
-        by the parameter's name; empty where no parameter differs between days.
+        deviations by parameter; empty if no parameter varies between sessions.
     """
     values = {info.name: record.flat(info.name) for info in record.free}
     known, day = {spec.name for spec in specs} & set(values), record.attrs.get(ADAPTED_TO, "")

@@ -1,6 +1,6 @@
 """Predictions under a posterior: of the recordings it was fitted to, and of recordings it has never seen.
 
-A cube that is pushed starts where it was measured before a new recording.
+A pushed cube starts at its measured pose in a new recording.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, 
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
-# Among the attributes of a posterior.
+# Keys of a posterior's attributes.
 FITTED = "fitted_recordings"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
-KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
+KNOWN_NOISE = "known_noise"  # of the positions, if its parameters are not inferred
 SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
 PLACE = ("cube_x", "cube_y", "cube_z", "cube_yaw")
 
@@ -54,10 +54,10 @@ class NewPredictions(NamedTuple):
 
     Attributes:
         recordings: the predictions.
-        unmatched: draws that did not converge in matching a first row.
-        far: how many times as far as the model is wrong in the fitted recordings a first row is from the simulated one,
-            by recording, where that is too much for chance.
-        without: cautions of groups that no fit has seen, see `without_cautions`.
+        unmatched: number of draws that did not converge on a first row.
+        far: distance of the measured from the simulated first row in units of the model error, by recording, if it
+            exceeds chance.
+        without: cautions on groups that no fit has seen, see `without_cautions`.
     """
 
     recordings: list[RecordingPrediction]
@@ -67,8 +67,9 @@ class NewPredictions(NamedTuple):
 
 
 def match_cautions(found: NewPredictions) -> list[Caution]:
-    """Cautions where draws did not converge in matching a first row, where one stays far from the simulated one, and
-    where a group is without what others have."""
+    """Cautions on draws that did not converge on a first row, on distant first rows, and on groups that lack parameters
+    of others.
+    """
     cautions = list(found.without)
     if found.unmatched:
         sentence = (
@@ -78,26 +79,26 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
         cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
     for name, times in found.far.items():
         sentence = (
-            f"the first row of {name} is {times:.2g} times as far from the simulated one as the model was wrong in the "
-            "fitted recordings: see that frame, units and start are those of the fitted recordings, or adapt to a "
-            "recording of that day"
+            f"the first row of {name} is {times:.2g} times as far from the simulated row as the model "
+            "error in the fitted recordings: check that frame, units and start match the fitted "
+            "recordings, or adapt to a recording of that session"
         )
         cautions.append(Caution(Code.FIRST_ROW_FAR, sentence))
     return cautions
 
 
 def without_cautions(scopes: Scopes, groups: Sequence[str], known: Container[str]) -> list[Caution]:
-    """Cautions of groups that no fit has seen, where some of the fitted groups alone have a parameter.
+    """Cautions on groups that no fit has seen, if only some fitted groups have a parameter.
 
     Args:
-        scopes: of the fit.
-        groups: that are predicted; known: those of the fitted recordings.
+        scopes: scopes of the fit.
+        groups: groups to predict; known: groups of the fitted recordings.
     """
     owners = scopes.groups_alone
     names = "; ".join(f"{name} in {' and '.join(own)}" for name, own in owners.items())
     sentence = (
-        "{0} is predicted without what some of the fitted groups alone have ({1}); if {0} may have it, name {0} in "
-        "[model.only_in] and calibrate with a recording of {0}"
+        "{0} is predicted without ({1}), which only some of the fitted groups have; if {0} may have it, "
+        "name {0} in [model.only_in] and calibrate with a recording of {0}"
     )
     unseen = [group for group in groups if group not in known]
     return [Caution(Code.GROUP_WITHOUT, sentence.format(group, names)) for group in unseen if owners]
@@ -132,22 +133,22 @@ def predict_new(
 ) -> NewPredictions:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
-    A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
-    them at random for every draw; what is of a group of recordings takes, for a new group, values from the spread
-    between groups. The offset of the measuring frame and the deviations of a new group are then conditioned on the
-    first row (`match_first_row`), and for a new recording of a known group draws count as they predict its first row
+    A parameter that was free per recording takes, for a new recording, its value in a random fitted recording, chosen
+    anew for every draw. A parameter of a group takes, for a new group, values from the spread between groups. The
+    offset of the measuring frame and the deviations of a new group are then conditioned on the first row
+    (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
     (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
-    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A parameter
-    that some groups alone have is that of their new recordings, too; a group that no fit has seen is without it. A cube
-    starts where it was measured in the first row.
+    A parameter that only some fitted recordings had free, such as a payload, applies to them alone. A parameter that
+    only some groups have also applies to their new recordings; an unseen group lacks it. A cube starts at its measured
+    pose in the first row.
 
     Args:
-        fitted: names of the recordings that were fitted.
-        left: what the model left of the fitted recordings, which is its error in new ones where its noise is taken to
-            be independent from row to row; without, all markers weigh the same in a first row.
-        groups: which recordings belong together, by name or wildcard; each is a group of its own without.
-        slow: error of the day of each recording that no fit has seen, by its name.
+        fitted: names of the fitted recordings.
+        left: residuals of the model on the fitted recordings, its error in new recordings if its noise is white;
+            without it, all markers have equal weight in a first row.
+        groups: recordings that belong together, by name or wildcard; by default each is its own group.
+        slow: error of the session of each unseen recording, by name.
     """
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
@@ -197,10 +198,10 @@ def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKey
 def with_repeats_marked(
     predictions: Sequence[RecordingPrediction], trajectories: Sequence[Trajectory]
 ) -> list[RecordingPrediction]:
-    """Predictions that say which of them repeat the commands of another one of the same split.
+    """Predictions with repeats of the same commands marked within each split.
 
     Args:
-        predictions: of recordings.
+        predictions: predictions of recordings.
         trajectories: these recordings, in the same order.
     """
     marked, number = list(predictions), 0
@@ -215,9 +216,9 @@ def with_repeats_marked(
 
 
 def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key: PRNGKeyArray) -> Batch:
-    """Values of the parameters of new recordings, from draws of the fitted ones.
+    """Values of the parameters of new recordings, from draws of the fitted parameters.
 
-    One fitted recording is chosen per draw for all parameters of a new one: its values belong together.
+    One fitted recording is chosen per draw for all parameters of a new recording: its values belong together.
     """
     count, found = len(next(iter(values.values()))), {}
     chosen = {
@@ -247,7 +248,7 @@ def _predictions(
     unseen: Sequence[str] = (),
     left: ModelError | None = None,
 ) -> list[RecordingPrediction]:
-    """Predictions of the recordings of a problem; draws count for those ``unseen`` as they predict the first row."""
+    """Predictions of the recordings of a problem; draws of ``unseen`` recordings are weighted by the first row."""
     recordings = problem.model.recordings
     position, pose, fine = _ended_well(problem, values)
     key, choice, again_key = jax.random.split(key, 3)
@@ -300,10 +301,10 @@ def _ended_well(problem: CalibrationProblem, values: Batch) -> tuple[np.ndarray,
 def with_measured_starts(
     model: TrajectoryModel, trajectories: Sequence[Trajectory], values: Batch
 ) -> tuple[TrajectoryModel, Batch]:
-    """Let the cube of every recording start where it was measured in the first row, standing on the plate.
+    """Let the cube of every recording start at its measured pose in the first row, standing on the plate.
 
-    Whatever the values say of its place is replaced, for those recordings; the measuring frame's offset, which differs
-    between draws, is taken off. A recording without a measured cube keeps what the values say.
+    Its pose in the values is replaced for these recordings, less the measuring frame's offset of each draw. A recording
+    without a measured cube keeps the pose of the values.
     """
     simulator = model.simulator
     if not isinstance(simulator, RobotSimulator) or not simulator.pushes:
@@ -334,7 +335,9 @@ def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajec
 
 
 def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]:
-    """Shift [m] of measured against simulated positions among the values of one recording; zero where it is none's."""
+    """Shift [m] of measured against simulated positions among the values of one recording; zero if no offset is a
+    parameter.
+    """
     return np.stack(
         [np.broadcast_to(np.asarray(known.get(name, 0.0), dtype=float), (count,)) for name in OFFSETS], axis=1
     )
@@ -343,8 +346,9 @@ def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]
 def measured_objects(
     problem: CalibrationProblem, pose: Float[np.ndarray, "n recording time 7"], values: Batch, key: PRNGKeyArray
 ) -> Float[np.ndarray, "n recording time 7"]:
-    """Simulated poses of the cube as they would be measured: with the offset of the measuring frame and, where measured
-    poses were among the data, with the error that the model was found to have."""
+    """Simulated poses of the cube as they would be measured: with the offset of the measuring frame and, if measured
+    poses were data, with the fitted model error.
+    """
     model = problem.model
     shifted = np.array(pose)
     count = len(shifted)

@@ -172,7 +172,7 @@ class Summary(_Open):
 def effective_draws(record: PosteriorRecord, details: Mapping[str, Any]) -> float | None:
     """Number of independent draws that a posterior is worth; None for draws that are no posterior.
 
-    At most as many as there are distinct draws: a sampler that ran out of its budget repeats a few.
+    At most the number of distinct draws: a sampler without budget repeats a few.
     """
     if record.log_likelihood is None:
         return None

@@ -30,7 +30,7 @@ COMMANDS = ("m", "rad", "N", "N m", "-")
 USUAL_PULL = 0.15
 """Usual pull of a cable over the body's length."""
 FORCE_LIMIT = 5.0
-"""Largest tension of a drive over that of the usual command."""
+"""Ratio of a drive's largest tension to the tension of a usual command."""
 KNOWN, ASSUMED = 0.3, 1.0
 """Standard deviation of the logarithm in the prior of a given value, and of a default."""
 

@@ -67,7 +67,7 @@ class BlackBox:
         one_shape: whether a batched function always gets arrays of the same shape: ``lanes`` sets, padded by repeats,
             and whole commands. JAX then compiles it once for recordings of equal length.
         difference: relative step of derivatives; larger if the motion is rough on small scales.
-        usual_command: size of usual commands, in their unit; by default that of a usual trunk.
+        usual_command: size of usual commands, in their unit; by default a usual trunk's.
         limits: least and greatest command of each channel for policies; none by default.
         families: parameters that are not inferred unless they have a prior, each with the quantity of which it is a
             local value; an audit tests whether they differ from their nominal values.
@@ -341,7 +341,7 @@ class BlackBoxSimulator(ExtendedSimulator):
             if not callable(self.box.function):
                 found = self.box.simulate(columns, command[None])[0]
             elif self.box.batched:
-                # On the device of callbacks: what JAX compiles now serves them, too.
+                # On the device of callbacks, which also runs the programs compiled now.
                 with jax.default_device(jax.local_devices(backend="cpu")[0]):
                     found = self.box.answers(columns, command[None], np.zeros(1, int))[0]
             else:

@@ -1,4 +1,4 @@
-"""What a simulator lacks, by name: ``audit``."""
+"""The effects that a simulator lacks, by name: ``audit``."""
 
 from __future__ import annotations
 
@@ -103,26 +103,26 @@ def audit(
     show: bool | None = None,
     between: Between | None = None,
 ) -> Audit:
-    """Say what a model lacks, by name, and measure what it gains with that. What is not given is as the experiment file
-    of the model has it.
+    """Name the effects that a model lacks, and measure the gain of adding them. Missing arguments are taken from the
+    model's experiment file.
 
     Args:
-        model: what is simulated and inferred.
-        runs: recordings that are fitted and screened.
-        options: keys of [audit] that override the model's own file.
-        test: unseen recordings, which measure the gain.
-        seed: of all that is random, 0 where no file says. The same seed gives the same answer.
+        model: simulator and inferred parameters.
+        runs: recordings to fit and test candidates on.
+        options: keys of [audit], which override the model's own file.
+        test: unseen recordings that measure the gain.
+        seed: seed of all random numbers; 0 without a file. The same seed gives the same answer.
         fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
-        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
+        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it is used if
             nothing was repeated.
-        out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
-        resume: go on from what an interrupted audit has left in ``out``.
-        overwrite: start anew whatever ``out`` holds.
+        out: folder for audit.json, extended.toml and report.html; None writes nothing.
+        resume: continue an interrupted audit in ``out``.
+        overwrite: replace an earlier run in ``out``.
         workshop: see `build_problem`.
-        show: whether to say now and then what is done, as in `calibrate`.
-        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
-            Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
-            What both lack is named, too.
+        show: whether to show progress, as in `calibrate`.
+        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared. Two
+            names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
+            Effects that both lack are also named.
 
     Raises:
         InputError: bad input, before anything long has started.
@@ -160,7 +160,7 @@ def audit(
 
 
 def nominal_paths(problem: AuditProblem) -> list[Paths]:
-    """The fitted recordings beside the nominal model; empty where an object is pushed, or a rollout ends badly."""
+    """The fitted recordings beside the nominal model; empty if an object is pushed, or a rollout fails."""
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
@@ -180,7 +180,7 @@ def _audited(
     out: Path | None,
     doubts: Sequence[Caution],
 ) -> Audit:
-    """What an audit found as an object, with its page; ``doubts`` are those of its recordings."""
+    """Result of an audit as an object, with its page; ``doubts`` are cautions on its recordings."""
     versions, following = software_versions(), next_experiment(answer)
     given: dict[str, Any] = {"versions": versions, "data_sha256": data_sha256, "next_experiment": following}
     content = record(answer, **given, doubts=doubts)
@@ -220,10 +220,10 @@ def build_problem(
     """The base model with every candidate of the library in it, at its null value.
 
     ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
-    are the candidates, where it is not all; ``groups`` of recordings are compared, or have candidates of their own.
+    are the candidates, all by default; ``groups`` of recordings are compared, or have candidates of their own.
 
     Raises:
-        InputError: [audit] leaves nothing to ask.
+        InputError: [audit] leaves no candidate.
     """
     spreads, robot = spec.per_group, spec.robot
     if groups is not None and groups.compared:  # what the groups do not share is to be found
@@ -275,18 +275,18 @@ def build_problem(
 
 
 def _something_asked(table: AuditTable, groups: Groups | None) -> None:
-    """Refuse an audit without the library that has no laws at ports or candidates of one's own to ask for either."""
+    """Refuse an audit without the library, laws at ports or user candidates."""
     ports = table.ports and (groups is None or not groups.compared)
     if not (ports or table.candidates):
         raise InputError(
-            "nothing is asked: the library is left out, and laws at ports are, too",
+            "no candidates: the library and laws at ports are both excluded",
             where="[audit] library",
             remedy="set library = true, or ports = true without --between",
         )
 
 
 def _rules(table: AuditTable) -> Rules:
-    """What [audit] says of the rules."""
+    """The rules of an audit from its table [audit]."""
     matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
     return Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters)
 
@@ -294,7 +294,7 @@ def _rules(table: AuditTable) -> Rules:
 def _named(
     table: AuditTable, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
 ) -> list[Candidate]:
-    """Mechanisms as candidates, less those that [audit] excludes."""
+    """Mechanisms as candidates, without the exclusions of [audit]."""
     index = {p.spec.name: i for i, p in enumerate(model.scopes.parameters)}
     return [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
@@ -321,12 +321,12 @@ def _with_own(
 
 
 def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
-    """What may be in the model: the registry, if it is asked, and the experiment's own, less what is in its base model.
+    """Names of candidates: the registry, if requested, and the experiment's own, without mechanisms of the base model.
 
-    Excluded ones are among them, so that what is compiled does not depend on what is excluded.
+    Excluded candidates are included, so that the compiled program does not depend on exclusions.
 
     Raises:
-        InputError: a name to exclude that is not there.
+        InputError: an unknown name to exclude.
     """
     known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
     own = spec.robot.parameter_table() if isinstance(spec.robot, Robot) else {}
@@ -340,7 +340,7 @@ def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
 def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> dict[str, str]:
     """Which of the candidates cannot run on the experiment's body and engine, and why.
 
-    A mechanism of the library says where it runs; one of a user's own is tried, too.
+    A mechanism of the library states its requirements; a user's mechanism is tried.
     """
     simulator = build_simulator(spec)
     engine = str(simulator.description["engine"])
@@ -358,7 +358,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
 
 
 def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
-    """What a simulator says against rollouts of its mechanisms, before anything is computed."""
+    """Reason why a simulator cannot run its mechanisms, found before any computation."""
     try:
         jax.eval_shape(jax.vmap(lambda given: simulator.rollout({}, given)), commands)
     except InputError as error:
@@ -375,8 +375,9 @@ def _lanes(
     coordinates: Coordinates,
     workshop: Workshop,
 ) -> Lanes:
-    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own. Lanes
-    that the workshop has are not made again."""
+    """The simulator with all candidates; expensive candidates get a simulator of their own. Lanes in the workshop are
+    reused.
+    """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
     key = repr((*made, markers.tolist(), coordinates.fixed, fields))
@@ -394,7 +395,7 @@ def _lanes(
 
 
 def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
-    """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
+    """Lanes with one-sided differences if available: they are exact enough for optimisation and score tests."""
     if isinstance(simulator, TrunkSimulator) and not simulator.pushes and simulator.engine.backend.name == "numba":
         quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
         return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
@@ -449,8 +450,9 @@ def _fields(model: TrajectoryModel) -> list[str]:
 
 
 def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
-    """The noise that the experiment states, for recordings without repeats: that of the positions under [noise],
-    that of other channels under [model.scopes.fixed]; None where that of any channel is not stated."""
+    """The noise that the experiment states, for recordings without repeats: of the positions under [noise], of other
+    channels under [model.fixed]; None if a channel lacks it.
+    """
     if spec.stated is None or spec.stated.standard_deviation == 0.0:
         return None
     parts = [stated_noise(spec, model.recordings, first)]

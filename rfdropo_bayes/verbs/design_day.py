@@ -37,11 +37,12 @@ PER_ACTION = "displacement_per_action"  # among the settings of a recording whos
 
 
 class DayOutlook(NamedTuple):
-    """What a command sequence leaves unknown.
+    """Remaining uncertainty after a command sequence.
 
     Attributes:
-        seconds: after which the day adds less to the error of the last marker than the model; infinite if never.
-        left: deviation [m] of the last marker, in the recordings at hand, by what is then not known of the day.
+        seconds: time after which the session's uncertainty is less than the model error at the last marker; infinite if
+            never.
+        left: deviation [m] of the last marker in the given recordings, from the remaining uncertainty of the session.
     """
 
     seconds: float
@@ -66,26 +67,26 @@ def design_day(
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Design:
-    """Propose the shortest commands whose recording determines what a day changes.
+    """Propose the shortest commands whose recording determines the parameters of a session.
 
-    Of random walks, holds, slow loops and chirps that the drives follow, each is looked at from its beginning. It is
-    long enough where the last marker, under the commands of the recordings at hand, is as uncertain by the day as it is
-    by what the model misses. The noise is that of `adapt`, and so are the day's parameters. Proposals stay within what
-    the drives did in the recordings at hand and what is stated of them; where commands are actions, which pull or
-    release one cable, proposals are made of these.
+    Proposals are random walks, holds, slow loops and chirps within the drives' limits, each evaluated for all lengths.
+    A length suffices if the session's uncertainty at the last marker, under the given recordings' commands, is no
+    larger than the model error. Noise and session parameters are as in `adapt`. Proposals stay within the commands of
+    the given recordings and the stated limits. If commands are actions that pull or release one cable, proposals
+    consist of actions.
 
     Args:
         fit: a calibration, with its model.
-        runs: recordings at hand; those of the model's experiment by default.
-        seconds: no proposal is longer.
-        group: among the recordings at hand, whose drives and commands the day is to have; that of the last by default.
-        seed: of the proposals; that of the model's experiment by default.
-        out: folder that gets design.json and next_commands.csv; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
-        show: whether to say now and then what is done, as in `calibrate`.
+        runs: given recordings; by default from the model's experiment.
+        seconds: longest proposal.
+        group: group whose drives and commands the session shares; by default the last recording's.
+        seed: seed of the proposals; by default from the model's experiment.
+        out: folder for design.json and next_commands.csv; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
+        show: whether to show progress, as in `calibrate`.
 
     Raises:
-        InputError: nothing of the model differs between days, or no recording is of the group.
+        InputError: no parameter varies between sessions, or the group has no recording.
     """
     model = model_of(given_fit(fit, "design_day"))
     runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
@@ -159,8 +160,9 @@ def _design_day(
 
 
 def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationProblem, list[str], Batch]:
-    """Recordings of one day, the names of its parameters, and values a step up and a step down along each of these from
-    the middle of its prior, at the body's mean."""
+    """Problem of one session's recordings, names of its parameters, and values one step up and down along each, from
+    the centre of its prior at the body's mean.
+    """
     model, left = model_of(fit), model_error_of(fit.record)
     scopes, noise = day_scopes(fit, model, [run.name for run in runs], DAY), left.every(sample_time(runs[0].time))
     drawn = fit.record.posterior
@@ -171,7 +173,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
-            remedy="name what does, and calibrate",
+            remedy="name the parameters that do, and calibrate",
         )
     points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
     values = {name: np.full(len(points), value) for name, value in body.items()}
@@ -215,7 +217,7 @@ def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -
 
 
 def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
-    """A recording of so many seconds that begins as another one, is observed as often, by all of its markers."""
+    """A recording of length ``seconds`` with the start, rate and markers of another."""
     step = sample_time(run.time)
     time = step * np.arange(max(2, int(seconds / step + 1e-6) + 1))
     return _as_recording(run, whole(run.name), np.zeros(1), run.initial_command[None], time)
@@ -224,8 +226,9 @@ def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
 def _followed_proposals(
     model: Model, begun: Trajectory, like: Trajectory, runs: Sequence[Trajectory], rng: np.random.Generator
 ) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Proposals, in the order of their kinds, that the drives follow: within what they did in the recordings at hand,
-    and made of actions where the commands of ``like`` are."""
+    """Proposals, in the order of their kinds, that the drives follow: within the commands of the given recordings, and
+    made of actions if the commands of ``like`` are.
+    """
     simulator = model.simulator
 
     def taken(run: Trajectory, value: np.ndarray) -> np.ndarray:
@@ -257,7 +260,7 @@ def _as_actions(begun: Trajectory, period: float, time: np.ndarray, value: np.nd
 def _as_recording(
     like: Trajectory, name: str, time: np.ndarray, value: np.ndarray, seen: np.ndarray | None = None
 ) -> Trajectory:
-    """Commands as a recording that begins as another one and is observed when that was, by all of its markers."""
+    """Commands as a recording with the start, observation times and markers of another."""
     observed = like.time if seen is None else seen
     return Trajectory.build(
         Origin(name=name, robot=like.robot, format="memory", settings={"unseen": True}),
@@ -278,7 +281,7 @@ def _sentence(kind: str, outlook: DayOutlook, length: float, before: float, erro
     what = f"Record the first {length:.3g} s of the {kind} in {COMMANDS}"
     if length == 0.0:
         what = "The first row of a recording is enough, before anything moves"
-    change = f"what is not known of the day then moves the last marker by {1e3 * outlook.left:.2g} mm"
+    change = f"the remaining uncertainty of the session then moves the last marker by {1e3 * outlook.left:.2g} mm"
     change = f"{change}, and by {1e3 * before:.2g} mm without it"
     if np.isfinite(outlook.seconds):
         return f"{what}: {change}. The model's own error is {1e3 * error:.2g} mm."

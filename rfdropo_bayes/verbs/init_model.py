@@ -90,7 +90,7 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
     table = {"format": guess.format, "fit": [entry], "columns": columns, "missing": "mask"}
     try:
         run = load_recordings(parse_table(DataSpec, table, where="--recording"), Path(), role="fit")[0]
-    except InputError:  # what is wrong with it is said by check, which the user runs next
+    except InputError:  # check, the user's next command, reports the fault
         return dict.fromkeys(guess.markers)
     return {marker: run.position[0, k] for k, marker in enumerate(run.marker_names)}
 

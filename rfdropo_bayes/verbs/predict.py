@@ -1,4 +1,4 @@
-"""What a calibrated simulator expects of commands that were never run: ``predict``, and ``rfdropo predict``."""
+"""Predictions of a calibrated simulator for commands that were never run: ``predict``, and ``rfdropo predict``."""
 
 from __future__ import annotations
 
@@ -69,17 +69,17 @@ def predict(
     seed: int = 0,
     group: str | None = None,
 ) -> Prediction:
-    """Predict what the markers will do under given commands, from at most the start pose.
+    """Predict the motion of the markers under given commands, from at most the start pose.
 
     Args:
         fit: a calibration, with its model.
-        commands: a recording, of which nothing but the commands and the first row is looked at; or a pair of times [s]
-            and commands (time, channel), in the robot's unit.
-        start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
-        draws: of the posterior that are rolled out.
-        seed: of what is random.
-        group: the day, robot or other group that they belong to; by default the day that `adapt` has taken the fit to,
-            or else as [model.groups] has it.
+        commands: a recording, of which only the commands and the first row are used; or a pair of times [s] and
+            commands (time, channel), in the robot's unit.
+        start: positions of the markers in the first row [m], (marker, 3), for such a pair; unknown by default.
+        draws: number of posterior draws to simulate.
+        seed: seed of random numbers.
+        group: session, robot or other group of the commands; by default the session of `adapt`, or else from
+            [model.groups].
 
     Raises:
         InputError: a calibration without its model, or commands of another robot.
@@ -126,7 +126,7 @@ def predict(
 
 
 def _slow_error(record: PosteriorRecord, unseen: Trajectory, groups: Patterns, scopes: Scopes) -> dict[str, DayError]:
-    """The slow error of the day of a recording, by its name; empty where the fit has seen the day, or has no days."""
+    """The slow error of a recording's session, by name; empty if the fit has seen the session, or has no sessions."""
     days = {p.scope.owner for p in scopes.deviating}
     error = recorded_day_error(record) if days else None
     if error is None:
@@ -143,13 +143,13 @@ def model_of(fit: Calibration) -> Model:
     """The model of a calibration.
 
     Raises:
-        InputError: it was read from files that do not say which, or the model has another integrator than the fit.
+        InputError: its files do not describe the model, or the model has another integrator than the fit.
     """
     if fit.model is not None:
         fitted = fitted_integrator(fit.record.attrs, fit.folder)
         check_fitted_integrator(fitted, integrator_of(fit.model.spec), where=f"posterior of {fit.model.name}")
         return fit.model
-    why = "no config.toml says which"
+    why = "no config.toml describes it"
     if fit.folder is not None and (fit.folder / CONFIG).is_file():
         try:
             return Model.read(fit.folder / CONFIG)
@@ -158,12 +158,12 @@ def model_of(fit: Calibration) -> Model:
     raise InputError(
         f"the calibration has no model: {why}",
         where=str(fit.folder or "predict"),
-        remedy="give the one that was calibrated: rb.load(folder, model=model)",
+        remedy="give the calibrated model: rb.load(folder, model=model)",
     )
 
 
 def fitted_scopes(fit: Calibration) -> Scopes:
-    """What a calibration inferred, and what it took for known."""
+    """Inferred and fixed parameters of a calibration."""
     model, record = model_of(fit), fit.record
     fixed = fixed_values(model.spec, model.simulator)
     return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.held)
@@ -193,21 +193,21 @@ def run_prediction(
     group: str | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Predict what the markers will do under the commands of a file, from at most the start pose.
+    """Predict the motion of the markers under the commands of a file, from at most the start pose.
 
-    Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of what would be measured, in metres, in the
-    robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. Where the robot pushes
-    an object, it starts from its measured pose; its centre is in both files, every draw of its pose in the first.
+    Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of the measurement, in metres, in the robot's
+    base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. A pushed object starts from
+    its measured pose; its centre is in both files, every draw of its pose in the first.
 
     Args:
-        model: of the experiment file that was calibrated.
-        posterior: folder of its calibration.
+        model: model of the calibrated experiment file.
+        posterior: folder of the calibration.
         commands, start: see `data.load_unseen`.
         out: folder to write to.
-        episode: of a LeRobotDataset.
-        seed: of the draws; that of the experiment by default.
+        episode: number of the episode in a LeRobotDataset.
+        seed: seed of the draws; by default from the experiment.
         group: see `predict`.
-        overwrite: write whatever ``out`` holds.
+        overwrite: replace earlier files in ``out``.
 
     Raises:
         InputError: bad input, or a posterior that does not belong to the experiment.
@@ -254,7 +254,7 @@ def run_prediction(
 
 
 def _check_noise(record: PosteriorRecord, noise: str) -> None:
-    """Raise an InputError where an experiment's noise model is not the one that a posterior was fitted with."""
+    """Raise an InputError if an experiment's noise model differs from a posterior's."""
     fitted = record.attrs.get(NOISE, noise)  # earlier posteriors do not say
     if noise != fitted:
         raise InputError(
@@ -265,14 +265,14 @@ def _check_noise(record: PosteriorRecord, noise: str) -> None:
 
 
 def _known_noise(spec: ModelSpec, known: Mapping[str, Any] | None, step: float) -> tuple[Autoregression | None, Any]:
-    """The noise that the posterior knows, and the markers it is of; None where it is inferred.
+    """The noise stored in the posterior, and its markers; None for an inferred noise.
 
     Args:
-        spec: of the model; known: as the posterior holds it.
-        step: seconds between the rows to predict, which have the memory that [noise] states.
+        spec: the model; known: the noise as the posterior stores it.
+        step: seconds between the rows to predict. A correlation time in [noise] replaces the stored autocorrelation.
 
     Raises:
-        InputError: a noise that is not inferred, and a posterior that does not hold it.
+        InputError: a noise that is neither inferred nor stored in the posterior.
     """
     if spec.noise not in KNOWN:
         return None, ()
@@ -304,7 +304,7 @@ def summarise(predicted: RecordingPrediction) -> xr.Dataset:
 
 
 def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
-    """Where a pushed object is: mean and quantiles of its centre, and every draw of its pose."""
+    """Position of a pushed object: mean and quantiles of its centre, and every draw of its pose."""
     found = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
     centre = pose[..., :3]
     quantiles = np.quantile(centre, list(LEVELS.values()), axis=0)

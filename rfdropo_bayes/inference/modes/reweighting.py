@@ -118,7 +118,7 @@ def _batches(candidates: int) -> list[tuple[bool, int]]:
 def _by_share(
     by_mode: Float[np.ndarray, "n mode"], weights: Float[np.ndarray, " mode"], by_evidence: bool
 ) -> Float[np.ndarray, " n"]:
-    """Weights of candidates: each optimum gets its share of the mixture, or what the exact posterior gives it."""
+    """Weights of candidates: each optimum gets its share of the mixture, or its share under the exact posterior."""
     mass = by_mode.sum(axis=0)
     found = mass > 0.0
     share = mass[found] if by_evidence else weights[found]

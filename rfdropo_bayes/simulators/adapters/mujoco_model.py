@@ -357,7 +357,7 @@ class MuJoCoRollouts:
         ctrl = np.tile(self.first[1], (*commands.shape[:2], 1))
         ctrl[:, :, list(self.channels.values())] = commands
         state, found = self.begun(models, ctrl[:, 0])
-        # MuJoCo's sensors tell of the state before a step: one step more than rows shows the last row.
+        # MuJoCo's sensors refer to the state before a step: one step more than rows shows the last row.
         played = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
         states, sensed = self.rolled(models, state, played)
         found &= self._arrived(states[:, -1], len(commands[0]))
