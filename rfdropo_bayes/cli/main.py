@@ -41,7 +41,7 @@ from rfdropo_bayes.interrupts import EXIT_STATUS, NOTHING_LOST, watch_interrupts
 from rfdropo_bayes.runtime import keep_compilations
 
 INPUT_ERROR = 2
-# What a disk or its rights keep a command from writing is no fault of the program.
+# A full or protected disk is not a fault of the program.
 OF_THE_USER = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EISDIR, errno.ENOTDIR)
 
 # Typer carries its own copy of click, or uses the installed one, depending on its version.
@@ -75,7 +75,7 @@ def calibrate(
     as_json: AsJson = False,
     fit: Annotated[
         Path | None,
-        typer.Option("--from", help="folder of an earlier calibration of this robot, to start climbs from"),
+        typer.Option("--from", help="folder of an earlier calibration of this robot, at which optimisations start"),
     ] = None,
     overrides: Overrides = None,
 ) -> None:

@@ -218,7 +218,7 @@ class CsvColumns(BaseModel):
         ):
             if names is not None and len(names) != count:
                 what = "marker in positions" if key == "markers" else "channel in commands"
-                raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
+                raise ValueError(f"{key} has {len(names)} entries instead of {count}, one for each {what}")
         if len(self.orientations or ()) != len(self.sections or ()):
             raise ValueError("give one name in sections for each of orientations")
         for turn in self.orientations or ():

@@ -50,7 +50,7 @@ def open_bus(table: BusTable) -> can.BusABC:
         options["hop_limit"] = 0
     try:
         return can.Bus(interface=table.interface, channel=table.channel, **(options | table.options))
-    except Exception as error:  # each interface raises what its driver raises
+    except Exception as error:  # each interface passes on the exceptions of its driver
         raise InputError(
             f"cannot be opened ({type(error).__name__}: {error})",
             where=f"bus {table.interface} {table.channel}",

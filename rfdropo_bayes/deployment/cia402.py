@@ -193,7 +193,7 @@ def controlword_towards(state: DriveState, target: DriveState, previous: int) ->
     if target is DriveState.QUICK_STOP_ACTIVE:
         return int(
             Controlword.QUICK_STOP
-        )  # from lower states it leads to SWITCH ON DISABLED, where nothing moves either
+        )  # from lower states it leads to SWITCH ON DISABLED, in which nothing moves either
     if state is DriveState.QUICK_STOP_ACTIVE or target is DriveState.SWITCH_ON_DISABLED:
         return int(Controlword.DISABLE_VOLTAGE)
     if _RANK[state] < _RANK[target]:

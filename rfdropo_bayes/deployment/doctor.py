@@ -99,7 +99,7 @@ def scan(bus: BusTable, patience: float = 0.5) -> dict[str, dict[str, int]]:
             network.subscribe(0x580 + node, take)
         for node in range(1, 128):
             _ask(network, node, objects.Object.DEVICE_TYPE, 0)
-            time.sleep(0.002)  # a bus of 125 kbit/s carries so many
+            time.sleep(0.002)  # a bus of 125 kbit/s carries this rate
         time.sleep(patience)
         nodes = sorted(node for node, index, _ in answers if index == objects.Object.DEVICE_TYPE)
         for node in nodes:

@@ -123,7 +123,7 @@ class Drive:
         assert self.reading is not None
         return self.motor.tension(self.reading.torque)
 
-    # SDO; indices are those of a first axis
+    # SDO; indices are of a first axis
 
     def index(self, index: int) -> int:
         """Index of an object on this axis."""
@@ -373,7 +373,7 @@ class Drive:
             (Object.MAX_MOTOR_SPEED, 0, max(1, round(1.5 * fastest / speed))),
             (Object.QUICK_STOP_DECELERATION, 0, max(1, round(braking / acceleration))),
             (Object.QUICK_STOP_OPTION, 0, 6),  # slow down on the quick stop ramp, and hold
-            (Object.ABORT_CONNECTION, 0, 3),  # quick stop where the master is lost
+            (Object.ABORT_CONNECTION, 0, 3),  # quick stop if the master is lost
             (Object.CONSUMER_HEARTBEAT, 1, guards.master_node << 16 | round(1e3 * guards.master_timeout_s)),
             (Object.PRODUCER_HEARTBEAT, 0, round(1e3 * guards.drive_heartbeat_s)),
         ]

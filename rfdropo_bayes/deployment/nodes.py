@@ -42,7 +42,7 @@ class Node:
         network.add_node(self.remote)
         self._sdo = threading.Lock()
         self.nmt: int | None = None
-        self.heartbeat = 0.0  # time of the last one [s, monotonic]
+        self.heartbeat = 0.0  # time of the last heartbeat [s, monotonic]
         network.subscribe(objects.HEARTBEAT + number, self._on_heartbeat)
 
     def _on_heartbeat(self, identifier: int, data: bytearray, timestamp: float) -> None:

@@ -31,7 +31,7 @@ from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.errors import InputError
 
-AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
+AGAIN = 3  # times that a base fit is continued from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3, "orientation": 0.01}
 
@@ -111,7 +111,7 @@ def base_fits(
     for _ in range(AGAIN):
         yield Reached.at(judge, replace(fit, promise=np.inf))
         better = better_nearby(judge, fit)
-        if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
+        if better is None:  # for a motion with kinks, as with slack cables, slopes predict gains that do not exist
             fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
             break
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
@@ -176,7 +176,7 @@ def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) 
     points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)
     points[:, : own.base] += np.linspace(-0.5, 0.5, len(points))[:, None] * own.prior_sd[: own.base]
     took = []
-    for _ in range(2):  # the first one compiles
+    for _ in range(2):  # the first call compiles
         began = time.monotonic()
         forward.observe(np.clip(points, *own.bounds))
         took.append(time.monotonic() - began)

@@ -331,7 +331,7 @@ def conclude(found: Found, report: Callable[[str], None] = lambda line: None) ->
     sizes = extended
     with suppress(OutOfTime), clock.stage("sizes"):
         sizes = widened(steps[-1].judge, extended) if steps else extended
-    clock.lift()  # what is left are single rollouts, for the report, and the climb for the sizes of a law
+    clock.lift()  # the rest are single rollouts for the report, and the optimisation for the sizes of a law
     finer, refined = fitted.search.finer, DISCRETISATION in [*fitted.names, *kept.unsupported]
     shown = None if refined or finer is None else numerical_shift(target, finer, extended)
     left = extended.residual
@@ -389,7 +389,7 @@ def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
     gain = Validation.of_steps(kept.held_out, len(named.steps)).gain
     last = named.screens[-1].omnibus.p if named.steps else None
     verdict = decide(rules, named.screens[0].omnibus.p, last, members, gain, noise.doubtful)
-    if not named.fit.converged:  # what unseen recordings clearly support is found all the same
+    if not named.fit.converged:  # clearly supported effects are found nevertheless
         return PARTLY if gain is not None and gain.clear else NO_VERDICT
     return verdict if ended or named.steps or verdict != UNEXPLAINED else NO_VERDICT
 

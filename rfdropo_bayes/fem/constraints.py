@@ -60,7 +60,7 @@ class Contacts(NamedTuple):
 
     opening: Float[Array, " contacts"]  # gap over the time step [m/s]
     friction: Scalar
-    before: Float[Array, "contacts 3"]  # impulses of the step before, in the rows of this one [N s]
+    before: Float[Array, "contacts 3"]  # impulses of the previous step, in the rows of this step [N s]
 
 
 class Impulses(NamedTuple):

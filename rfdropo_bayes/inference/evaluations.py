@@ -18,7 +18,7 @@ from rfdropo_bayes.errors import InputError
 
 SPACINGS = ("geometric", "linear")
 NOT_A_NUMBER = "not_a_number"
-REDRAWS = 256  # times as many prior draws as are wanted, at most
+REDRAWS = 256  # most prior draws, as a multiple of the requested number
 
 
 @dataclass

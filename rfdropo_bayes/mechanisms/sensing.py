@@ -38,7 +38,7 @@ class CameraRotation:
         """Rotate about the base's origin (Rodrigues' formula, written so that it is smooth at zero)."""
         vector = jnp.stack([values[spec.name] for spec in self.parameters])
         square = jnp.sum(vector**2)
-        # sin(a)/a and (1 - cos(a))/a^2 by their series near zero, where the square root has no derivative.
+        # sin(a)/a and (1 - cos(a))/a^2 by their series near zero, at which the square root has no derivative.
         small = square < 1e-8
         angle = jnp.sqrt(jnp.where(small, 1.0, square))
         first = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)

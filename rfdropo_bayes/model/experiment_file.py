@@ -19,7 +19,7 @@ from rfdropo_bayes.tables import parse_assignment, plain, read_toml, set_entry
 ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
 FILE_KEYS = ("observations", "commands")
-NO_COMMANDS = "none"  # stands for zero commands where a file of them could be named
+NO_COMMANDS = "none"  # zero commands instead of a file of commands
 WRITTEN_BY_RUNS = ("config.toml", "extended.toml")
 RESULTS_OF_RUNS = ("run.json", "summary.json", "audit.json")
 
@@ -136,7 +136,7 @@ def _robot_placed(robot: str, folder: Path, out: Path | None) -> str:
     file = _robot_file(robot, folder)
     if file.suffix == ".toml" and file.is_file():
         return _brought(file, out, ROBOT_COPY)
-    if file.suffix in MODEL_FILES and file.is_file():  # which may name meshes beside it: it stays where it is
+    if file.suffix in MODEL_FILES and file.is_file():  # it may name meshes beside it, and is not moved
         return str(file.resolve())
     return code_placed(robot, folder, out) if ".py:" in robot else robot
 

@@ -101,7 +101,7 @@ def shown(answer: Answer) -> figures.Shown:
         measured = np.where(valid, recordings.position, np.nan)
         series = {"measured": measured, "base model": base, "extended model": extended}
         unseen = (step * np.flatnonzero(seen), {name: path[worst, seen, -3:] for name, path in series.items()})
-        names = answer.problem.model.recordings.markers  # those that all recordings have
+        names = answer.problem.model.recordings.markers  # markers that all recordings have
         for index in np.argsort([-each.rmse_base for each in found.gain.differences.values()]):
             rows = slice(0, int(np.flatnonzero(valid[index].any(axis=1))[-1]) + 1)
             moved = {name: path[index, rows].reshape(-1, len(names), 3) for name, path in series.items()}

@@ -15,7 +15,7 @@ from rfdropo_bayes.report.headline import FEW_DRAWS, best_baseline
 BAND = "0.9"
 TIP = "tip"  # a marker of this name needs no other words
 OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
-CHOSEN = ("rfdropo", "adapt")  # methods whose draws are as many as were asked for, and no chain
+CHOSEN = ("rfdropo", "adapt")  # methods with a requested number of draws, and no chain
 NAMED = 3  # parameters that a sentence names
 UNMIXED = 1.1  # R-hat
 HALF = 0.5  # of a variance: beyond it, most of an error is systematic

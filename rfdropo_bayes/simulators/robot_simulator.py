@@ -69,7 +69,7 @@ def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time sec
     beside = beside - jnp.sum(beside * x, axis=-1, keepdims=True) * x
     y = beside / jnp.linalg.norm(beside, axis=-1, keepdims=True)
     z = jnp.cross(x, y)
-    # Four ways to write the quaternion, each good where its own component is large.
+    # Four formulas for the quaternion, each accurate if its own component is large.
     a, e, i = x[..., 0], y[..., 1], z[..., 2]
     p, q, r = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
     u, v, w = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]

@@ -1,4 +1,4 @@
-"""A budget in minutes: as many rollouts as fit into them on the machine where they run."""
+"""A budget in minutes, converted to rollouts on the present machine."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MOST_DRAWS, FEWEST_DRAWS = 200, 16
 
 
 class Budget(NamedTuple):
-    """What fits into some minutes.
+    """Numbers of rollouts and draws for a time.
 
     Attributes:
-        rollouts: of the fit, in full-length rollouts of the fitted recordings.
-        draws: whose predictions are kept.
+        rollouts: rollouts of the fit, in full-length rollouts of the fitted recordings.
+        draws: number of draws with stored predictions.
     """
 
     rollouts: int
@@ -45,7 +45,7 @@ def budget_within(minutes: float, rollout_seconds: float, predicted: float) -> B
 
 
 def rollout_seconds(problem: CalibrationProblem, key: PRNGKeyArray) -> float:
-    """Seconds that one parameter set takes in a batch of the prior, all recordings, compiling left out."""
+    """Seconds per parameter set in a batch of the prior, for all recordings, without compilation."""
     drawn = {name: np.asarray(values) for name, values in problem.sample_prior(key, problem.chunk).items()}
     problem.row_log_likelihood(drawn, problem.n_rows)
     begun = time.perf_counter()

@@ -143,7 +143,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     if ahead and recordings["fit"] and not found.problems:
         fewer = [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
-            _say_motion(found, experiment, folder, fewer)
+            _say_motion(found, experiment, folder, recordings["fit"], fewer[0])
         _say_ahead(found, experiment, folder, fewer)
     if any(recordings.values()):
         out = output_folder(out)
@@ -159,11 +159,16 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     return found
 
 
-def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What the nominal model shows: errors of time step, elements and motion, and motions in another direction."""
-    say_step(f"simulating {runs[0].name} with a finer time step, more elements, and the other kind of motion")
+def _say_motion(
+    found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory], first: Trajectory
+) -> None:
+    """What the nominal model shows: errors of time step, elements and motion, and motions in another direction.
+
+    ``first`` is the first of the recordings with the rows that its motion needs.
+    """
+    say_step(f"simulating {first.name} with a finer time step, more elements, and the other kind of motion")
     spec = spec_of(experiment, folder)
-    found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
+    found.lines += _try(found, partial(numerical_error_lines, spec, first)) or []
     columns = None if experiment.data is None else experiment.data.columns
     compared = _try(found, partial(measure_motion, spec, runs, columns))
     if compared is not None:

@@ -38,7 +38,7 @@ def installed_mechanisms(robot: Robot) -> list[str]:
 
 
 def installed_priors(robot: Robot, recording: Trajectory | None) -> list[str]:
-    """Lines of [model.priors] of a robot as it is installed, in its sizes and those of its first recording."""
+    """Lines of [model.priors] of a robot as it is installed, from its sizes and its first recording."""
     lines = []
 
     def normal(name: str, scale: float, words: str) -> None:

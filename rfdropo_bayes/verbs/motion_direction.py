@@ -96,14 +96,21 @@ def direction_doubt(found: Direction, axes: tuple[str, str, str] | None) -> str 
     return None
 
 
+def axes_of_mirror(turn: float, axes: tuple[str, str, str] | None) -> str:
+    """The line that reads a left-handed frame right, or where to look for it."""
+    if axes is None or not _by_quarters(turn):
+        return "look at the axes of the positions"
+    c, s = np.round(np.cos(turn)), np.round(np.sin(turn))
+    back = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, 1.0]])
+    return f"axes = {axes_words(back @ axes_matrix(axes))} in [data.columns]"
+
+
 def _mirror_remedy(turn: float, axes: tuple[str, str, str] | None) -> str:
     """What would undo a mirror: the frame is left-handed, or the commands run the other way round."""
     order = "look at the order of the commands and at azimuth_deg of the cables, which counts from +x towards +y"
     if axes is None or not _by_quarters(turn):
         return f"the frame is left-handed, or {order}"
-    c, s = np.round(np.cos(turn)), np.round(np.sin(turn))
-    back = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, 1.0]])
-    return f"if the frame is left-handed, axes = {axes_words(back @ axes_matrix(axes))} in [data.columns]; else {order}"
+    return f"if the frame is left-handed, {axes_of_mirror(turn, axes)}; else {order}"
 
 
 def _by_quarters(turn: float) -> bool:

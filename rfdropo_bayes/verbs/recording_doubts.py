@@ -101,7 +101,7 @@ def _moved(model: Model, first: Sequence[Trajectory], paths: Sequence[Paths]) ->
     if not (isinstance(model.spec.robot, Robot) and paths):
         return []
     motion = Motion(direction_of(paths), size_of(paths))
-    return motion_cautions(motion, columns_of(model), first[0].cable_names, first[0].command_unit)
+    return motion_cautions(motion, columns_of(model), first[0].command_unit)
 
 
 def _prior_paths(prediction: RecordingPrediction) -> list[Paths]:

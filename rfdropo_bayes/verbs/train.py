@@ -231,6 +231,6 @@ One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} 
 
 Action, every {layout.period_s:g} s: {what}. Layout SHA-256 {summary["layout_sha256"][:16]}.
 
-It has seen a simulator only. `rfdropo evaluate` says how it does on others; summary.json says what made it.
+It has seen a simulator only. `rfdropo evaluate` tests it on others; summary.json has its origin.
 Made with {versions}.
 """

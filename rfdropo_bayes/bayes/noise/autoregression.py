@@ -27,8 +27,8 @@ from rfdropo_bayes.data.sample_times import ONE_RATE
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
-INNOVATIONS = "innovations"  # white, of the size of what in slow residuals the rows before do not predict
-MISFIT = "misfit"  # white, of the size of what a model that is far off leaves
+INNOVATIONS = "innovations"  # white: the size of slow residuals that the rows before do not predict
+MISFIT = "misfit"  # white, of the size of a misspecified model's residuals
 SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
 LEAST_ROWS = 3  # for each column, to estimate correlations at all
@@ -339,7 +339,7 @@ def estimate_noise(
     across = shrunk_correlation(alone.innovations(series, valid)[whole], freedom_share, shared=shared)
     if across is None:
         return alone
-    # The mean of correlated squares is known as well as that of fewer independent ones.
+    # The mean of correlated squares is as accurate as the mean of fewer independent squares.
     return replace(alone, correlation=across, freedom=alone.freedom * len(across) / float(np.sum(across**2)))
 
 
@@ -381,7 +381,7 @@ def shrunk_correlation(
         return None
     scale = np.sqrt(np.maximum(np.mean(rows**2, axis=0), 1e-300))
     sample = (rows / scale).T @ (rows / scale) / len(rows)
-    np.fill_diagonal(sample, 1.0)  # of a column that never differs, too
+    np.fill_diagonal(sample, 1.0)  # also of a constant column
     pairs = columns * (columns - 1) / 2
     if shared is None:
         likelihood = -(count - 1.0 - (2.0 * columns + 5.0) / 6.0) * np.linalg.slogdet(sample)[1]

@@ -20,7 +20,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 START = 300.0  # [s]: a plant may compile itself first
-_END = 5.0  # [s]: for the step that it is at, and for what its libraries tidy up
+_END = 5.0  # [s]: for the present step, and for the clean-up of its libraries
 
 
 class PlantState(NamedTuple):

@@ -33,7 +33,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 TICK = 0.002  # [s]: drives check their guards and move between frames
-PLANT_PERIOD = 0.01  # [s]: how often plant and markers are brought up to date where no SYNC comes
+PLANT_PERIOD = 0.01  # [s]: time between updates of plant and markers without SYNC
 DATAGRAM = struct.Struct("<4sId")
 MAGIC = b"RFMK"
 

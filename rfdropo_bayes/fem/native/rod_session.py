@@ -258,7 +258,7 @@ class RodSession:
             own: dict[str, dict[str, np.ndarray]] = {place.record: {} for place in self._places}
             for place in self._places:
                 own[place.record][place.name] = self.memory[block, place.first : place.last]
-            # What is present is the same for all blocks, and no lane's own.
+            # Flags of present effects are the same for all blocks and lanes.
             own["samples"]["present"] = self._run.batch.present
             parts = {name: getattr(records, name)._replace(**fields) for name, fields in own.items()}
             self._local.records[block] = records._replace(**parts)

@@ -61,7 +61,7 @@ def integrate_scales(
     """
     owner = np.concatenate([np.full(len(m), j) for j, m in enumerate(members)])
     index = np.concatenate([np.asarray(m, dtype=int) for m in members])
-    # The rest of the quadratic form stays; in its own coordinates but those of the members it is integrated out once.
+    # The rest of the quadratic form is unchanged; it is integrated out once in its coordinates other than the members'.
     precision = np.linalg.inv(mode.covariance)
     precision[index, index] -= 1.0 / held[owner] ** 2
     slope = np.zeros(len(mode.mean))
