@@ -77,8 +77,8 @@ def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_
 
 
 def test_slow_residuals_are_a_misfit_and_no_autoregression_explains_them():
-    """Without repeats: a wave of 20 deviations over 2 s is no noise, though an autoregression could follow it. Noise with
-    the memory of a measurement stays one."""
+    """Without repeats: a wave of 20 deviations over 2 s is no noise, though an autoregression could follow it. Noise
+    with the memory of a measurement stays one."""
     measured = first_target(replace(problem(TRUTH, 3), trajectories=problem(TRUTH, 3).trajectories[2:]), Journal())
     rng, shape = np.random.default_rng(0), measured.measurements.count.shape
     white = NOISE * rng.standard_normal(shape)
