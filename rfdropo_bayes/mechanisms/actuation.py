@@ -425,31 +425,6 @@ class DriveCreep(SteppedActuation):
         return (slow, start), given - values["drive_creep"] * (slow - start)
 
 
-class DriveDrift(InCommandUnit, SteppedActuation):
-    """The zero of all drives moves at a steady rate from the start of the recording; no rate at null."""
-
-    name = "drive_drift"
-    stage = "actuation"
-    inside_drive = False
-    cause = "drives or cables that slip, or spools that wind unevenly, so that the zero wanders"
-    remedy = "return to zero at the end of a recording and compare the pose with that at the start"
-    in_metres = (
-        ParameterSpec(
-            "drive_drift", "m/s", -0.1, 0.1, 0.0, normal(0.0005), "rate at which the zero of every drive moves"
-        ),
-    )
-
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Int[Array, ""]:
-        """Number of steps."""
-        return jnp.zeros((), int)
-
-    def advance(
-        self, values: Values, memory: Int[Array, ""], given: Float[Array, " channel"], now: float
-    ) -> tuple[Int[Array, ""], Float[Array, " channel"]]:
-        """Add the drift to every channel."""
-        return memory + 1, given + values["drive_drift"] * now * (memory + 1)
-
-
 class GuideAzimuth(MemorylessActuation):
     """Guides of each cable turned about the body's axis by an angle; zero is the base simulator.
 

@@ -24,7 +24,6 @@ from rfdropo_bayes.mechanisms.actuation import (
     CommandDelay,
     CommandGain,
     DriveCreep,
-    DriveDrift,
     EndStop,
     GuideAzimuth,
     RateLimit,
@@ -49,8 +48,8 @@ from rfdropo_bayes.mechanisms.body_mechanisms import (
     ViscoelasticBranch,
     WallContact,
 )
+from rfdropo_bayes.mechanisms.drift import CableGainDrift, CameraDrift, CameraTurn, CameraZoom, DriveDrift, GainDrift
 from rfdropo_bayes.mechanisms.sensing import (
-    CameraDrift,
     CameraOffset,
     CameraRotation,
     CameraScale,
@@ -79,6 +78,8 @@ REGISTRY: dict[str, type] = {
         SpoolGrowth,
         DriveCreep,
         DriveDrift,
+        GainDrift,
+        CableGainDrift,
         Payload,
         AxialStiffness,
         StiffnessGradient,
@@ -99,6 +100,8 @@ REGISTRY: dict[str, type] = {
         CameraScale,
         CameraOffset,
         CameraDrift,
+        CameraTurn,
+        CameraZoom,
         MarkerOffset,
         SensorLag,
         ClockOffset,
