@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
+from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -25,38 +26,38 @@ Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
 class CalibrationProblem:
     """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a few sizes.
 
-    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is
-    cut into chunks of at most ``chunk`` parameter sets, the last one padded to one of `chunk_sizes`, so that a few
-    compilations serve every batch size, and the number of simulated steps is a run-time argument, so that they serve
+    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is cut
+    into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
+    compilations serve every batch size. The number of simulated steps is a run-time argument, so that they also serve
     every horizon.
 
     Args:
         model: priors, simulator and data.
         chunk: most parameter sets in one compiled call.
-        earlier: draws of the posterior of another model of the same robot, by parameter name, from which climbs may
-            start; parameters that it lacks start from their priors.
+        earlier: draws of the posterior of another model of the same robot, from which optimisations may start; missing
+            parameters start from their priors.
     """
 
-    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: Batch | None = None) -> None:
+    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: DrawsByOwner | None = None) -> None:
         self.model = model
-        self.earlier = {} if earlier is None else {name: np.asarray(draws) for name, draws in earlier.items()}
+        self.earlier: DrawsByOwner = earlier or {}
         self.measured = model.measured
         self.shares = dict.fromkeys(self.measured, 1.0)  # what each channel counts
         self.jacobian = "auto"
         self._told: Callable[[float], None] | None = None
         self.chunk = chunk
-        self.names = model.space.names
-        self.units = {p.name: p.spec.unit for p in model.space.parameters}
-        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.space.parameters}
-        self.prior_ends = {p.name: p.ends for p in model.space.parameters}
+        self.names = model.scopes.names
+        self.units = {p.name: p.spec.unit for p in model.scopes.parameters}
+        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.scopes.parameters}
+        self.prior_ends = {p.name: p.ends for p in model.scopes.parameters}
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}
         self.compared = [channel for channel in model.channels if isinstance(channel, FeatureChannel)]
         physical = {spec.name for spec in model.simulator.parameters}
-        self.scales, self.typical_scales = model.space.scales, model.space.typical_scales
+        self.scales, self.typical_scales = model.scopes.scales, model.scopes.typical_scales
         self.physical_names = tuple(
-            p.name for p in model.space.parameters if p.physical in physical or p.name in self.scales
+            p.name for p in model.scopes.parameters if p.physical in physical or p.name in self.scales
         )
 
     @cached_property
@@ -67,74 +68,78 @@ class CalibrationProblem:
         data = self.measured.values()
         for array in (*data, recordings.time, *jax.tree.leaves((recordings.line, recordings.commands))):
             digest.update(np.ascontiguousarray(array).tobytes())
-        priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
+        priors = [(p.name, sorted(p.table.items())) for p in self.model.scopes.parameters]
         rest = (
             priors,
-            sorted(self.model.fixed.items()),
+            sorted(self.model.scopes.fixed.items()),
             [(channel.name, _plain(channel)) for channel in self.model.channels],
             self.model.noise,
             sorted(self.model.simulator.description.items()),
             sorted(self.shares.items()),
-            *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
+            *(
+                (name, owner, np.asarray(draws).tobytes())
+                for name, own in sorted(self.earlier.items())
+                for owner, draws in sorted(own.items())
+            ),
         )
         digest.update(repr(rest).encode())
         return digest.hexdigest()
 
     def holding(self, values: Mapping[str, float]) -> CalibrationProblem:
-        """The same problem with some parameters known, and no longer inferred; itself where none is."""
+        """The same problem with some parameters fixed; itself if ``values`` is empty."""
         if not values:
             return self
-        model = replace(self.model, space=self.model.space.holding(values), fixed={**self.model.fixed, **values})
+        model = replace(self.model, scopes=self.model.scopes.holding(values))
         other = CalibrationProblem(model, chunk=self.chunk, earlier=self.earlier)
         other.measured, other.shares = self.measured, self.shares
         other.jacobian, other._told = self.jacobian, self._told
         return other
 
     def telling(self, spent: Callable[[float], None]) -> CalibrationProblem:
-        """The same problem, which tells of rollouts, in full-length ones, as they are done."""
+        """The same problem, which reports rollouts in full-length equivalents to ``spent``."""
         other = self._copied()
         other._told = spent
         return other
 
     def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
         """Log density of the prior of the standard deviations, in the order of ``scales``."""
-        priors = [self.model.space[name].prior for name in self.scales]
+        priors = [self.model.scopes[name].prior for name in self.scales]
         return np.sum([np.asarray(p.log_prob(column)) for p, column in zip(priors, values.T, strict=True)], axis=0)
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""
-        return self.model.space.sample(key, n)
+        return self.model.scopes.sample(key, n)
 
     def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
-        """Where climbs may start: the prior, with what an earlier posterior knows in its place."""
-        return self.model.space.sample_around(self.earlier, key, n)
+        """Starts of optimisations: the prior, with draws of an earlier posterior for its parameters."""
+        return self.model.scopes.sample_around(self.earlier, key, n)
 
     def to_unconstrained(self, values: Batch) -> Float[Any, "n d"]:
         """Values as points of the unconstrained space, columns in the order of ``names``."""
         columns = {name: values[name] for name in self.names}
-        space = self.model.space
-        return padded(self._unconstrained, columns) if is_batch(columns, 1) else space.to_unconstrained(columns)
+        scopes = self.model.scopes
+        return padded(self._unconstrained, columns) if is_batch(columns, 1) else scopes.to_unconstrained(columns)
 
     def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`."""
-        return padded(self._constrained, u) if is_batch(u, 2) else self.model.space.from_unconstrained(u)
+        return padded(self._constrained, u) if is_batch(u, 2) else self.model.scopes.from_unconstrained(u)
 
     def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log prior density in the unconstrained space."""
-        space = self.model.space
-        return padded(self._log_prior, u) if is_batch(u, 2) else space.log_prior_unconstrained(u)
+        scopes = self.model.scopes
+        return padded(self._log_prior, u) if is_batch(u, 2) else scopes.log_prior_unconstrained(u)
 
     @cached_property
     def _unconstrained(self) -> Callable:
-        return jax.jit(self.model.space.to_unconstrained)
+        return jax.jit(self.model.scopes.to_unconstrained)
 
     @cached_property
     def _constrained(self) -> Callable:
-        return jax.jit(self.model.space.from_unconstrained)
+        return jax.jit(self.model.scopes.from_unconstrained)
 
     @cached_property
     def _log_prior(self) -> Callable:
-        return jax.jit(self.model.space.log_prior_unconstrained)
+        return jax.jit(self.model.scopes.log_prior_unconstrained)
 
     @cached_property
     def prior_derivatives(self) -> tuple[Callable, Callable]:
@@ -165,10 +170,10 @@ class CalibrationProblem:
     def row_log_likelihood(
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon"], Int[np.ndarray, " n"]]:
-        """Log density of each of the first ``horizon`` rows given those before it, summed over recordings.
+        """Log density of each of the first ``horizon`` rows given the earlier rows, summed over recordings.
 
         Returns:
-            rows, minus infinity throughout where the rollout did not end well, and the `Result` code of each set.
+            rows, minus infinity throughout after a failed rollout, and the `Result` code of each set.
         """
         rows, status = self._chunked(self._rows, values, horizon, self.measured, self.shares)
         rows = rows[:, :horizon]
@@ -177,9 +182,9 @@ class CalibrationProblem:
         return np.where((status == Result.OK)[:, None], rows, -np.inf), status
 
     def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
-        """Log likelihood of all rows at one unconstrained point; minus infinity where the rollout does not end well.
+        """Log likelihood of all rows at one unconstrained point; minus infinity after a failed rollout.
 
-        Traceable; differentiable backwards where the engine is.
+        Traceable; differentiable in reverse mode if the engine is.
         """
         values = {name: value[0] for name, value in self.from_unconstrained(u[None]).items()}
         rows, status = self.model.row_log_likelihood(values, None, self.measured, self.shares)
@@ -206,7 +211,7 @@ class CalibrationProblem:
     def noise_deviation(self, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
         values."""
-        known = {**self.model.fixed, **values}
+        known = {**self.model.scopes.fixed, **values}
         return np.tile(np.concatenate([c.feature_deviation(known) for c in self.compared]), self.n_recordings)
 
     @cached_property
@@ -226,14 +231,14 @@ class CalibrationProblem:
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
-        """True where ``observed`` may be used."""
+        """True for usable entries of ``observed``."""
         return self._side_by_side(np.concatenate([c.feature_valid for c in self.compared], axis=-1)[None])[0]
 
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
-        """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
+        """Whitened residuals of the first ``horizon`` rows (zero if masked); traceable, for one set of values."""
         white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured, self.shares)
         return self._flat({name: part[None] for name, part in white.items()}, horizon)[0]
 
@@ -243,7 +248,7 @@ class CalibrationProblem:
         return np.asarray(self._flat(white, horizon))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
-        """Whitened residuals of the markers at one set of values, NaN where masked."""
+        """Whitened residuals of the markers at one set of values, NaN if masked."""
         single = {name: np.array([values[name]]) for name in self.names}
         white = self._chunked(self._white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0))
         positions = white[self.model.markers.name][0]
@@ -311,7 +316,9 @@ class CalibrationProblem:
         return self._chunked(self._positions, values, self.n_rows)
 
     def observe(self, values: Batch) -> Observation:
-        """What every recording would show, without observation noise: fields (n, recording, time, ...), status (n,)."""
+        """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),
+        status (n,).
+        """
         return Observation(*self._chunked(self._observations, values, self.n_rows))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
@@ -319,11 +326,11 @@ class CalibrationProblem:
         return self._realised(self.model.markers.draw_noise, key, values)
 
     def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:
-        """What ``draw`` makes of a key, the times of a recording and a set of values, for all of both."""
+        """Results of ``draw`` for a key, the times of a recording and a set of values, for all recordings and sets."""
 
         def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             keys = jax.random.split(key, self.n_recordings)
-            known = {**self.model.fixed, **values}
+            known = {**self.model.scopes.fixed, **values}
             return jax.vmap(lambda k, t: draw(k, t, known))(keys, jnp.asarray(self.model.recordings.time))
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}
@@ -375,9 +382,9 @@ class CalibrationProblem:
         return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=told)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
-        """Residuals by rollout, cut to the horizon where they have a time axis, and flattened.
+        """Residuals by rollout, cut to the horizon if they have a time axis, and flattened.
 
-        Channels come in the order of the model; a dictionary that JAX returns has another.
+        Channels come in the order of the model; a dictionary that JAX returns has another order.
         """
         cut = []
         for channel in self.model.channels:
@@ -387,7 +394,7 @@ class CalibrationProblem:
 
 
 def _plain(channel: Channel) -> str:
-    """What beside its readings tells a channel from another one."""
+    """Digest of a channel's settings, without its readings."""
     if isinstance(channel, Series):
         known = channel.known
         return repr(None if known is None else (known.scale, known.autocorrelation, known.correlation))

@@ -16,12 +16,13 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.bayes.channels import Channel, Markers, ObjectPose, Seen
 from rfdropo_bayes.bayes.channels.object_pose import Placing, offset_of
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
+from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.protocol import Observation, Simulator
 
 Values = Mapping[str, Float[Array, "..."]]
 Measured = Mapping[str, Float[Any, "..."]]
-"""What was measured, by channel, apart from when and where: another set of numbers is another data set."""
+"""Measured arrays by channel, without times and places: other numbers are another data set."""
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,13 @@ class TrajectoryModel:
 
     Attributes:
         simulator: anything that satisfies `Simulator`, mechanisms included.
-        space: inferred parameters, those of the channels among them.
-        fixed: values of parameters that are not inferred and differ from their nominal value; of all recordings, or of
-            one (``name@recording``).
-        recordings: what was commanded, and when it was observed.
-        channels: what was measured, `Markers` first.
+        scopes: inferred and fixed parameters, including the channels'.
+        recordings: commands and times of observation.
+        channels: measurement channels, `Markers` first.
     """
 
     simulator: Simulator
-    space: ParameterSpace
-    fixed: Mapping[str, float]
+    scopes: Scopes
     recordings: RecordingSet
     channels: tuple[Channel, ...]
 
@@ -56,12 +54,12 @@ class TrajectoryModel:
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """What was measured."""
+        """Names of the measurement channels."""
         return tuple(channel.name for channel in self.channels)
 
     @cached_property
     def measured(self) -> Measured:
-        """What was measured."""
+        """Measured arrays by channel."""
         return {channel.name: channel.measured for channel in self.channels}
 
     @cached_property
@@ -72,37 +70,20 @@ class TrajectoryModel:
     def _physical(self) -> frozenset[str]:
         return frozenset(spec.name for spec in self.simulator.parameters)
 
-    @cached_property
-    def _absent(self) -> dict[str, float]:
-        """Nominal values of parameters that belong to some recordings only: the others have these."""
-        own = {parameter.spec.name for parameter in self.space.parameters if parameter.recording}
-        own |= {name.partition(SEPARATOR)[0] for name in self.fixed if SEPARATOR in name}
-        return {spec.name: spec.nominal for spec in self.simulator.parameters if spec.name in own}
-
-    @cached_property
-    def _ends_of_sums(self) -> dict[str, tuple[float, float]]:
-        """Hard bounds of the parameters that are a shared value and a group's deviation from it."""
-        summed = {parameter.added_to for parameter in self.space.parameters if parameter.added_to}
-        return {spec.name: (spec.low, spec.high) for spec in self.simulator.parameters if spec.name in summed}
-
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
-        """What the simulator is given for one recording: fixed and inferred physical parameters.
+        """The parameters that the simulator is given for one recording.
 
-        The sum of a shared value and a group's deviation ends at the parameter's hard bounds, as in audits. A body
-        whose poses are measured starts at the first of them.
+        A body whose poses are measured starts at the first of them.
         """
-        parts = ((name.partition(SEPARATOR), value) for name, value in self.fixed.items())
-        fixed = {name: value for (name, _, owner), value in parts if owner in ("", recording)}
-        chosen = {**self._absent, **fixed, **self.space.for_recording(values, recording)}
+        chosen = self.scopes.values_in(recording, values)
         physical = {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
-        physical |= {name: jnp.clip(physical[name], *ends) for name, ends in self._ends_of_sums.items()}
         if self._poses is None:
             return physical
         assert isinstance(self.simulator, Placing)
         return self.simulator.with_object_at(physical, self._poses.measured[self.recordings.names.index(recording), 0])
 
     def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:
-        """Roll out every recording under one set of values.
+        """Roll out every recording under a set of values.
 
         Args:
             values: inferred parameters, scalars.
@@ -120,7 +101,7 @@ class TrajectoryModel:
     def seen(self, observation: Observation, values: Values) -> Seen:
         """An observation as channels want it, with the values that it was simulated under."""
         offset = jnp.stack([offset_of(self.rollout_values(values, name)) for name in self.recordings.names])
-        return Seen(observation, {**self.fixed, **values}, offset)
+        return Seen(observation, {**self.scopes.fixed, **values}, offset)
 
     def row_log_likelihood(
         self,
@@ -129,9 +110,9 @@ class TrajectoryModel:
         measured: Measured | None = None,
         shares: Mapping[str, Any] | None = None,
     ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
-        """Log density of each row given those before it, summed over recordings, and the worst result code.
+        """Log density of each row given the earlier rows, summed over recordings, and the worst result code.
 
-        ``measured`` puts other data in the place of the model's own; ``shares`` says how much each channel counts.
+        ``measured`` replaces the model's own data; ``shares`` are the weights of channels.
         """
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
@@ -149,7 +130,7 @@ class TrajectoryModel:
         measured: Measured | None = None,
         shares: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, "..."]]:
-        """Whitened residuals by channel, zero where masked; see `Channel.residuals` and `row_log_likelihood`."""
+        """Whitened residuals by channel, zero if masked; see `Channel.residuals` and `row_log_likelihood`."""
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
         white = {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}
@@ -158,14 +139,15 @@ class TrajectoryModel:
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
         values: dict[str, Array] = {}
-        for p in self.space.parameters:  # a spread comes before what it is the spread of
-            prior = dist.Normal(0.0, values[p.scaled_by]) if p.scaled_by else p.prior
+        for p in self.scopes.parameters:
+            scale = p.scope.scaled_by
+            prior = dist.Normal(0.0, values[scale]) if scale else p.prior
             values[p.name] = numpyro.sample(p.name, prior)
         seen = self.seen(self.simulate(values), values)
         numpyro.deterministic("status", seen.observation.status)
         for index, name in enumerate(self.recordings.names):
             rows = int(self.recordings.rows[index])
             measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
-            numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
+            numpyro.sample(label("position", name), self.markers.distribution(seen, index), obs=measured)
         for channel in self.channels[1:] if observe else ():
             numpyro.factor(channel.name, channel.row_log_density(seen, channel.measured))

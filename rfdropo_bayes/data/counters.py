@@ -34,7 +34,7 @@ class Wraps(NamedTuple):
 
     Attributes:
         rows: after the jumps.
-        turn: of the counter, in the unit of the column.
+        turn: turn of the counter, in the unit of the column.
         known: whether this is the turn of a known counter; else it is estimated from the jumps.
     """
 

@@ -20,9 +20,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Fields, Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
@@ -305,7 +306,7 @@ class Posterior(ProblemDefaults):
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""
-        drawn = ParameterSpace(self._parameters).sample(key, n)
+        drawn = Scopes(self._parameters).sample(key, n)
         return {name: np.asarray(column, dtype=float) for name, column in drawn.items()}
 
     def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n free"]:

@@ -11,18 +11,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
+from rfdropo_bayes.mechanisms.sizes import USUAL, scaled
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-SPOOL = 0.02  # [m], a usual radius: a prior for metres of cable becomes one for radians of the motor that winds it
-STROKE = 0.03  # [m], a usual pull: what commands in units of their own are measured by
+SPOOL = 0.02  # [m], radius of a usual spool, for motors of which no usual command is known
 POWERS = {"m": 1, "m/s": 1, "1/m": -1, "s/m": -1}  # of a length in each unit
 NUMBERED = tuple(str(k + 1) for k in range(8))
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
 GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)  # of travels to a stop, inverted
-SIZES = ("loc", "scale")  # entries of a prior's table that have the parameter's unit
 
 
 class InCommandUnit:
@@ -31,39 +30,29 @@ class InCommandUnit:
 
     Args:
         unit: unit of the commands.
-        stroke: size of usual commands, if they are neither metres nor radians.
+        usual: size of usual commands, in their unit; a usual trunk's if unknown.
     """
 
     parameters: tuple[ParameterSpec, ...]
     in_metres: ClassVar[tuple[ParameterSpec, ...]]
 
-    def __init__(self, unit: str = "m", stroke: float | None = None) -> None:
-        per_metre = {"m": 1.0, "rad": 1.0 / SPOOL}.get(unit, (stroke or 1.0) / STROKE)
+    def __init__(self, unit: str = "m", usual: float | None = None) -> None:
+        unknown = {"m": USUAL.pull, "rad": USUAL.pull / SPOOL}.get(unit, 1.0)
+        per_metre = (unknown if usual is None else usual) / USUAL.pull
         self.parameters = tuple(in_unit(spec, unit, per_metre) for spec in self.in_metres)
 
     @classmethod
     def for_robot(cls, robot: Robot) -> InCommandUnit:
         """With parameters in the unit that a robot is commanded in."""
-        return cls(robot.command_unit, getattr(robot, "stroke", None))
+        return cls(robot.command_unit, robot.usual_command)
 
 
 def in_unit(spec: ParameterSpec, unit: str, per_metre: float) -> ParameterSpec:
-    """A parameter given for metres of cable, in another unit of commands, with ``per_metre`` units per metre.
-
-    For radians this is a usual spool; for other units, the ratio of usual commands.
+    """A parameter given for metres of cable of a usual trunk, in another unit of commands: ``per_metre`` is the ratio
+    of usual commands.
     """
-    if unit == "m":
-        return spec
-    factor = per_metre ** POWERS[spec.unit]
     word = {"-": "1", "N m": "(N m)"}.get(unit, unit) if "/" in spec.unit else unit
-    return spec._replace(
-        unit=word.join(spec.unit.rsplit("m", 1)),
-        low=factor * spec.low,
-        high=factor * spec.high,
-        nominal=factor * spec.nominal,
-        prior={name: factor * value if name in SIZES else value for name, value in spec.prior.items()},
-        grid=tuple(factor * value for value in spec.grid),
-    )
+    return scaled(spec, per_metre ** POWERS[spec.unit])._replace(unit=word.join(spec.unit.rsplit("m", 1)))
 
 
 def kept_over(time_step: float, time_constant: Float[Array, ""]) -> Float[Array, ""]:
@@ -212,7 +201,7 @@ class CableSlack(InCommandUnit, MemorylessActuation):
     remedy = "tension the cables until each just moves the body, and set zero there"
     in_metres = (
         ParameterSpec(
-            "cable_slack", "m", 0.0, 0.1, 0.0, half_normal(0.001), "command that is lost before a cable is taut"
+            "cable_slack", "m", 0.0, 0.1, 0.0, half_normal(0.003), "command that is lost before a cable is taut"
         ),
     )
 

@@ -1,4 +1,4 @@
-"""What a simulator lacks, by name: ``audit``."""
+"""The effects that a simulator lacks, by name: ``audit``."""
 
 from __future__ import annotations
 
@@ -41,10 +41,9 @@ from rfdropo_bayes.model.assembly import (
     AnySimulator,
     build_simulator,
     expand_groups,
-    fixed_values,
     gather_channels,
     measurement_specs,
-    model_space,
+    model_scopes,
     stated_noise,
 )
 from rfdropo_bayes.model.experiment import AuditTable, NoiseTable
@@ -95,26 +94,26 @@ def audit(
     between: Between | None = None,
     **keys: Any,
 ) -> Audit:
-    """Say what a model lacks, by name, and measure what it gains with that. What is not given is as the experiment file
-    of the model has it.
+    """Name the effects that a model lacks, and measure the gain of adding them. Missing arguments are taken from the
+    model's experiment file.
 
     Args:
-        model: what is simulated and inferred.
-        runs: recordings that are fitted and screened.
-        test: unseen recordings, which measure the gain.
-        seed: of all that is random, 0 where no file says. The same seed gives the same answer.
+        model: simulator and inferred parameters.
+        runs: recordings to fit and test candidates on.
+        test: unseen recordings that measure the gain.
+        seed: seed of all random numbers; 0 without a file. The same seed gives the same answer.
         fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
-        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
+        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it is used if
             nothing was repeated.
-        out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
-        resume: go on from what an interrupted audit has left in ``out``.
-        overwrite: start anew whatever ``out`` holds.
+        out: folder for audit.json, extended.toml and report.html; None writes nothing.
+        resume: continue an interrupted audit in ``out``.
+        overwrite: replace an earlier run in ``out``.
         workshop: see `build_problem`.
-        show: whether to say now and then what is done, as in `calibrate`.
-        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
-            Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
-            What both lack is named, too.
-        keys: of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
+        show: whether to show progress, as in `calibrate`.
+        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared. Two
+            names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
+            Effects that both lack are also named.
+        keys: keys of an experiment file's [audit]: ``candidates`` (names, or your own classes), ``exclude``,
             ``bootstraps``, ``minutes``.
 
     Raises:
@@ -153,7 +152,7 @@ def audit(
 
 
 def nominal_paths(problem: AuditProblem) -> list[Paths]:
-    """The fitted recordings beside the nominal model; empty where an object is pushed, or a rollout ends badly."""
+    """The fitted recordings beside the nominal model; empty if an object is pushed, or a rollout fails."""
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
@@ -173,7 +172,7 @@ def _audited(
     out: Path | None,
     doubts: Sequence[Caution],
 ) -> Audit:
-    """What an audit found as an object, with its page; ``doubts`` are those of its recordings."""
+    """Result of an audit as an object, with its page; ``doubts`` are cautions on its recordings."""
     versions, following = software_versions(), next_experiment(answer)
     given: dict[str, Any] = {"versions": versions, "data_sha256": data_sha256, "next_experiment": following}
     content = record(answer, **given, doubts=doubts)
@@ -215,10 +214,10 @@ def build_problem(
     """The base model with every candidate of the library in it, at its null value.
 
     ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
-    are the candidates, where it is not all; ``groups`` of recordings are compared, or have candidates of their own.
+    are the candidates, all by default; ``groups`` of recordings are compared, or have candidates of their own.
 
     Raises:
-        InputError: [audit] leaves nothing to ask.
+        InputError: [audit] leaves no candidate.
     """
     spreads, robot = spec.per_group, spec.robot
     if groups is not None and groups.compared:  # what the groups do not share is to be found
@@ -242,7 +241,7 @@ def build_problem(
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
         candidates = [c for c in candidates if c.name not in table.exclude]
     nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
-    coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
+    coordinates = Coordinates(model.scopes, base, tuple(nominal), nominal, model.scopes.fixed, limits)
     workshop = {} if workshop is None else workshop
     lanes = partial(_lanes, names=names, model=model, coordinates=coordinates, workshop=workshop)
 
@@ -270,18 +269,18 @@ def build_problem(
 
 
 def _something_asked(table: AuditTable, groups: Groups | None) -> None:
-    """Refuse an audit without the library that has no laws at ports or candidates of one's own to ask for either."""
+    """Refuse an audit without the library, laws at ports or user candidates."""
     ports = table.ports and (groups is None or not groups.compared)
     if not (ports or table.candidates):
         raise InputError(
-            "nothing is asked: the library is left out, and laws at ports are, too",
+            "no candidates: the library and laws at ports are both excluded",
             where="[audit] library",
             remedy="set library = true, or ports = true without --between",
         )
 
 
 def _rules(table: AuditTable) -> Rules:
-    """What [audit] says of the rules."""
+    """The rules of an audit from its table [audit]."""
     matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
     return Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters)
 
@@ -289,8 +288,8 @@ def _rules(table: AuditTable) -> Rules:
 def _named(
     table: AuditTable, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
 ) -> list[Candidate]:
-    """Mechanisms as candidates, less those that [audit] excludes."""
-    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
+    """Mechanisms as candidates, without the exclusions of [audit]."""
+    index = {p.spec.name: i for i, p in enumerate(model.scopes.parameters)}
     return [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
         for name, m in zip(names, added, strict=True)
@@ -307,21 +306,21 @@ def _with_own(
     spreads: Mapping[str, float],
 ) -> tuple[TrajectoryModel, list[Candidate]]:
     """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
-    space, own = with_fixed_quantities(model.space, plain, tuple(model.fixed))
+    space, own = with_fixed_quantities(model.scopes, plain, tuple(model.scopes.fixed))
     if groups is not None:
         space, candidates = with_differences(
-            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
+            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.scopes.fixed)
         )
-    return replace(model, space=space), [*candidates, *own]
+    return replace(model, scopes=space), [*candidates, *own]
 
 
 def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
-    """What may be in the model: the registry, if it is asked, and the experiment's own, less what is in its base model.
+    """Names of candidates: the registry, if requested, and the experiment's own, without mechanisms of the base model.
 
-    Excluded ones are among them, so that what is compiled does not depend on what is excluded.
+    Excluded candidates are included, so that the compiled program does not depend on exclusions.
 
     Raises:
-        InputError: a name to exclude that is not there.
+        InputError: an unknown name to exclude.
     """
     known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
     own = spec.robot.parameter_table() if isinstance(spec.robot, Robot) else {}
@@ -335,7 +334,7 @@ def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
 def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> dict[str, str]:
     """Which of the candidates cannot run on the experiment's body and engine, and why.
 
-    A mechanism of the library says where it runs; one of a user's own is tried, too.
+    A mechanism of the library states its requirements; a user's mechanism is tried.
     """
     simulator = build_simulator(spec)
     engine = str(simulator.description["engine"])
@@ -353,7 +352,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
 
 
 def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
-    """What a simulator says against rollouts of its mechanisms, before anything is computed."""
+    """Reason why a simulator cannot run its mechanisms, found before any computation."""
     try:
         jax.eval_shape(jax.vmap(lambda given: simulator.rollout({}, given)), commands)
     except InputError as error:
@@ -370,8 +369,9 @@ def _lanes(
     coordinates: Coordinates,
     workshop: Workshop,
 ) -> Lanes:
-    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own. Lanes
-    that the workshop has are not made again."""
+    """The simulator with all candidates; expensive candidates get a simulator of their own. Lanes in the workshop are
+    reused.
+    """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
     key = repr((*made, markers.tolist(), coordinates.fixed, fields))
@@ -389,7 +389,7 @@ def _lanes(
 
 
 def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
-    """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
+    """Lanes with one-sided differences if available: they are exact enough for optimisation and score tests."""
     if isinstance(simulator, TrunkSimulator) and not simulator.pushes and simulator.engine.backend.name == "numba":
         quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
         return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
@@ -429,12 +429,12 @@ def _model(
     recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
     specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
-    space = model_space(spec, simulator, specs, *groups, later=added)
-    space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
+    scopes = model_scopes(spec, simulator, specs, *groups, later=added)
+    scopes = scopes.holding(scopes.typical_scales)  # evidences are compared at one spread between groups
     of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
-    base = sum(p.spec.name not in of_candidates for p in space.parameters)
-    channels = gather_channels(spec, simulator, trajectories, recordings, space.names, fitted)
-    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels), base
+    base = sum(p.spec.name not in of_candidates for p in scopes.parameters)
+    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
+    return TrajectoryModel(simulator, scopes, recordings, channels), base
 
 
 def _fields(model: TrajectoryModel) -> list[str]:
@@ -444,17 +444,18 @@ def _fields(model: TrajectoryModel) -> list[str]:
 
 
 def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
-    """The noise that the experiment states, for recordings without repeats: that of the positions under [noise],
-    that of other channels under [model.fixed]; None where that of any channel is not stated."""
+    """The noise that the experiment states, for recordings without repeats: of the positions under [noise], of other
+    channels under [model.fixed]; None if a channel lacks it.
+    """
     if spec.stated is None or spec.stated.standard_deviation == 0.0:
         return None
     parts = [stated_noise(spec, model.recordings, first)]
     for channel in model.channels[1:]:
         if isinstance(channel, Series):
-            known = [model.fixed.get(each.name) for each in channel.noise_specs]
+            known = [model.scopes.fixed.get(each.name) for each in channel.noise_specs]
             if any(value is None for value in known):
                 return None
-            parts.append(channel.stated(model.fixed, float(first.dataset.attrs["sample_time"])))
+            parts.append(channel.stated(model.scopes.fixed, float(first.dataset.attrs["sample_time"])))
     return Stacked(tuple(parts))
 
 
@@ -519,9 +520,9 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
         parameter = coordinates.space.parameters[index]
         if parameter.spec.name != parameter.physical:  # how far one group's value is off, of which no file has a prior
             continue
-        table = dict(parameter.table or parameter.spec.prior)
+        table = dict(parameter.table)
         for key in ("loc", "low", "high"):  # a size in one group is measured from null
-            if key in table and parameter.added_to:
+            if key in table and parameter.scope.added_to:
                 table[key] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")

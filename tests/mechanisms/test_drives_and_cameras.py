@@ -257,18 +257,20 @@ def test_markers_beside_their_places_turn_with_the_body():
 
 
 def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
-    """Half a millimetre of play is 25 mrad of a motor with a spool of 20 mm; a limit of 1/m becomes one of 0.02/rad."""
+    """Sizes are shares of usual commands, in their unit; the limit of a stop is in one over it."""
     names = ["backlash", "cable_slack", "end_stop", "travel_stop", "spool_growth", "drive_drift", "rate_limit"]
-    cables, motors = (mechanisms_named(names, Robot.load(robot)) for robot in ("smooth_arm", "asl_trunk"))
+    robots = [Robot.load(robot) for robot in ("smooth_arm", "asl_trunk")]
+    cables, motors = (mechanisms_named(names, robot) for robot in robots)
     units = [spec.unit for mechanism in motors for spec in mechanism.parameters]
     assert units == ["rad", "rad", "1/rad", "1/rad", "1/rad", "1/rad", "rad/s", "s/rad"]
+    ratio = robots[1].usual_command / robots[0].usual_command
     play, turned = cables[0].parameters[0], motors[0].parameters[0]
-    assert (play.unit, play.prior["scale"], play.high) == ("m", 0.0005, 0.1)
-    assert (turned.prior["scale"], turned.high) == pytest.approx((0.025, 5.0))
+    assert play.unit == "m"
+    assert (turned.prior["scale"], turned.high) == pytest.approx((ratio * play.prior["scale"], ratio * play.high))
     stop, turned = cables[2].parameters[0], motors[2].parameters[0]
-    np.testing.assert_allclose(turned.grid, 0.02 * np.array(stop.grid))
+    np.testing.assert_allclose(turned.grid, np.array(stop.grid) / ratio)
     assert turned.prior["distribution"] == "HalfNormal"
-    assert stop.prior["scale"] == pytest.approx(50.0 * turned.prior["scale"])
+    assert stop.prior["scale"] == pytest.approx(ratio * turned.prior["scale"])
 
 
 def test_a_drift_of_actuation_is_the_mechanism_with_the_size_of_each_step():

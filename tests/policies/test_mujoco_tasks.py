@@ -64,7 +64,7 @@ def test_commands_stay_in_the_range_of_the_actuators_and_move_by_a_share_of_it(t
 @pytest.mark.parametrize(
     ("text", "changes", "said"),
     [
-        (ARM, {"goals": None}, "nobody knows where its goals are"),
+        (ARM, {"goals": None}, "the task has no goals for this robot"),
         (ARM, {"task": "TrunkPush-v0"}, "has no cube to push"),
         (ARM.replace(' ctrlrange="-1 1"', ""), {}, "nothing limits the command 'a'"),
         (ARM, {"tension_limit": 1.0}, "tells no cable tensions between two actions; name its cables"),

@@ -22,7 +22,7 @@ from rfdropo_bayes.inference.method_options import attributes_of, settings_text
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.model.experiment import AuditTable, ModelTable
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.verbs.predict import fitted_parts
+from rfdropo_bayes.verbs.predict import fitted_scopes
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -144,7 +144,7 @@ def test_every_calibration_among_the_reports_has_a_model_of_its_parameters(folde
     """An audit's answer that lies beside it changes nothing."""
     fit = rb.load(folder)
     assert isinstance(fit, rb.Calibration)
-    assert set(fitted_parts(fit)[1].names) == {info.name for info in fit.record.free}
+    assert set(fitted_scopes(fit).names) == {info.name for info in fit.record.free}
 
 
 @pytest.mark.slow
@@ -233,9 +233,9 @@ def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
     back = rb.load(fit.folder)
     np.testing.assert_array_equal(back.idata.posterior["gain"], fit.idata.posterior["gain"])
     with pytest.raises(InputError, match=r"has no model: .*'lag'.*rb.load\(folder, model=model\)"):
-        fitted_parts(back)  # no file describes a function
+        fitted_scopes(back)  # no file describes a function
     back = rb.load(fit.folder, model=fit.model)
-    assert set(fitted_parts(back)[1].names) == {"gain", "time_constant"}
+    assert set(fitted_scopes(back).names) == {"gain", "time_constant"}
 
 
 @pytest.mark.slow

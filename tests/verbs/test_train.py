@@ -19,8 +19,7 @@ from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.predictive import HELD
+from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
@@ -274,11 +273,17 @@ def test_policies_whose_folders_are_called_the_same_are_told_apart(tmp_path) -> 
         rb.evaluate(rb.Model.read(REACH), [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)
 
 
+def held_at(name, value):
+    return {"parameter": ParameterInfo(name, "-").as_dict(), "value": value}
+
+
 def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
     """Its draws, or its phi, explain the data with these values, and not with nominal ones."""
     held = {"trunk_mass": 0.31, "observation_noise": 1e-3}
     modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
-    record = PosteriorRecord((modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: held})
+    record = PosteriorRecord(
+        (modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: [held_at(*each) for each in held.items()]}
+    )
     record.save(tmp_path / "posterior.nc")
     normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
     (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"young_modulus": normal}}))
@@ -310,9 +315,11 @@ def test_a_posterior_whose_law_the_simulator_lacks_is_refused(tmp_path) -> None:
     """A law is no mechanism of the library, and its effect would be left out without a word."""
     term = {"coefficient": "creep", "feature": "low_pass", "commands": ["own"], "shape": 0.3, "scale": 0.1}
     law = {"port": "every cable", "terms": [{**term, "shape_parameter": "creep_time"}]}
-    names = ("young_modulus", "creep", "creep_time", "observation_noise", "offset_x@monday", "cube_mass")
+    names = ("young_modulus", "creep", "creep_time", "observation_noise", "cube_mass")
     draws = {name: np.full((1, 3), 0.4) for name in names} | {"young_modulus": np.full((1, 3), 2e6)}
-    record = PosteriorRecord(tuple(ParameterInfo(name, "-") for name in names), draws)
+    offset = ParameterInfo("offset_x", "m", scope=Scope("monday"))
+    infos = (*(ParameterInfo(name, "-") for name in names), offset)
+    record = PosteriorRecord(infos, {**draws, offset.name: np.zeros((1, 3))})
     record.save(tmp_path / "posterior.nc")
     normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
     (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"young_modulus": normal}}))
