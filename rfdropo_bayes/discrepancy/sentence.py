@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, REPEATS, STATED
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.deadline import INTERRUPT
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, TOLD_APART
@@ -341,7 +341,10 @@ def _assumption(answer: Answer) -> str:
         return ""
     if source == STATED:
         return "; the noise is what the experiment file states"
-    words = "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"
+    taken = "an autoregression fitted to the residuals themselves"
+    if source == INNOVATIONS:
+        taken = "that part of the residuals which the rows before do not predict"
+    words = f"; without repeats the noise is an assumption, {taken}"
     if apart := answer.target.measurements.apart:
         which = ", ".join(apart[:MOST_EXCLUDED]) + (" ..." if len(apart) > MOST_EXCLUDED else "")
         words += (

@@ -49,7 +49,14 @@ from rfdropo_bayes.prediction.predictive import (
     thin,
     with_repeats_marked,
 )
-from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report import (
+    BaselineErrors,
+    RecordingFacts,
+    RunFacts,
+    baseline_errors,
+    build_summary,
+    software_versions,
+)
 from rfdropo_bayes.report.baselines import with_fitted_commands
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
@@ -326,8 +333,9 @@ def gather_facts(
     tested: Sequence[Trajectory],
     record: PosteriorRecord,
     unmatched: Sequence[Caution] = (),
+    baselines: Mapping[str, BaselineErrors] | None = None,
 ) -> RunFacts:
-    """What the report says beside the posterior."""
+    """What the report says beside the posterior; ``baselines`` are those of `baseline_errors` by default."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
     simulator = problem.model.simulator
@@ -365,7 +373,7 @@ def gather_facts(
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
-        baselines=baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
+        baselines=baselines or baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
         fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,
