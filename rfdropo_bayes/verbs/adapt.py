@@ -62,7 +62,7 @@ from rfdropo_bayes.verbs.predict import fitted_scopes, model_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
 DRAWS = 100
-MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
+MUCH_WORSE = 2.0**0.5  # above this, more than half of the squared error exceeds the residuals of the fitted sessions
 
 
 def adapt(
