@@ -13,12 +13,9 @@ import jax
 import numpy as np
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
@@ -225,15 +222,13 @@ class Adapted(NamedTuple):
 def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
     """Fit the day to as much of the recording as is looked at, and predict the rest."""
     fit, _, scopes, own, head, _, _, day, left = asked
-    simulator, rows = asked.model.simulator, len(head.time)
-    recordings = gather_recordings(simulator, [head])
-    noise = noise_of_markers(left.lasting(sample_time(head.time), rows), left.markers, recordings)
+    simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
     posterior = fit.record.posterior
     body = thin({name: posterior[name] for name in scopes.names if name in posterior}, draws)
     body |= _drawn_spreads(scopes, body, spread_key)
-    channel = Markers.gather(recordings, STATED, noise)
-    program = TrajectoryModel(simulator, scopes, recordings, (channel,))
+    noise = left.lasting(sample_time(head.time), len(head.time))
+    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
     evaluations: list[float] = []
     problem = CalibrationProblem(program, chunk=simulator.lanes).telling(evaluations.append)
     with Progress("adapt", show=show) as progress:
@@ -247,7 +242,8 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
             share=left.share,
         )
     noise = replace(noise, scale=found.excess * noise.scale)
-    problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
+    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
+    problem = CalibrationProblem(program, chunk=simulator.lanes)
     say_step(f"the day is fitted: predicting {_named([head, *asked.tested])}", show=show)
     predictions = predict_fitted(problem, found.values, fitted_key)
     cautions = _cautions(found)
@@ -282,14 +278,11 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
     if not names:
         return []
     rest = [run if run.position_mask[0].any() else _with_first_row(run, asked.head) for run in asked.tested]
-    recordings = gather_recordings(asked.model.simulator, rest)
-    noise = noise_of_markers(asked.left.every(sample_time(rest[0].time)), asked.left.markers, recordings)
-    noise = noise.at(recordings.steps)
-    channel = Markers.gather(recordings, STATED, noise)
+    simulator, noise = asked.model.simulator, asked.left.every(sample_time(rest[0].time))
     slow = recorded_day_error(record)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     return predict_new(
-        TrajectoryModel(asked.model.simulator, fitted_scopes(asked.fit), recordings, (channel,)),
+        TrajectoryModel.of_positions(simulator, fitted_scopes(asked.fit), rest, STATED, noise, asked.left.markers),
         rest,
         values,
         key,
