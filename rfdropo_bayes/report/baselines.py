@@ -198,7 +198,7 @@ def scored(
     fit: Sequence[Trajectory],
     test: Sequence[Trajectory],
 ) -> BaselineErrors:
-    """How a predictor fares on recordings of both roles; where it cannot predict, the reason."""
+    """Errors of a predictor on the fitted and the test recordings, or the reason if it cannot predict."""
     figures: list[ErrorFigures | None] = []
     reason = ""
     for recordings in (fit, test):

@@ -336,7 +336,7 @@ def gather_facts(
     unmatched: Sequence[Caution] = (),
     baselines: Mapping[str, BaselineErrors] | None = None,
 ) -> RunFacts:
-    """What the report says beside the posterior; ``baselines`` are those of `baseline_errors` by default."""
+    """Contents of the report beside the posterior; ``baselines`` are those of `baseline_errors` by default."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
     simulator = problem.model.simulator
