@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
-from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
+from rfdropo_bayes.bayes.channels import Channel, Series
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
 from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -23,42 +22,95 @@ from rfdropo_bayes.simulators.protocol import Observation, Result
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
 
 
+@dataclass(frozen=True, eq=False)
 class CalibrationProblem:
     """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a few sizes.
 
     Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is cut
     into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
     compilations serve every batch size. The number of simulated steps is a run-time argument, so that they also serve
-    every horizon.
+    every horizon. Problems of one model share its compiled programs.
 
-    Args:
+    Attributes:
         model: priors, simulator and data.
         chunk: most parameter sets in one compiled call.
         earlier: draws of the posterior of another model of the same robot, from which optimisations may start; missing
             parameters start from their priors.
+        other: measured data in place of the model's data; None for the model's.
+        counted: factors of the log likelihood of some channels; the other factors are 1.
+        jacobian: method of Jacobians, see `ResidualProblem`.
+        told: called with the number of rollouts, in full-length equivalents, after each chunk.
     """
 
-    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: DrawsByOwner | None = None) -> None:
-        self.model = model
-        self.earlier: DrawsByOwner = earlier or {}
-        self.measured = model.measured
-        self.shares = dict.fromkeys(self.measured, 1.0)  # what each channel counts
-        self.jacobian = "auto"
-        self._told: Callable[[float], None] | None = None
-        self.chunk = chunk
-        self.names = model.scopes.names
-        self.units = {p.name: p.spec.unit for p in model.scopes.parameters}
-        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.scopes.parameters}
-        self.prior_ends = {p.name: p.ends for p in model.scopes.parameters}
-        self.n_rows = model.recordings.time.shape[1]
-        self.n_recordings = len(model.recordings.names)
-        self.status_names = {int(result): result.name.lower() for result in Result}
-        self.compared = [channel for channel in model.channels if isinstance(channel, FeatureChannel)]
-        physical = {spec.name for spec in model.simulator.parameters}
-        self.scales, self.typical_scales = model.scopes.scales, model.scopes.typical_scales
-        self.physical_names = tuple(
-            p.name for p in model.scopes.parameters if p.physical in physical or p.name in self.scales
-        )
+    model: TrajectoryModel
+    chunk: int = 32
+    earlier: DrawsByOwner = field(default_factory=dict)
+    other: Measured | None = None
+    counted: Mapping[str, float] = field(default_factory=dict)
+    jacobian: str = "auto"
+    told: Callable[[float], None] = lambda rollouts: None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels of the inferred parameters, in sampling order."""
+        return self.model.scopes.names
+
+    @property
+    def measured(self) -> Measured:
+        """The data, by channel."""
+        return self.model.measured if self.other is None else self.other
+
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """Factor of the log likelihood of each channel."""
+        return {**dict.fromkeys(self.measured, 1.0), **self.counted}
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {p.name: p.spec.unit for p in self.model.scopes.parameters}
+
+    @cached_property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Hard bounds of each parameter."""
+        return {p.name: (p.spec.low, p.spec.high) for p in self.model.scopes.parameters}
+
+    @cached_property
+    def prior_ends(self) -> dict[str, tuple[float, float]]:
+        """Ends of each parameter's prior."""
+        return {p.name: p.ends for p in self.model.scopes.parameters}
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the longest recording."""
+        return self.model.recordings.time.shape[1]
+
+    @property
+    def n_recordings(self) -> int:
+        """Number of recordings."""
+        return len(self.model.recordings.names)
+
+    @property
+    def status_names(self) -> dict[int, str]:
+        """Words for the codes of rollouts."""
+        return {int(result): result.name.lower() for result in Result}
+
+    @property
+    def scales(self) -> Mapping[str, tuple[str, ...]]:
+        """See `Hierarchy`."""
+        return self.model.scopes.scales
+
+    @property
+    def typical_scales(self) -> dict[str, float]:
+        """See `Hierarchy`."""
+        return self.model.scopes.typical_scales
+
+    @cached_property
+    def physical_names(self) -> tuple[str, ...]:
+        """Parameters that the simulation depends on, and standard deviations of such."""
+        physical = {spec.name for spec in self.model.simulator.parameters}
+        every = self.model.scopes.parameters
+        return tuple(p.name for p in every if p.physical in physical or p.name in self.scales)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -89,17 +141,22 @@ class CalibrationProblem:
         """The same problem with some parameters fixed; itself if ``values`` is empty."""
         if not values:
             return self
-        model = replace(self.model, scopes=self.model.scopes.holding(values))
-        other = CalibrationProblem(model, chunk=self.chunk, earlier=self.earlier)
-        other.measured, other.shares = self.measured, self.shares
-        other.jacobian, other._told = self.jacobian, self._told
-        return other
+        return replace(self, model=replace(self.model, scopes=self.model.scopes.holding(values)))
 
     def telling(self, spent: Callable[[float], None]) -> CalibrationProblem:
         """The same problem, which reports rollouts in full-length equivalents to ``spent``."""
-        other = self._copied()
-        other._told = spent
-        return other
+        return replace(self, told=spent)
+
+    def with_measured(self, measured: Measured) -> CalibrationProblem:
+        """The same problem with other data.
+
+        Its Jacobians are central differences of compiled rollouts, because a derivative would be compiled anew.
+        """
+        return replace(self, other=measured, jacobian="central")
+
+    def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
+        """The same problem with the log likelihood of some channels times a share."""
+        return replace(self, counted={**self.counted, **shares})
 
     def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
         """Log density of the prior of the standard deviations, in the order of ``scales``."""
@@ -118,46 +175,22 @@ class CalibrationProblem:
         """Values as points of the unconstrained space, columns in the order of ``names``."""
         columns = {name: values[name] for name in self.names}
         scopes = self.model.scopes
-        return padded(self._unconstrained, columns) if is_batch(columns, 1) else scopes.to_unconstrained(columns)
+        compiled = self.model.programs.unconstrained
+        return padded(compiled, columns) if is_batch(columns, 1) else scopes.to_unconstrained(columns)
 
     def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`."""
-        return padded(self._constrained, u) if is_batch(u, 2) else self.model.scopes.from_unconstrained(u)
+        return padded(self.model.programs.constrained, u) if is_batch(u, 2) else self.model.scopes.from_unconstrained(u)
 
     def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log prior density in the unconstrained space."""
         scopes = self.model.scopes
-        return padded(self._log_prior, u) if is_batch(u, 2) else scopes.log_prior_unconstrained(u)
+        return padded(self.model.programs.log_prior, u) if is_batch(u, 2) else scopes.log_prior_unconstrained(u)
 
-    @cached_property
-    def _unconstrained(self) -> Callable:
-        return jax.jit(self.model.scopes.to_unconstrained)
-
-    @cached_property
-    def _constrained(self) -> Callable:
-        return jax.jit(self.model.scopes.from_unconstrained)
-
-    @cached_property
-    def _log_prior(self) -> Callable:
-        return jax.jit(self.model.scopes.log_prior_unconstrained)
-
-    @cached_property
+    @property
     def prior_derivatives(self) -> tuple[Callable, Callable]:
         """Gradient and Hessian of the log prior at one unconstrained point."""
-
-        def single(u: Array) -> Array:
-            return self.log_prior(u[None])[0]
-
-        gradient = jax.jit(jax.vmap(jax.grad(single)))
-
-        def hessian(u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-            # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
-            steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
-            above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
-            found = (above - below) / (2.0 * np.diag(steps)[:, None])
-            return 0.5 * (found + found.T)
-
-        return lambda u: gradient(u[None])[0], hessian
+        return self.model.programs.prior_derivatives
 
     def steps_for(self, horizon: int) -> int:
         """Time steps to simulate so that the first ``horizon`` rows of every recording are there."""
@@ -175,7 +208,7 @@ class CalibrationProblem:
         Returns:
             rows, minus infinity throughout after a failed rollout, and the `Result` code of each set.
         """
-        rows, status = self._chunked(self._rows, values, horizon, self.measured, self.shares)
+        rows, status = self._chunked(self.model.programs.rows, values, horizon, self.measured, self.shares)
         rows = rows[:, :horizon]
         finite = np.isfinite(rows).all(axis=1)
         status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
@@ -194,7 +227,7 @@ class CalibrationProblem:
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
         """Simulated features [m] of all recordings side by side, without observation noise; see `FeatureChannel`."""
-        features, status = self._chunked(self._features, values, horizon)
+        features, status = self._chunked(self.model.programs.features, values, horizon)
         return self._side_by_side(features)[:, :horizon], status
 
     def noisy_rollouts(
@@ -204,7 +237,7 @@ class CalibrationProblem:
         clean, status = self.rollouts(values, self.n_rows)
         noise = [
             self._realised(channel.draw_features, jax.random.fold_in(key, index) if index else key, values)
-            for index, channel in enumerate(self.compared)
+            for index, channel in enumerate(self.model.compared)
         ]
         return clean + self._side_by_side(np.concatenate(noise, axis=-1)), status
 
@@ -212,7 +245,7 @@ class CalibrationProblem:
         """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
         values."""
         known = {**self.model.scopes.fixed, **values}
-        return np.tile(np.concatenate([c.feature_deviation(known) for c in self.compared]), self.n_recordings)
+        return np.tile(np.concatenate([c.feature_deviation(known) for c in self.model.compared]), self.n_recordings)
 
     @cached_property
     def actions(self) -> Float[np.ndarray, "n_rows channel"]:
@@ -226,13 +259,13 @@ class CalibrationProblem:
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
         """Measured features [m], laid out like `rollouts`."""
-        features = [np.asarray(channel.features(self.measured[channel.name])) for channel in self.compared]
+        features = [np.asarray(channel.features(self.measured[channel.name])) for channel in self.model.compared]
         return self._side_by_side(np.concatenate(features, axis=-1)[None])[0]
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
         """True for usable entries of ``observed``."""
-        return self._side_by_side(np.concatenate([c.feature_valid for c in self.compared], axis=-1)[None])[0]
+        return self._side_by_side(np.concatenate([c.feature_valid for c in self.model.compared], axis=-1)[None])[0]
 
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
@@ -244,41 +277,18 @@ class CalibrationProblem:
 
     def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
         """`residuals` of many sets of values at once, in compiled chunks."""
-        white = self._chunked(self._white, values, horizon, self.measured, self.shares)
+        white = self._chunked(self.model.programs.white, values, horizon, self.measured, self.shares)
         return np.asarray(self._flat(white, horizon))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
         """Whitened residuals of the markers at one set of values, NaN if masked."""
         single = {name: np.array([values[name]]) for name in self.names}
-        white = self._chunked(self._white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0))
+        white = self._chunked(
+            self.model.programs.white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0)
+        )
         positions = white[self.model.markers.name][0]
         valid = self.model.recordings.line.valid[..., None]
         return np.where(valid, positions.reshape(*valid.shape[:3], 3), np.nan)
-
-    def with_measured(self, measured: Measured) -> CalibrationProblem:
-        """The same problem with other data, which shares all that has been compiled.
-
-        Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
-        """
-        other = self._copied()
-        other.__dict__.pop("observed", None)
-        other.measured, other.jacobian = measured, "central"
-        return other
-
-    def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
-        """The same problem with the log likelihood of some channels times a share."""
-        other = self._copied()
-        other.shares = {**self.shares, **shares}
-        return other
-
-    def _copied(self) -> CalibrationProblem:
-        """The same problem, which shares all that has been compiled."""
-        # Made before the copy, so that all copies have the same compiled functions.
-        _ = self._rows, self._white, self._positions, self._features, self._observations, self.actions
-        _ = self._unconstrained, self._constrained, self._log_prior, self.prior_derivatives
-        other = copy.copy(self)
-        other.__dict__.pop("fingerprint", None)
-        return other
 
     @property
     def row_steps(self) -> Float[np.ndarray, " recording"]:
@@ -313,13 +323,13 @@ class CalibrationProblem:
     def predict_scene(self, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Int[np.ndarray, " n"]]:
         """As `predict`, with the poses of the object (n, recording, time, 7) in the robot's frame: position [m] and
         unit quaternion (x, y, z, w); None if the scene has none."""
-        return self._chunked(self._positions, values, self.n_rows)
+        return self._chunked(self.model.programs.positions, values, self.n_rows)
 
     def observe(self, values: Batch) -> Observation:
         """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),
         status (n,).
         """
-        return Observation(*self._chunked(self._observations, values, self.n_rows))
+        return Observation(*self._chunked(self.model.programs.observations, values, self.n_rows))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
@@ -337,49 +347,15 @@ class CalibrationProblem:
         count = len(next(iter(inferred.values())))
         return np.asarray(jax.vmap(of_all)(jax.random.split(key, count), inferred))
 
-    @cached_property
-    def _rows(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None, None, None)))
-
-    @cached_property
-    def _white(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.residuals, in_axes=(0, None, None, None)))
-
-    @cached_property
-    def _positions(self) -> Callable:
-        def positions(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array | None, Array]:
-            observation = self.model.simulate(values, steps)
-            return observation.position, observation.object_pose, jnp.max(observation.status)
-
-        return jax.jit(jax.vmap(positions, in_axes=(0, None)))
-
-    @cached_property
-    def _features(self) -> Callable:
-        def features(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array]:
-            seen = self.model.seen(self.model.simulate(values, steps), values)
-            found = [c.features(c.expected(seen)) for c in self.compared]
-            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
-
-        return jax.jit(jax.vmap(features, in_axes=(0, None)))
-
-    @cached_property
-    def _observations(self) -> Callable:
-        def observations(values: Mapping[str, Array], steps: Int[Array, ""]) -> Observation:
-            observation = self.model.simulate(values, steps)
-            return observation._replace(status=jnp.max(observation.status))
-
-        return jax.jit(jax.vmap(observations, in_axes=(0, None)))
-
     def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> Any:
         """Evaluate a batch chunk by chunk, see `in_chunks`."""
         steps = jnp.asarray(self.steps_for(horizon))
         columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
 
-        def told(count: int) -> None:
-            if self._told is not None:
-                self._told(count * horizon / self.n_rows)
+        def after(count: int) -> None:
+            self.told(count * horizon / self.n_rows)
 
-        return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=told)
+        return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=after)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
         """Residuals by rollout, cut to the horizon if they have a time axis, and flattened.

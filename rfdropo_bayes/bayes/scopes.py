@@ -49,7 +49,7 @@ class Scopes:
         """The parameters of a posterior; to which recordings a group belongs is said by `extended`.
 
         Args:
-            infos: of the inferred parameters.
+            infos: facts about the inferred parameters.
             specs: every parameter of the model.
             fixed: values that the model knows.
             held: parameters whose values the fit took for known.

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.bayes.channels import Channel, Markers, ObjectPose, Seen
+from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Markers, ObjectPose, Seen
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.channels.object_pose import Placing, offset_of
-from rfdropo_bayes.bayes.recordings import RecordingSet
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.scopes import Scopes
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.protocol import Observation, Simulator
 
@@ -40,6 +44,32 @@ class TrajectoryModel:
     scopes: Scopes
     recordings: RecordingSet
     channels: tuple[Channel, ...]
+
+    @classmethod
+    def of_positions(
+        cls,
+        simulator: Simulator,
+        scopes: Scopes,
+        trajectories: Sequence[Trajectory],
+        noise: str,
+        known: Autoregression | None = None,
+        markers: Sequence[str] = (),
+    ) -> TrajectoryModel:
+        """The model of marker positions alone.
+
+        Args:
+            simulator: see above; scopes: of its parameters.
+            trajectories: the recordings.
+            noise: name of the noise of the positions.
+            known: the noise of ``markers``, unless it is inferred.
+
+        Raises:
+            InputError: a marker whose noise is not known, or see `gather_recordings`.
+        """
+        recordings = gather_recordings(simulator, trajectories)
+        if known is not None:
+            known = noise_of_markers(known, markers, recordings).at(recordings.steps)
+        return cls(simulator, scopes, recordings, (Markers.gather(recordings, noise, known),))
 
     @property
     def markers(self) -> Markers:
@@ -70,8 +100,18 @@ class TrajectoryModel:
     def _physical(self) -> frozenset[str]:
         return frozenset(spec.name for spec in self.simulator.parameters)
 
+    @cached_property
+    def compared(self) -> tuple[FeatureChannel, ...]:
+        """Channels that have features."""
+        return tuple(channel for channel in self.channels if isinstance(channel, FeatureChannel))
+
+    @cached_property
+    def programs(self) -> Programs:
+        """Compiled functions of the model."""
+        return Programs(self)
+
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
-        """The parameters that the simulator is given for one recording.
+        """Parameters of the simulator for one recording.
 
         A body whose poses are measured starts at the first of them.
         """
@@ -87,7 +127,7 @@ class TrajectoryModel:
 
         Args:
             values: inferred parameters, scalars.
-            steps: simulate only this many time steps (rows beyond hold no meaning); None for all, differentiable in
+            steps: simulate only this many time steps (later rows are meaningless); None for all, differentiable in
                 reverse mode.
 
         Returns:
@@ -151,3 +191,41 @@ class TrajectoryModel:
             numpyro.sample(label("position", name), self.markers.distribution(seen, index), obs=measured)
         for channel in self.channels[1:] if observe else ():
             numpyro.factor(channel.name, channel.row_log_density(seen, channel.measured))
+
+
+class Programs:
+    """The functions of a model that are compiled, for batches of parameter sets; each when it is first called."""
+
+    def __init__(self, model: TrajectoryModel) -> None:
+        def positions(values: Values, steps: Int[Array, ""]) -> tuple[Array, Array | None, Array]:
+            observation = model.simulate(values, steps)
+            return observation.position, observation.object_pose, jnp.max(observation.status)
+
+        def features(values: Values, steps: Int[Array, ""]) -> tuple[Array, Array]:
+            seen = model.seen(model.simulate(values, steps), values)
+            found = [c.features(c.expected(seen)) for c in model.compared]
+            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
+
+        def observations(values: Values, steps: Int[Array, ""]) -> Observation:
+            observation = model.simulate(values, steps)
+            return observation._replace(status=jnp.max(observation.status))
+
+        scopes = model.scopes
+        self.unconstrained = jax.jit(scopes.to_unconstrained)
+        self.constrained = jax.jit(scopes.from_unconstrained)
+        self.log_prior = jax.jit(scopes.log_prior_unconstrained)
+        self.rows = jax.jit(jax.vmap(model.row_log_likelihood, in_axes=(0, None, None, None)))
+        self.white = jax.jit(jax.vmap(model.residuals, in_axes=(0, None, None, None)))
+        self.positions, self.features, self.observations = (
+            jax.jit(jax.vmap(function, in_axes=(0, None))) for function in (positions, features, observations)
+        )
+        gradient = jax.jit(jax.vmap(jax.grad(lambda u: scopes.log_prior_unconstrained(u[None])[0])))
+
+        def hessian(u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+            # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
+            steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
+            above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
+            found = (above - below) / (2.0 * np.diag(steps)[:, None])
+            return 0.5 * (found + found.T)
+
+        self.prior_derivatives = (lambda u: gradient(u[None])[0]), hessian

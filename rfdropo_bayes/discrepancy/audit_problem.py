@@ -27,11 +27,11 @@ class AuditProblem:
     Attributes:
         lanes: simulator with the base model's mechanisms, and every candidate at its null value.
         finer: the same on a finer mesh and time step, with the commands on its own clock; None without.
-        coordinates: of all parameters.
+        coordinates: coordinates of all parameters.
         model: base model and candidates, for all recordings, fitted recordings first.
         trajectories: fitted recordings.
         candidates: mechanisms that may be named.
-        stated_noise: from the experiment file, used if nothing was repeated; None without.
+        stated_noise: noise of the experiment file, used if nothing was repeated; None without it.
         start: start values of base parameters from an earlier calibration; None for a search.
         rules, seed: see `Rules`.
         left_out: mechanisms that do not run on this body or engine, with the reason.

@@ -212,8 +212,8 @@ class PortedForward(Forward):
 
     Args:
         forward: without them.
-        ports: of the simulator.
-        table: that has the features of the laws.
+        ports: ports of the simulator.
+        table: table of the laws' features.
         terms: their coefficients, which become the last coordinates.
     """
 

@@ -122,7 +122,7 @@ def stepped_balance(
     Args:
         state: initial state, with the commanded displacements before the first step.
         displacement: commanded displacement at the end of every step [m].
-        integrator: how a step is taken.
+        integrator: scheme of a step.
         scene, cube: bodies in contact.
 
     Raises:

@@ -241,7 +241,7 @@ def check_spec(spec: ModelSpec, simulator: AnySimulator) -> None:
 
 
 def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
-    """The recordings of one role, ``"fit"`` or ``"test"``."""
+    """The recordings of one role, ``"fit"`` or ``"test"``; InputError without [data]."""
     if data is None:
         raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
     return load_recordings(data, folder, role=role)
@@ -304,15 +304,32 @@ def scoping(
     return found
 
 
-def build_model(spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
+def build_model(
+    spec: ModelSpec,
+    simulator: AnySimulator,
+    trajectories: Sequence[Trajectory],
+    *,
+    specs: Sequence[ParameterSpec] | None = None,
+    fitted: int | None = None,
+    later: Sequence[Mechanism] = (),
+) -> TrajectoryModel:
     """The probabilistic program of a model for the given recordings.
+
+    Args:
+        spec: what is meant; simulator: with all mechanisms.
+        trajectories: the recordings.
+        specs: parameters that may be inferred; all by default.
+        fitted: number of recordings, the first ones, that are fitted; all by default.
+        later: see `model_scopes`.
 
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     recordings = gather_recordings(simulator, trajectories)
-    scopes = model_scopes(spec, simulator, model_specs(spec, simulator), recordings.names)
-    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos)
+    count, chosen = len(trajectories) if fitted is None else fitted, model_specs(spec, simulator)
+    groups = recordings.names[:count], recordings.names[count:]
+    scopes = model_scopes(spec, simulator, chosen if specs is None else specs, *groups, later)
+    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
     return TrajectoryModel(simulator, scopes, recordings, channels)
 
 
@@ -413,4 +430,4 @@ def stated_noise(spec: ModelSpec, recordings: RecordingSet, first: Trajectory) -
 def build_problem(model: TrajectoryModel, earlier: DrawsByOwner | None = None) -> CalibrationProblem:
     """The model as the inference methods see it, in chunks that suit its engine; ``earlier``: see the problem."""
     lanes = model.simulator.lanes
-    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier)
+    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier or {})

@@ -45,8 +45,8 @@ class ExperimentFile(NamedTuple):
     """The file that a model was read from.
 
     Attributes:
-        path: of the file.
-        tables: as they were read, with the overrides in place.
+        path: path of the file.
+        tables: its tables with the overrides applied.
     """
 
     path: Path

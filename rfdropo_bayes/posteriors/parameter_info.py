@@ -49,7 +49,7 @@ class ParameterInfo:
         low, high: hard bounds, infinite without a bound.
         prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.
         description: one line on its physical meaning.
-        scope: whose it is.
+        scope: its owner and the composition of its value.
     """
 
     parameter: str

@@ -89,7 +89,7 @@ class PosteriorRecord:
         trace: numbers of the sampler, one dictionary per stage.
         block_scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows
             before it), ``sd``.
-        log_likelihood: of each data row at each draw, or None.
+        log_likelihood: log likelihood of each data row at each draw, or None.
         attrs: data hash, seed, versions and the like.
     """
 

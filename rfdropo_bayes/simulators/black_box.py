@@ -56,7 +56,8 @@ class BlackBox:
 
     Args:
         function: function that simulates.
-        parameters: by name, each a `Parameter` or its fields. ``low`` and ``high`` must be there; ``unit`` is "-",
+        parameters: parameters by name, each a `Parameter` or its fields. ``low`` and ``high`` must be there; ``unit``
+            is "-",
             ``nominal`` the middle and ``prior`` uniform between the bounds by default.
         markers, channels, cables: names of the markers, of the command channels, and of the cables with a tension.
         time_step: time between rows of the command [s].

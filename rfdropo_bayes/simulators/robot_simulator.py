@@ -360,7 +360,7 @@ class RobotSimulator(ExtendedSimulator):
         """Values with the cube at its measured pose, less the offset of the measuring frame, standing on the plate.
 
         Args:
-            values: of one rollout, or of many (arrays of one shape); missing values are nominal.
+            values: values of one rollout, or of many (arrays of one shape); missing values are nominal.
             pose: measured centre [m] and unit quaternion (x, y, z, w).
         """
         known = {spec.name: spec.nominal for spec in self.parameters} | dict(values)

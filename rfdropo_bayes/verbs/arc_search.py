@@ -51,9 +51,9 @@ class ArcSearch:
     """A search by arcs.
 
     Args:
-        robot: as described.
-        command: as recorded.
-        position: of markers [m], not a number if one was not seen.
+        robot: robot as described.
+        command: commands as recorded.
+        position: positions of markers [m], NaN if not seen.
         markers: their names.
     """
 

@@ -18,8 +18,8 @@ class Arrangement(NamedTuple):
 
     Attributes:
         columns: channel k of the robot takes column ``columns[k]``.
-        signs: of the commands of each column, 1 or -1.
-        turns: by which the cables of each section stand further about +z than described [rad], base to tip.
+        signs: signs of the commands of each column, 1 or -1.
+        turns: turn of the cables of each section about +z against the description [rad], base to tip.
     """
 
     columns: tuple[int, ...]
@@ -116,7 +116,7 @@ class Agreement(NamedTuple):
     Attributes:
         straight: their correlation as they are, -1 to 1.
         turned: the same after the turn about +z that agrees best.
-        turn: that turn [rad], from the simulated motion to the measured one.
+        turn: turn from the simulated to the measured motion [rad].
         mirrored: the same as ``turned``, of the mirror image of the simulated motion.
     """
 

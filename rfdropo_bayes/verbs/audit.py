@@ -10,11 +10,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from pydantic import field_validator
 
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
+from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
@@ -39,11 +40,10 @@ from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import source_of
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
+    build_model,
     build_simulator,
     expand_groups,
-    gather_channels,
     measurement_specs,
-    model_scopes,
     stated_noise,
 )
 from rfdropo_bayes.model.experiment import AuditTable, NoiseTable
@@ -59,7 +59,7 @@ from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import as_options, stated
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
@@ -77,10 +77,20 @@ JOURNAL = "checkpoints/audit"
 FINER = 2
 
 
-@with_keys_of(AuditTable)
+@as_options
+class AuditOptions(AuditTable):
+    """Options of `rb.audit`: keys of an experiment file's [audit]. Candidates may be classes of one's own."""
+
+    @field_validator("candidates", mode="before")
+    @classmethod
+    def _sources(cls, given: Sequence[Any]) -> list[str]:
+        return [source_of(candidate) for candidate in given]
+
+
 def audit(
     model: Model,
     runs: Sequence[Trajectory] | None = None,
+    options: AuditOptions | None = None,
     *,
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
@@ -92,7 +102,6 @@ def audit(
     workshop: Workshop | None = None,
     show: bool | None = None,
     between: Between | None = None,
-    **keys: Any,
 ) -> Audit:
     """Name the effects that a model lacks, and measure the gain of adding them. Missing arguments are taken from the
     model's experiment file.
@@ -100,6 +109,7 @@ def audit(
     Args:
         model: simulator and inferred parameters.
         runs: recordings to fit and test candidates on.
+        options: keys of [audit], which override the model's own file.
         test: unseen recordings that measure the gain.
         seed: seed of all random numbers; 0 without a file. The same seed gives the same answer.
         fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
@@ -113,13 +123,11 @@ def audit(
         between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared. Two
             names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
             Effects that both lack are also named.
-        keys: keys of an experiment file's [audit]: ``candidates`` (names, or your own classes), ``exclude``,
-            ``bootstraps``, ``minutes``.
 
     Raises:
         InputError: bad input, before anything long has started.
     """
-    model = _asked(given_model(model, "audit"), noise, keys)
+    model = _asked(given_model(model, "audit"), noise, stated(options, AuditOptions))
     runs, test = model.runs(runs, test)
     chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)
@@ -191,8 +199,6 @@ def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str
     spec, settings = model.spec, model.settings
     if options:
         chosen = {**settings.audit.model_dump(exclude_unset=True), **options}
-        if "candidates" in chosen:
-            chosen["candidates"] = [source_of(candidate) for candidate in chosen["candidates"]]
         settings = replace(settings, audit=parse_table(AuditTable, chosen, where="audit"))
     if noise is not None:
         spec = replace(spec, stated=parse_table(NoiseTable, noise, where="audit, noise"))
@@ -220,7 +226,7 @@ def build_problem(
         InputError: [audit] leaves no candidate.
     """
     spreads, robot = spec.per_group, spec.robot
-    if groups is not None and groups.compared:  # what the groups do not share is to be found
+    if groups is not None and groups.compared:  # the difference between the groups is to be found
         spec = replace(spec, per_group={})
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
@@ -426,15 +432,15 @@ def _model(
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and how many of its parameters are of the base model, which come
     first. The noise of its channels is known, so that its parameters are not among them."""
-    recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
+    added = simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
-    specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
-    scopes = model_scopes(spec, simulator, specs, *groups, later=added)
-    scopes = scopes.holding(scopes.typical_scales)  # evidences are compared at one spread between groups
+    model = build_model(
+        spec, simulator, trajectories, specs=(*simulator.parameters, *gains), fitted=fitted, later=added
+    )
+    # Evidences are compared at one spread between groups.
+    model = replace(model, scopes=model.scopes.holding(model.scopes.typical_scales))
     of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
-    base = sum(p.spec.name not in of_candidates for p in scopes.parameters)
-    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
-    return TrajectoryModel(simulator, scopes, recordings, channels), base
+    return model, sum(p.spec.name not in of_candidates for p in model.scopes.parameters)
 
 
 def _fields(model: TrajectoryModel) -> list[str]:

@@ -11,10 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, actions
 from rfdropo_bayes.data.sample_times import sample_time
@@ -167,10 +164,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     the centre of its prior at the body's mean.
     """
     model, left = model_of(fit), model_error_of(fit.record)
-    recordings = gather_recordings(model.simulator, runs)
-    noise = noise_of_markers(left.every(sample_time(runs[0].time)), left.markers, recordings)
-    noise = noise.at(recordings.steps)
-    scopes = day_scopes(fit, model, recordings.names, DAY)
+    scopes, noise = day_scopes(fit, model, [run.name for run in runs], DAY), left.every(sample_time(runs[0].time))
     drawn = fit.record.posterior
     body = {name: value for name, value in scopes.typical_scales.items() if name not in drawn}
     body |= {p.name: float(np.mean(drawn[p.name])) for p in scopes.parameters if p.name in drawn}
@@ -184,7 +178,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
     values = {name: np.full(len(points), value) for name, value in body.items()}
     values |= {p.name: physical_of_normal(p, x, values) for p, x in zip(own, points.T, strict=True)}
-    program = TrajectoryModel(model.simulator, scopes, recordings, (Markers.gather(recordings, STATED, noise),))
+    program = TrajectoryModel.of_positions(model.simulator, scopes, runs, STATED, noise, left.markers)
     return CalibrationProblem(program, chunk=max(1, model.simulator.lanes // len(runs))), [p.name for p in own], values
 
 

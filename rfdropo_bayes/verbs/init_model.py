@@ -32,7 +32,7 @@ def write_model_experiment(
 
     Args:
         model: file of the model, which is not moved.
-        folder: to write to; it is made.
+        folder: folder to write to; it is created.
         recordings: files to fit; the last of several is for testing.
         commands: the file of commands of each, if they have any.
         guess: guess of their columns; None without recordings.

@@ -34,14 +34,14 @@ from rfdropo_bayes.policies.randomisation import (
     spread_out,
 )
 from rfdropo_bayes.policies.tasks import Task, task_named
-from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.prediction.day_spread import day_deviations
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import stated
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
@@ -52,24 +52,28 @@ base of a trunk whose tip rests at 184 mm.
 """
 
 
-@with_keys_of(TrainingTable)
 def make_vec(
-    task: str, model: Model, *, fit: Calibration | Path | None = None, n: int = 64, **keys: Any
+    task: str,
+    model: Model,
+    options: TrainingOptions | None = None,
+    *,
+    fit: Calibration | Path | None = None,
+    n: int = 64,
 ) -> TrunkVecEnv:
     """Environments of a task, side by side, for Stable-Baselines3.
 
     Args:
         task: "TrunkReach-v0" or "TrunkPush-v0".
         model: that is simulated; its fixed values hold.
+        options: further keys of [training], such as ``observation`` or ``period``.
         fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws;
             nominal values without.
         n: how many environments.
-        keys: further keys of an experiment file's [training], such as ``observation`` or ``period``.
 
     Raises:
         InputError: an unknown task or key, or a posterior of another robot.
     """
-    model = with_training(model, {"task": task, **keys})
+    model = with_training(model, {**stated(options, TrainingOptions), "task": task})
     table, chosen, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, fit)
     return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, episode_settings(table)))
@@ -124,6 +128,7 @@ def _check_length(task: Task, robot: Robot | BlackBox) -> None:
 
 
 def episode_settings(table: TrainingTable) -> Settings:
+    """Settings of episodes in [training]."""
     return Settings(
         table.actions,
         table.observation,

@@ -85,7 +85,7 @@ def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
 
     Args:
         resting: the robot as it is written, showing the markers of the rows.
-        rows: of recordings.
+        rows: rows of recordings.
     """
     robot = resting.simulator.robot
     finder = _Finder(resting, robot, rows.of(spread_rows(rows, ROWS)))
@@ -198,10 +198,10 @@ def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key:
     """Lines that bring an arrangement about.
 
     Args:
-        arrangement: that was found.
-        robot: as it is written.
+        arrangement: found arrangement.
+        robot: robot as written.
         own: names of the columns.
-        key: how the order of columns is written, with the list in the place of {}.
+        key: template of the order of columns, with {} for the list.
     """
     lines = []
     if arrangement.columns != tuple(range(len(own))):

@@ -12,11 +12,8 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import (
@@ -36,6 +33,7 @@ from rfdropo_bayes.groups import Patterns, group_of, in_group
 from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
@@ -98,12 +96,8 @@ def predict(
     groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
     simulator = with_groups(model.simulator, groups)
     scopes = fitted_scopes(fit)
-    recordings = gather_recordings(simulator, [unseen])
-    stated, step = spec.stated, sample_time(unseen.time)
-    lasts = stated.correlation_time if stated is not None and spec.noise == STATED else None
-    memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
-    channels = (_markers(recordings, spec.noise, record.attrs.get(KNOWN_NOISE), memory),)
-    program = TrajectoryModel(simulator, scopes, recordings, channels)
+    noise = _known_noise(spec, record.attrs.get(KNOWN_NOISE), sample_time(unseen.time))
+    program = TrajectoryModel.of_positions(simulator, scopes, [unseen], spec.noise, *noise)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     fitted = record.attrs.get(FITTED, sorted({info.scope.owner for info in record.free if info.scope.owner}))
     slow = _slow_error(record, unseen, groups, scopes)
@@ -270,17 +264,18 @@ def _check_noise(record: PosteriorRecord, noise: str) -> None:
         )
 
 
-def _markers(
-    recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None, memory: Float[np.ndarray, " lag"] | None
-) -> Markers:
-    """The positions to predict, under the inferred noise, or the noise stored in the posterior; with the
-    autocorrelation of residuals, if given.
+def _known_noise(spec: ModelSpec, known: Mapping[str, Any] | None, step: float) -> tuple[Autoregression | None, Any]:
+    """The noise stored in the posterior, and its markers; None for an inferred noise.
+
+    Args:
+        spec: the model; known: the noise as the posterior stores it.
+        step: seconds between the rows to predict. A correlation time in [noise] replaces the stored autocorrelation.
 
     Raises:
         InputError: a noise that is neither inferred nor stored in the posterior.
     """
-    if noise not in KNOWN:
-        return Markers.gather(recordings, noise)
+    if spec.noise not in KNOWN:
+        return None, ()
     if known is None:
         raise InputError(
             "the posterior does not hold the noise of the positions",
@@ -288,10 +283,10 @@ def _markers(
             remedy="predict with the experiment that was calibrated",
         )
     recalled = Autoregression.from_dict(known)
-    if memory is not None:
-        recalled = replace(recalled, autocorrelation=memory, step=None)
-    own = noise_of_markers(recalled, known["markers"], recordings).at(recordings.steps)
-    return Markers.gather(recordings, noise, own)
+    lasts = spec.stated.correlation_time if spec.stated is not None and spec.noise == STATED else None
+    if lasts is not None:
+        recalled = replace(recalled, autocorrelation=np.array([1.0, np.exp(-step / lasts)]), step=None)
+    return recalled, known["markers"]
 
 
 def summarise(predicted: RecordingPrediction) -> xr.Dataset:

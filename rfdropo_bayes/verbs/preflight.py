@@ -76,7 +76,7 @@ class Preflight:
 
     Attributes:
         directions: undetermined combinations, the worst first.
-        parameters: for each parameter the share of its prior standard deviation that remains: ``alone`` with all other
+        parameters: share of the prior standard deviation that remains for each parameter: ``alone`` with all other
             parameters known, and ``kept``.
         channels: constant command channels of each recording.
         noise: assumed noise of the positions, in words.

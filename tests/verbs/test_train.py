@@ -38,6 +38,7 @@ QUICK = [
 
 
 SINGLE = {"precision": "float32"}
+GOALS = [[0.0, 0.0, 0.25], [0.02, 0.02, 0.27]]
 
 
 def rfdropo(*words: object) -> str:
@@ -52,7 +53,7 @@ def test_an_arm_of_another_length_needs_goals_of_its_own() -> None:
     long = Robot.outline(name="long", length=0.3, radius=0.01, markers={"tip": 0.3})
     with pytest.raises(rb.InputError, match="a trunk of 195 mm, and long has 300 mm"):
         rb.make_vec("TrunkReach-v0", rb.Model(long), n=1)
-    venv = rb.make_vec("TrunkReach-v0", rb.Model(long), n=1, goals=[[0.0, 0.0, 0.25], [0.02, 0.02, 0.27]])
+    venv = rb.make_vec("TrunkReach-v0", rb.Model(long), n=1, options=rb.TrainingOptions(goals=GOALS))
     venv.reset()
     assert 0.25 <= venv.episodes.goal[0, 2] <= 0.27
 
@@ -224,7 +225,8 @@ def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, word
 
 def test_the_model_in_memory_makes_environments() -> None:
     model = rb.Model("trunk_sofa", simulator=SINGLE, fixed={"young_modulus": 4e6})
-    venv = rb.make_vec("TrunkReach-v0", model, n=3, observation="markers", start={"trunk_mass": [0.3, 0.4]})
+    options = rb.TrainingOptions(observation="markers", start={"trunk_mass": [0.3, 0.4]})
+    venv = rb.make_vec("TrunkReach-v0", model, options, n=3)
     venv.seed(0)
     assert venv.reset().shape == (3, 3 * 4 + 3 + 8 + 3 * 4)
     drawn = [info["parameters"] for info in venv.reset_infos]
@@ -238,11 +240,11 @@ def test_the_model_in_memory_makes_environments() -> None:
 def test_a_posterior_beside_another_randomisation_is_refused(tmp_path) -> None:
     """It would take the place of the ranges without a word."""
     model = rb.Model("trunk_sofa", simulator=SINGLE)
-    ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
+    ranges = rb.TrainingOptions(randomisation="uniform", ranges={"young_modulus": [4e6, 5e6]})
     with pytest.raises(InputError, match="a calibration was given, and randomisation = 'uniform'"):
-        rb.make_vec("TrunkReach-v0", model, fit=tmp_path, **ranges)
+        rb.make_vec("TrunkReach-v0", model, ranges, fit=tmp_path)
     with pytest.raises(InputError, match=r"posterior\.nc"):  # which is looked for where the two agree
-        rb.make_vec("TrunkReach-v0", model, fit=tmp_path, randomisation="posterior")
+        rb.make_vec("TrunkReach-v0", model, rb.TrainingOptions(randomisation="posterior"), fit=tmp_path)
 
 
 @pytest.mark.slow
@@ -253,11 +255,12 @@ def test_same_seed_same_curve_from_python(tmp_path) -> None:
     ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
     runs = {}
     for name, seed in (("first", 0), ("again", 0), ("other", 1)):
-        curve = rb.train(model, tmp_path / name, seed=seed, **options, **ranges)["curve"]
+        curve = rb.train(model, tmp_path / name, rb.TrainingOptions(**options, **ranges), seed=seed)["curve"]
         runs[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in curve]
     assert runs["first"] == runs["again"] != runs["other"]
     twins = [tmp_path / "first", tmp_path / "again"]
-    found = rb.evaluate(model, twins, tmp_path / "test", episodes=4, film=False, **ranges)["policies"]
+    drawn = rb.TrainingOptions(**ranges)
+    found = rb.evaluate(model, twins, tmp_path / "test", drawn, episodes=4, film=False)["policies"]
     assert found["first"] == found["again"]
     assert (tmp_path / "test" / "episodes.csv").exists()
 

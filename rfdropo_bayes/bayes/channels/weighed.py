@@ -27,7 +27,7 @@ class Weighed(NamedTuple):
 
     Attributes:
         parameters: names; their sum was measured.
-        value: in their unit.
+        value: measured value in their unit.
         sd: its standard deviation.
     """
 

@@ -80,7 +80,7 @@ def MuJoCo(
             number of a keyframe.
         time_step: time step [s]; by default from the file.
         command_unit: unit of the commands; by default from the actuators' targets, "-" if these differ.
-        name: for reports; the model's own by default.
+        name: name in reports; the model's own by default.
         lanes: number of parameter sets simulated at once.
         threads: number of threads; one per processor by default.
         difference: see `BlackBox`.
@@ -141,7 +141,7 @@ def _read(path: Path) -> Any:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise InputError(f"MuJoCo cannot read it: {error}", where=str(path), remedy="mend the file") from None
+        raise InputError(f"MuJoCo cannot read it: {error}", where=str(path), remedy="correct the file") from None
 
 
 def _markers(spec: Any, markers: Mapping[str, str] | Sequence[str] | None) -> dict[str, tuple[str, str]]:
@@ -203,13 +203,13 @@ class MuJoCoRollouts:
         channels: actuators that are commanded.
         start: see `MuJoCo`.
         threads: see `MuJoCo`.
-        path: of the file that it was read from.
+        path: path of its source file.
 
     Attributes:
-        spec: as it was read.
+        spec: unchanged specification of the file.
         model: compiled, with sensors of the markers and cables.
         channels: number of the actuator's command in ``ctrl``, by channel.
-        edits: how each parameter changes the model, by name.
+        edits: effect of each parameter on the model, by name.
         first: state, and ``ctrl``, before anything settles.
 
     Raises:
