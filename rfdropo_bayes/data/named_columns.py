@@ -146,8 +146,8 @@ class CsvColumns(BaseModel):
     )
     base_marker: tuple[str, str, str] | None = Field(
         default=None,
-        description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved between "
-        "rows or recordings: positions are counted from it, and origin is the base's place beside it",
+        description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved: "
+        "positions are counted from it, and origin is the base's place beside it",
     )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
