@@ -64,13 +64,13 @@ MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not
 
 def adapt(
     fit: Calibration,
-    recording: Trajectory,
+    recording: Trajectory | RecordingEntry,
     *,
     seconds: float | None = None,
     group: str | None = None,
     test: Sequence[Trajectory] = (),
     draws: int = DRAWS,
-    seed: int = 0,
+    seed: int | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
     show: bool | None = None,
@@ -83,14 +83,14 @@ def adapt(
 
     Args:
         fit: a calibration, with its model.
-        recording: of the new day.
+        recording: a recording of the new day, or its entry in [data].
         seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
             rest is predicted.
         group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
         test: other recordings of the day, of which nothing but the first row is looked at; the report says how well
             they are predicted.
         draws: of the posterior.
-        seed: of all that is random.
+        seed: seed of all random numbers; by default from the model's experiment.
         out: folder that gets what a calibration writes; None writes nothing.
         overwrite: start anew whatever ``out`` holds.
         show: whether to show progress, see `Progress`.
@@ -98,7 +98,10 @@ def adapt(
     Raises:
         InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
     """
-    model = model_of(given_fit(fit, "adapt"))
+    fit = given_fit(fit, "adapt")
+    if isinstance(recording, RecordingEntry):
+        fit, recording = _recorded(fit, recording)
+    model = model_of(fit)
     recording, test = given_recording(recording, "adapt"), given_recordings(test, "adapt, test")
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.spec.groups) if group is None else group
@@ -111,7 +114,7 @@ def adapt(
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
     asked = Day(fit, moved, scopes, own, head, tested, "" if rest is None else rest.name, day, left)
-    run = partial(_adapt, asked, draws, seed, show)
+    run = partial(_adapt, asked, draws, model.settings.seed if seed is None else seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -326,41 +329,22 @@ def _own_of_day(fit: PosteriorRecord, scopes: Scopes, recording: str, day: str) 
     return own
 
 
-def run_adaptation(
-    run: Path,
-    model: Model,
-    entry: RecordingEntry,
-    out: Path,
-    *,
-    seconds: float | None = None,
-    group: str | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
-    show: bool | None = None,
-) -> Calibration:
-    """`adapt` a run's folder to a recording in the format of its experiment; lost markers are left out.
-
-    Args:
-        run: folder of a calibration, or of an earlier adaptation.
-        model: that was fitted, with the [data] of its experiment, see `fitted_model`.
-        entry: names the file of observations, that of the commands where the format has one, and the episode.
-        out, seconds, group, seed, overwrite, show: see `adapt`.
+def _recorded(fit: Calibration, entry: RecordingEntry) -> tuple[Calibration, Trajectory]:
+    """The recording of a file in the format of the fit's experiment, without lost markers, and the fit with it as data.
 
     Raises:
-        InputError: bad input.
+        InputError: an experiment without [data], or several recordings.
     """
+    model = model_of(fit)
     read = model.settings
     if read.data is None:
         where = model.name if model.file is None else str(model.file.path)
-        raise InputError("the experiment has no [data]", where=where, remedy="say in which format recordings are")
-    found = load_recordings(_alone(read.data, entry), model.folder)
+        raise InputError("the experiment has no [data]", where=where, remedy="name the format of the recordings")
+    data = _alone(read.data, entry)
+    found = load_recordings(data, model.folder)
     if len(found) > 1:
         raise one_at_a_time(read.data, entry.observations, len(found), "adapt to")
-    fit = Calibration.of_posterior(run, model)
-    fit = replace(fit, model=Model.of(model.spec, replace(read, data=_alone(read.data, entry))))
-    chosen = read.seed if seed is None else seed
-    options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
-    return adapt(fit, found[0], out=out, **options)
+    return replace(fit, model=Model.of(model.spec, replace(read, data=data))), found[0]
 
 
 def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
