@@ -171,7 +171,7 @@ def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Pa
     if len(found) > 1:
         raise InputError(
             f"matches {len(found)} files ({', '.join(file.name for file in found[:3])}{', ...' if found[3:] else ''}) "
-            "where one is meant",
+            "but one file is expected",
             where=str(name),
             remedy="name the file; if every recording has its own commands, give an entry for each recording",
         )

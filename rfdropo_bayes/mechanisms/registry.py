@@ -24,14 +24,15 @@ from rfdropo_bayes.mechanisms.actuation import (
     CommandDelay,
     CommandGain,
     DriveCreep,
-    DriveDrift,
     EndStop,
+    GuideAzimuth,
     RateLimit,
     SpoolGrowth,
     TravelStop,
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
     AxialStiffness,
+    BaseCompliance,
     BaseTilt,
     BendTwistCoupling,
     CableCompliance,
@@ -42,12 +43,13 @@ from rfdropo_bayes.mechanisms.body_mechanisms import (
     PlaneAnisotropy,
     QuadraticDrag,
     Softening,
+    SoftPart,
     StiffnessGradient,
     ViscoelasticBranch,
     WallContact,
 )
+from rfdropo_bayes.mechanisms.drift import CableGainDrift, CameraDrift, CameraTurn, CameraZoom, DriveDrift, GainDrift
 from rfdropo_bayes.mechanisms.sensing import (
-    CameraDrift,
     CameraOffset,
     CameraRotation,
     CameraScale,
@@ -69,6 +71,7 @@ REGISTRY: dict[str, type] = {
         CommandGain,
         CableGain,
         CableSlack,
+        GuideAzimuth,
         Backlash,
         EndStop,
         TravelStop,
@@ -76,9 +79,13 @@ REGISTRY: dict[str, type] = {
         SpoolGrowth,
         DriveCreep,
         DriveDrift,
+        GainDrift,
+        CableGainDrift,
         Payload,
         AxialStiffness,
         StiffnessGradient,
+        SoftPart,
+        BaseCompliance,
         BaseTilt,
         CoulombFriction,
         CapstanFriction,
@@ -94,6 +101,8 @@ REGISTRY: dict[str, type] = {
         CameraScale,
         CameraOffset,
         CameraDrift,
+        CameraTurn,
+        CameraZoom,
         MarkerOffset,
         SensorLag,
         ClockOffset,
@@ -129,7 +138,7 @@ class MechanismChoice:
     kind: Any
 
     def made_for(self, robot: Robot | BlackBox | None) -> Mechanism:
-        """The mechanism; one with parameters per cable (a class method ``for_robot``) is made for the robot, and
+        """The mechanism; a class with parameters per cable (a class method ``for_robot``) is made for the robot, and
         mechanisms of the library have its sizes."""
         if not isinstance(self.kind, type):
             return self.kind

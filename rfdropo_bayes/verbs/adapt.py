@@ -48,18 +48,21 @@ from rfdropo_bayes.prediction.predictive import (
     with_repeats_marked,
     without_cautions,
 )
-from rfdropo_bayes.report import build_summary
+from rfdropo_bayes.report import BaselineErrors, build_summary
 from rfdropo_bayes.report.coverage import predictive_bands
+from rfdropo_bayes.report.day_baselines import day_baselines
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
+from rfdropo_bayes.report.scores import MeasuredPath
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
+from rfdropo_bayes.verbs.left_out_days import OPENINGS
 from rfdropo_bayes.verbs.predict import fitted_scopes, model_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
 DRAWS = 100
-MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
+MUCH_WORSE = 2.0**0.5  # above this, more than half of the squared error exceeds the residuals of the fitted sessions
 
 
 def adapt(
@@ -186,8 +189,16 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
         [asked.head],
         asked.tested,
         record,
+        baselines=_without_a_model(asked),
     )
     return Calibration(record, build_summary(record, facts), text, asked.model, out)
+
+
+def _without_a_model(asked: Day) -> dict[str, BaselineErrors]:
+    """What the day's first row and copies of the fitted recordings say of it."""
+    record = asked.fit.record
+    earlier = [MeasuredPath.of_prediction(each) for each in record.recordings if each.split == "fit"]
+    return day_baselines(asked.head, asked.tested, earlier, record.attrs.get(OPENINGS, {}))
 
 
 class Adapted(NamedTuple):

@@ -29,13 +29,15 @@ DRIVES = (
     "cable_gain",
     "cable_slack",
     "drive_creep",
+    "cable_gain_drift",
     "drive_drift",
+    "gain_drift",
     "end_stop",
     "travel_stop",
     "rate_limit",
     "spool_growth",
 )
-CAMERAS = ("camera_drift", "camera_offset", "clock_offset", "marker_offset", "sensor_lag")
+CAMERAS = ("camera_drift", "camera_turn", "camera_zoom", "camera_offset", "clock_offset", "marker_offset", "sensor_lag")
 
 
 def applied(name: str, values: dict):
@@ -79,7 +81,8 @@ def test_the_derivative_at_null_is_the_one_sided_difference(name):
         ahead = applied(name, {spec.name: jnp.asarray(spec.nominal + step)})
         difference = (ahead - applied(name, {spec.name: jnp.asarray(spec.nominal)})) / step
         np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=2e-5)
-        channels_beyond = spec.name.startswith("cable_gain_error") and int(spec.name[-1]) > COMMAND.shape[1]
+        channel = spec.name.removesuffix("_rate").removeprefix("cable_gain_error_")
+        channels_beyond = channel.isdigit() and int(channel) > COMMAND.shape[1]
         if not spec.grid and not channels_beyond:
             assert np.abs(slope).max() > 0
 
@@ -268,3 +271,15 @@ def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
     np.testing.assert_allclose(turned.grid, np.array(stop.grid) / ratio)
     assert turned.prior["distribution"] == "HalfNormal"
     assert stop.prior["scale"] == pytest.approx(ratio * turned.prior["scale"])
+
+
+def test_a_drift_of_actuation_is_the_mechanism_with_the_size_of_each_step():
+    drifted = applied("gain_drift", {"command_gain_error_rate": jnp.asarray(0.2)})
+    elapsed = STEP * np.arange(1, len(COMMAND) + 1)[:, None]
+    np.testing.assert_allclose(drifted, (1.0 + 0.2 * elapsed) * COMMAND, rtol=1e-12)
+
+
+def test_a_drift_of_a_camera_is_the_mechanism_with_the_size_of_each_row():
+    drifted = applied("camera_zoom", {"camera_scale_error_rate": jnp.asarray(0.01)})
+    elapsed = (TIME - TIME[0])[:, None, None]
+    np.testing.assert_allclose(drifted, (1.0 + 0.01 * elapsed) * POSITION, rtol=1e-12)

@@ -141,7 +141,7 @@ def _read(path: Path) -> Any:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise InputError(f"MuJoCo cannot read it: {error}", where=str(path), remedy="mend the file") from None
+        raise InputError(f"MuJoCo cannot read it: {error}", where=str(path), remedy="correct the file") from None
 
 
 def _markers(spec: Any, markers: Mapping[str, str] | Sequence[str] | None) -> dict[str, tuple[str, str]]:
