@@ -53,7 +53,7 @@ class Factors(NamedTuple):
     """What makes a solve a time step or a static iteration; (1, lanes) each."""
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
-    held: Float[np.ndarray, "1 lanes"]  # of the stiffness of taut cables
+    held: Float[np.ndarray, "1 lanes"]  # of what taut cables hold there
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there

@@ -48,7 +48,7 @@ class RodTables(NamedTuple):
     beside_start: Int[np.ndarray, " pieces"]  # guide that the way begins at; of the first way of a cable its end
     beside_share: Float[np.ndarray, " pieces"]  # see `cables.CableLayout`
     beside_along: Float[np.ndarray, " pieces"]
-    row: Int[np.ndarray, " cables"]  # of a cable's border: cables with the longest reach first
+    row: Int[np.ndarray, " cables"]  # of the border that a cable has: those that reach farthest first
     active: Int[np.ndarray, " stations"]  # panels of the border that are not zero at a station
     section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
     section_area: Float[np.ndarray, " stations"]  # that times the body's width [m2]
