@@ -223,7 +223,7 @@ class Adapted(NamedTuple):
 
 
 def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
-    """Fit the day to as much of the recording as is looked at, and predict the rest."""
+    """Fit the session to the used part of the recording, and predict the rest."""
     fit, _, scopes, own, head, _, _, day, left = asked
     simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
@@ -508,7 +508,7 @@ def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], B
 def _checks(
     before: Sequence[RecordingPrediction], after: Sequence[RecordingPrediction]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """How well recordings that were not looked at are predicted before and after, by recording."""
+    """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
         p.name: {
@@ -533,7 +533,7 @@ def _fared(prediction: RecordingPrediction) -> dict[str, float]:
 
 
 def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    """Before and after an adaptation in the same words, of each recording that it did not look at."""
+    """Sentence on each unused recording: its prediction error before and after the adaptation."""
     found = []
     for name, check in checks.items():
         words = [

@@ -22,7 +22,7 @@ QUARTER = np.pi / 12.0
 
 
 class Direction(NamedTuple):
-    """How the measured motion across the body lies to the nominal one.
+    """Direction of the measured motion across the body relative to the nominal motion.
 
     Attributes:
         turn: angle [rad] about +z from the simulated motion to the measured one.
