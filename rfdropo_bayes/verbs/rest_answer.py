@@ -62,8 +62,8 @@ def rest_notes(fit: RestFit) -> list[str]:
     best = min((name for name in fit.unseen if name != OWN), key=lambda name: fit.unseen[name])
     if fit.unseen[OWN] > fit.unseen[best]:
         notes.append(
-            f"a fitted robot at rest is off by {_millimetres(fit.unseen[OWN])} mm, the {best}, which knows no physics, by "
-            f"{_millimetres(fit.unseen[best])} mm: a unit, an order, a length or a frame is likely wrong; see at_rest.png"
+            f"a fitted robot at rest is off by {_millimetres(fit.unseen[OWN])} mm, the {best} without any physics by "
+            f"{_millimetres(fit.unseen[best])} mm: a unit, an order, a length or a frame is likely wrong"
         )
     return [*notes, *_drifts(fit), *_ways(fit)]
 
