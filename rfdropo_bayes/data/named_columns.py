@@ -35,11 +35,11 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "deg": ("rad", np.pi / 180.0),
     "N": ("N", 1.0),
     "N m": ("N m", 1.0),
-    "-": ("-", 1.0),
+    **dict.fromkeys(("-", "V", "A", "%"), ("-", 1.0)),
 }
 COUNTS = "counts"
 """Encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "-"]
+CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "V", "A", "%", "-"]
 
 
 ROWS = "rows"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
-from rfdropo_bayes.bayes.space import force_power
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
@@ -26,6 +26,7 @@ from rfdropo_bayes.discrepancy.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VER
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
+FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
 REFINE = "raise [simulator] refine and, of a motion, shorten its time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
@@ -91,6 +92,7 @@ def record(
         "seconds": round(answer.cost.seconds, 2),
         "waited_seconds": round(answer.cost.waited, 2),
         "profile": {stage: round(seconds, 2) for stage, seconds in answer.cost.profile.items()},
+        "minutes": answer.problem.rules.minutes,
         "seed": answer.problem.seed,
         "versions": versions,
         "data_sha256": data_sha256,
@@ -270,6 +272,7 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
     for i in indices:
         column = values[:, i]
         found[coordinates.names[i]] = {
+            "title": coordinates.space.parameters[i].spec.name,
             "mean": float(column.mean()),
             "sd": float(column.std()),
             "q05": float(np.quantile(column, 0.05)),
@@ -289,7 +292,8 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
     named, slopes = coordinates.named(fit.x), coordinates.slopes(fit.x[None])[0]
     found = {}
     for i in indices:
-        name, unit = coordinates.names[i], coordinates.space.parameters[i].spec.unit
+        name, own = coordinates.names[i], coordinates.space.parameters[i].spec
+        unit = own.unit
         power = force_power(unit)
         if power == 0 or i not in place or named[name] == 0.0:
             continue
@@ -299,8 +303,9 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
         ratio = named[name] / named[STIFFNESS] ** power
         spread = float(np.sqrt(gradient @ fit.covariance @ gradient))
         low, high = ratio * (1 - 1.645 * spread), ratio * (1 + 1.645 * spread)
-        title = f"{name}_over_{STIFFNESS}" if power > 0 else f"{name}_times_{STIFFNESS}"
-        found[title] = {
+        relation = f"_over_{STIFFNESS}" if power > 0 else f"_times_{STIFFNESS}"
+        found[f"{name}{relation}"] = {
+            "title": f"{own.name}{relation}",
             "parameter": name,
             "power": power,
             "mean": ratio,
@@ -369,8 +374,20 @@ def _candidate(answer: Answer, row: ScreenRow, screen: Screen, refit: float | No
         "degrees_of_freedom": row.rank,
         "p": row.p,
         "adjusted_p": row.adjusted_p,
+        "would_explain": row.lm / max(float(screen.fit.residual @ screen.fit.residual), 1e-300),
         "tried_at": at,
         "log_bayes_factor": refit,
         "named": any(step.name == row.name for step in answer.causes.steps),
         "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
     }
+
+
+def force_power(unit: str) -> int:
+    """Power of the unit of force in a unit such as "kg", "N/m", "Pa s" or "1/Pa"; exponents of its parts do not count.
+
+    1 for masses, forces and stiffnesses, -1 for compliances. Of equations of motion in which every such parameter is
+    multiplied by one factor to that power, no motion changes: where only positions are measured and lengths commanded,
+    data say nothing of that factor (Buckingham's theorem).
+    """
+    above, *below = [sum(part in FORCES for part in re.findall(r"[A-Za-z]+", side)) for side in unit.split("/")]
+    return above - sum(below)

@@ -149,18 +149,23 @@ def under_residual_noise(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
     """Noise and fit in turn."""
     converged = fit.converged
     for _ in range(2):
-        target = replace(target, noise=residual_noise(target, fit))
-        fit = climb(target, fit.x, fit.free)
+        target, fit = fit_with_noise(replace(target.measured, noise=residual_noise(target, fit)), fit.x, fit.free)
     return target, fit if converged else replace(fit, promise=np.inf)
 
 
 def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
-    """Autoregressions fitted to what a model leaves of every recording."""
-    measured = target.measurements
+    """What is taken for noise of what a model leaves of every recording, if nothing else says what the noise is.
+
+    An autoregression, unless the residuals change more slowly than the noise of a measurement: those are a misfit, and
+    an autoregression would explain it away. Noise is then only what the rows before do not predict, so that the model
+    counts as far off, see `inadequacy`.
+    """
+    measured = target.measured.measurements
     left = np.array(measured.spread)
     for group, error in zip(measured.members, target.errors(fit.x), strict=True):
         left[list(group)] += error
-    return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+    noise = measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+    return Stacked(tuple(part.unpredicted if part.doubtful else part for part in noise.parts))
 
 
 def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) -> None:

@@ -20,15 +20,17 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Fields, Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
 from rfdropo_bayes.inference import Target as Climbed
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
@@ -304,7 +306,7 @@ class Posterior(ProblemDefaults):
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""
-        drawn = ParameterSpace(self._parameters).sample(key, n)
+        drawn = Scopes(self._parameters).sample(key, n)
         return {name: np.asarray(column, dtype=float) for name, column in drawn.items()}
 
     def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n free"]:
@@ -488,16 +490,22 @@ def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"
         own = target.forward.coordinates
         posterior = Posterior(target, own.null, np.arange(own.base))
         # Its normal approximation is not used: the coarse differences of short climbs suffice.
-        mode = find_modes(posterior, LaplaceConfig(tolerance=CLIMBED), key).modes[0]
+        mode = find_modes(posterior, _searching(target), key).modes[0]
         return {"x": posterior.place(mode.mean[None])[0]}
 
     return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
 
 
+def _searching(target: FitTarget) -> LaplaceConfig:
+    """How `calibrate` searches; rows of a body at rest do not depend on the rows before them, and have one horizon."""
+    rests = getattr(target.forward.lanes.simulator, "integrator", None) == QUASI_STATIC
+    return LaplaceConfig(tolerance=CLIMBED, **({"blocks": 1} if rests else {}))
+
+
 def optimum_rollouts(target: FitTarget) -> int:
     """Rollouts that `base_optimum` usually takes: draws that are screened, at each horizon, and climbs, of which the
     better half goes on to the next."""
-    config, own = LaplaceConfig(), target.forward.coordinates
+    config, own = _searching(target), target.forward.coordinates
     beginning, step = climb_cost(own.base, 0)
     climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
     return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, simulated
@@ -407,9 +407,11 @@ def _named(begun: Named) -> Iterator[Named]:
         first = named
         yield first
     target = first.search.target
-    if not first.steps or target.noise.source != RESIDUALS:
+    if not first.steps or target.measured.noise.source not in (RESIDUALS, INNOVATIONS):
         return
-    target = replace(target, noise=residual_noise(first.judge, first.fit))
+    target = replace(target.measured, noise=residual_noise(first.judge, first.fit))
+    if target.noise.source == INNOVATIONS:  # as far off as before
+        return
     begun.search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
     *_, again = name_causes(begun.search.under(target), climb(target, first.base.x, first.base.free))
     yield again

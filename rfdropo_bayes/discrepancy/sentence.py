@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, REPEATS, STATED
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.deadline import INTERRUPT
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, TOLD_APART
@@ -243,7 +243,9 @@ def _small(answer: Answer) -> str:
 def _invisible(answer: Answer) -> str:
     """Candidates that could be there all the same, as nothing that was measured shows them."""
     names = [
-        row.name.replace("_", " ") for row in answer.causes.screens[0].rows if row.probe is None and "@" not in row.name
+        row.name.replace("_", " ")
+        for row in answer.causes.screens[0].rows
+        if row.probe is None and not answer.problem.group_of(row.name)
     ]
     if not names:
         return ""
@@ -279,17 +281,15 @@ def _named(finding: dict[str, Any]) -> str:
     ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
     given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
     surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
-    sizes = ", ".join(
-        _size(title.replace(f"@{finding['group']}", ""), row) for title, row in given if (title, row) in surest
-    )
+    sizes = ", ".join(_size(row) for title, row in given if (title, row) in surest)
     others = [spoken(other) for other in finding["equivalence_class"][1:]]
     alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
     return f"{name} ({sizes}){alike}"
 
 
-def _size(name: str, row: dict[str, Any]) -> str:
+def _size(row: dict[str, Any]) -> str:
     unit = "" if row["unit"] == "-" else f" {row['unit']}"
-    return f"{spoken(name)} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
+    return f"{spoken(row['title'])} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
 
 
 def _excluded(answer: Answer) -> str:
@@ -341,7 +341,10 @@ def _assumption(answer: Answer) -> str:
         return ""
     if source == STATED:
         return "; the noise is what the experiment file states"
-    words = "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"
+    taken = "an autoregression fitted to the residuals themselves"
+    if source == INNOVATIONS:
+        taken = "that part of the residuals which the rows before do not predict"
+    words = f"; without repeats the noise is an assumption, {taken}"
     if apart := answer.target.measurements.apart:
         which = ", ".join(apart[:MOST_EXCLUDED]) + (" ..." if len(apart) > MOST_EXCLUDED else "")
         words += (

@@ -169,7 +169,7 @@ def baseline_errors(
         "fir_cubic": ("cubic FIR", _describe(cubic, trained_on), cubic.predict),
     }
     return {
-        name: _scored(name, title, description, predict, fit, test)
+        name: scored(name, title, description, predict, fit, test)
         for name, (title, description, predict) in predictors.items()
     }
 
@@ -190,7 +190,7 @@ def _describe(fir: FirRegression, trained_on: str) -> str:
     )
 
 
-def _scored(
+def scored(
     name: str,
     title: str,
     description: str,
@@ -198,6 +198,7 @@ def _scored(
     fit: Sequence[Trajectory],
     test: Sequence[Trajectory],
 ) -> BaselineErrors:
+    """How a predictor fares on recordings of both roles; where it cannot predict, the reason."""
     figures: list[ErrorFigures | None] = []
     reason = ""
     for recordings in (fit, test):

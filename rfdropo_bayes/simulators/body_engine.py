@@ -135,7 +135,7 @@ class Engine:
         backend: backend of the arithmetic.
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of a rod.
         scene: geometry on which the body pushes a cube; None for a body that touches nothing.
-        integrator: how a time step is taken, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
+        integrator: scheme of a time step, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
             row, an equilibrium found from the row before.
     """
 

@@ -207,7 +207,7 @@ class Session:
         """Set lanes to the rows of a state that `save` returned.
 
         Args:
-            state: of a session of the same robot, engine and mechanisms, with one row for each of ``rows``.
+            state: state of a session of the same robot, engine and mechanisms, with one row for each of ``rows``.
             rows: lanes; all by default.
 
         Raises:

@@ -24,11 +24,11 @@ GAIN = 1e-4
 SWEEPS = 6
 """Most rounds."""
 FINE = np.radians(15.0) * np.array([-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0])
-"""Turns that a section is tried at about where it is."""
+"""Trial turns of a section about its present position."""
 TURNED = 4
-"""Exchanges, the most promising ones, after which sections are turned anew."""
+"""Number of the best exchanges after which sections are turned again."""
 HOPELESS = 3.0
-"""A sign that leaves so many times as much of the motion unexplained as the other is given up."""
+"""Ratio of unexplained motion above which the worse sign is discarded."""
 IN_PLACE = 1e-6
 """Agreement by which a column that makes no difference is given to its own channel."""
 AZIMUTHS = 24
@@ -36,11 +36,11 @@ AZIMUTHS = 24
 
 
 class Placed(NamedTuple):
-    """Where the cables of each column seem to run, whatever the robot's description says.
+    """Apparent courses of the cables of each column, regardless of the robot's description.
 
     Attributes:
         kind: number of the kind of channel.
-        azimuth: [rad].
+        azimuth: azimuth [rad].
     """
 
     kind: tuple[int, ...]
@@ -51,9 +51,9 @@ class ArcSearch:
     """A search by arcs.
 
     Args:
-        robot: as described.
-        command: as recorded.
-        position: of markers [m], not a number if one was not seen.
+        robot: robot as described.
+        command: commands as recorded.
+        position: positions of markers [m], NaN if not seen.
         markers: their names.
     """
 
@@ -104,7 +104,7 @@ class ArcSearch:
         return together / np.where(scale > 0.0, scale, np.inf)
 
     def relaxed(self, sign: int) -> tuple[Placed, np.ndarray]:
-        """Where each column's cables seem to run, and what every other place of each (column, kind, azimuth) scores."""
+        """Apparent courses of each column's cables, and scores of all other places (column, kind, azimuth)."""
         columns, kinds = self.command.shape[1], len(self.kinds)
         kind, azimuth, use = np.zeros(columns, int), np.zeros(columns), np.zeros(columns, dtype=bool)
         moving = np.ptp(self.command, axis=0) > 0.0
@@ -182,7 +182,7 @@ class ArcSearch:
         return self.turned(arrangement)
 
     def _assigned(self, placed: Placed, table: np.ndarray, sign: int) -> Arrangement:
-        """Columns given to channels by what each scores at the place of each channel."""
+        """Columns assigned to channels by their scores at each channel's place."""
         columns, own = len(table), np.arange(len(table))
         turns = np.array([self._turn_of(placed, section) for section in range(self.sections.number)])
 
@@ -214,7 +214,7 @@ def _with_turn(arrangement: Arrangement, section: int, angle: float) -> Arrangem
 def _between(
     table: Float[np.ndarray, "column channel azimuth"], azimuth: Float[np.ndarray, " channel"]
 ) -> Float[np.ndarray, "column channel"]:
-    """Values at azimuths [rad] between those of a table that goes round."""
+    """Values at azimuths [rad] interpolated in a periodic table."""
     at = azimuth / (2.0 * np.pi) * table.shape[2]
     below = np.floor(at)
     share, k = at - below, below.astype(int)

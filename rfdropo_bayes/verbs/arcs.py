@@ -1,9 +1,9 @@
-"""A robot as a chain of circular arcs under cables that only pull: where its markers are, for many guesses at once.
+"""A robot as a chain of circular arcs under cables that only pull: its marker positions, for many guesses at once.
 
 Between the heights at which cables end, the body is an arc that bends and shortens. A cable that is pulled in by
-:math:`d` asks :math:`r\\,\\beta` and the shortening of all arcs below its end to add up to it, or is slack. Among all
-such bodies the one of least energy is taken: a linear complementarity problem in the tensions, solved by projected
-Gauss-Seidel iterations. There is no weight. It serves to search; what is found is for a rod at rest to confirm.
+:math:`d` requires :math:`r\\,\\beta` and the shortening of all arcs below its end to add up to it, or is slack. The
+body of least energy is taken: a linear complementarity problem in the tensions, solved by projected Gauss-Seidel
+iterations. There is no weight. It serves a search; a rod at rest must confirm the result.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from rfdropo_bayes.robots import Robot
 
 ITERATIONS = 30
 LOOKED, STILL = 5, 1e-2
-"""Every so many iterations the largest change of a tension is compared with this share of the largest tension."""
+"""Iterations between convergence checks, and the limit of a change as a share of the largest tension."""
 SOFTENED = 1e-3
-"""Share of its own compliance that a cable gives way by: cables that ask for the same share what they take."""
+"""Softness of a cable as a share of its own compliance: redundant cables then share the load."""
 STIFFEST = 10.0
 """Stiffness against shortening over that against bending, at the cables: more would slow the iterations down, and is
 felt only by cables that pull against each other."""
 
 
 class Kind(NamedTuple):
-    """What channels of one kind move: cables that end at the same heights, whichever way they are turned.
+    """Cables of one kind of channel: equal end heights, at any azimuth.
 
     Attributes:
         gain: cable displacement [m], or tension [N], of a unit command.
-        radius: of the cables about the axis [m].
-        azimuth: of the cables from the first of them [rad].
-        end: number of the arc at whose end each cable ends.
+        radius: radius of the cables about the axis [m].
+        azimuth: azimuth of the cables from the first [rad].
+        end: index of the arc at whose end each cable ends.
     """
 
     gain: tuple[float, ...]
@@ -45,10 +45,10 @@ class Arcs(NamedTuple):
     """The chain, and the markers on it.
 
     Attributes:
-        length: of each arc [m].
-        bending, axial: compliances of each arc: bent by so many radians under a unit moment, shorter by so many metres
-            under a unit force.
-        marker_arc, marker_share, marker_offset: the arc that a marker lies on, how far along it, and where beside the
+        length: length of each arc [m].
+        bending, axial: compliances of each arc: bending in radians per unit moment, shortening in metres per unit
+            force.
+        marker_arc, marker_share, marker_offset: arc of a marker, its position along the arc, and its offset from the
             axis [m].
         pulled: commands impose lengths, else tensions.
     """
@@ -67,12 +67,12 @@ class Arcs(NamedTuple):
         arm: Float[np.ndarray, "guess cable 3 arc"],
         use: np.ndarray,
     ) -> Float[np.ndarray, "guess row marker 3"]:
-        """Where the markers are [m], about the straight body's base.
+        """Positions of the markers [m], relative to the straight body's base.
 
         Args:
             command: displacement of each cable [m], or its tension.
-            arm: by how much a cable shortens where an arc bends towards x, or towards y, by a radian, or shortens.
-            use: (guess, cable), whether the cable is there.
+            arm: shortening of a cable per radian of an arc's bending towards x, towards y, and per shortening.
+            use: (guess, cable), whether the cable exists.
         """
         guesses, cables = arm.shape[:2]
         softness = np.stack([self.bending, self.bending, self.axial])
@@ -105,7 +105,7 @@ class Arcs(NamedTuple):
 def _tensions(
     give: Float[np.ndarray, "guess cable cable"], asked: Float[np.ndarray, "guess row cable"], use: np.ndarray
 ) -> Float[np.ndarray, "guess row cable"]:
-    """Tensions of cables of imposed lengths, of which those that are not needed are slack."""
+    """Tensions of cables of imposed lengths, with unneeded cables slack."""
     there = np.flatnonzero(use.any(axis=0))
     own = np.einsum("gcc->gc", give) * (1.0 + SOFTENED)
     # One cable after the other, contiguous in memory: most of a search is spent here.

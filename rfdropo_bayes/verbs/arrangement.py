@@ -18,8 +18,8 @@ class Arrangement(NamedTuple):
 
     Attributes:
         columns: channel k of the robot takes column ``columns[k]``.
-        signs: of the commands of each column, 1 or -1.
-        turns: by which the cables of each section stand further about +z than described [rad], base to tip.
+        signs: signs of the commands of each column, 1 or -1.
+        turns: turn of the cables of each section about +z against the description [rad], base to tip.
     """
 
     columns: tuple[int, ...]
@@ -27,7 +27,7 @@ class Arrangement(NamedTuple):
     turns: tuple[float, ...]
 
     def commands(self, given: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row channel"]:
-        """What the robot's channels are sent."""
+        """Commands sent to the robot's channels."""
         return (given * np.array(self.signs))[:, list(self.columns)]
 
     def exchanged(self, i: int, j: int) -> Arrangement:
@@ -47,11 +47,11 @@ def as_written(channels: int, sections: int) -> Arrangement:
 
 
 class Sections(NamedTuple):
-    """The sections of a robot: which cables end at the same height.
+    """The sections of a robot: groups of cables with equal end height.
 
     Attributes:
         of_cable: number of the section of each cable, base to tip.
-        of_channel: of each channel, the one farthest up that it moves a cable of.
+        of_channel: highest section with a cable of each channel.
     """
 
     of_cable: tuple[int, ...]
@@ -59,7 +59,7 @@ class Sections(NamedTuple):
 
     @property
     def number(self) -> int:
-        """Of the sections."""
+        """Number of sections."""
         return 1 + max(self.of_cable)
 
 
@@ -73,7 +73,7 @@ def sections_of(robot: Robot) -> Sections:
 
 
 def turned_cables(robot: Robot, turns: Sequence[float]) -> list[Cable]:
-    """The cables with those of each section turned about +z [rad]."""
+    """The cables with each section turned about +z [rad]."""
     of_cable = sections_of(robot).of_cable
     return [_turned(cable, float(np.degrees(turns[k]))) for cable, k in zip(robot.cables, of_cable, strict=True)]
 
@@ -116,7 +116,7 @@ class Agreement(NamedTuple):
     Attributes:
         straight: their correlation as they are, -1 to 1.
         turned: the same after the turn about +z that agrees best.
-        turn: that turn [rad], from the simulated motion to the measured one.
+        turn: turn from the simulated to the measured motion [rad].
         mirrored: the same as ``turned``, of the mirror image of the simulated motion.
     """
 
@@ -143,7 +143,9 @@ def agreement(simulated: Moved, measured: Moved) -> Agreement:
 
 
 def neighbours(arrangement: Arrangement, sections: Sections) -> Iterator[Arrangement]:
-    """Arrangements that differ in two columns, in two sections of as many channels, in one sign, or in all signs."""
+    """Arrangements that differ in two columns, in two sections of equal numbers of channels, in one sign, or in all
+    signs.
+    """
     channels = range(len(arrangement.columns))
     for i, j in combinations(channels, 2):
         yield arrangement.exchanged(i, j)

@@ -1,4 +1,4 @@
-"""Where the markers of a robot at rest are under many commands at once: no clock, no rollout, milliseconds."""
+"""Marker positions of a robot at rest under many commands at once, without rollouts, in milliseconds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOVING = ("time_step", "integrator")
 
 
 class Rows(NamedTuple):
-    """Rows of recordings: commands as they were sent, and where markers were seen."""
+    """Rows of recordings: sent commands, and seen marker positions."""
 
     command: Float[np.ndarray, "row channel"]
     position: Float[np.ndarray, "row marker 3"]  # [m], not a number where a marker was not seen
@@ -50,8 +50,9 @@ def rows_of(recordings: Sequence[Trajectory], markers: Sequence[str], late: floa
 
 
 def spread_rows(rows: Rows, most: int, seed: int = 0) -> np.ndarray:
-    """Indices of at most so many rows in which a marker is seen, in order: one half by chance, the other those whose
-    commands are farthest from all chosen before."""
+    """Indices of at most ``most`` rows with a seen marker, in order: one half random, the other half with commands
+    farthest from all chosen rows.
+    """
     usable = np.flatnonzero(np.isfinite(rows.position).all(axis=2).any(axis=1))
     if len(usable) <= most:
         return usable
@@ -128,9 +129,10 @@ class RestingRobot:
     def markers(
         self, command: Float[np.ndarray, "row channel"], values: Mapping[str, Float[np.ndarray, " set"]] | None = None
     ) -> Float[np.ndarray, "set row marker 3"]:
-        """Where markers are measured [m] under each command, for each set of values; others are held or nominal.
+        """Measured positions of markers [m] under each command, for each set of values; other parameters are fixed or
+        nominal.
 
-        Not a number if no equilibrium was found.
+        NaN if no equilibrium was found.
         """
         given = {name: np.atleast_1d(np.asarray(value, float)) for name, value in (values or {}).items()}
         count = len(next(iter(given.values()))) if given else 1
@@ -166,7 +168,7 @@ class RestingRobot:
 
     @cached_property
     def _measured(self) -> Any:
-        """What is measured of true positions, row by row."""
+        """Measured from true positions, row by row."""
         own = self.simulator
 
         def measured(values: Any, position: Any) -> Any:

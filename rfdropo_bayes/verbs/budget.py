@@ -35,8 +35,8 @@ def budget_within(minutes: float, rollout_seconds: float, predicted: float) -> B
     """The budget of some minutes.
 
     Args:
-        minutes: that all of it may take.
-        rollout_seconds: of one parameter set, all fitted recordings.
+        minutes: time limit of the whole run.
+        rollout_seconds: time of one parameter set, all fitted recordings.
         predicted: rows that are predicted, over fitted rows.
     """
     within = 60.0 * minutes / rollout_seconds

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
@@ -29,10 +28,12 @@ from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
-    ParameterInfo,
+    HELD,
+    DrawsByOwner,
     PosteriorRecord,
     ProductOfPowers,
     RecordingPrediction,
+    by_owner,
     central_interval,
 )
 from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, left_out_sentence, recorded_day_error
@@ -40,17 +41,22 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
-    HELD,
     KNOWN_NOISE,
     NOISE,
-    Batch,
     match_cautions,
     predict_fitted,
     predict_new,
     thin,
     with_repeats_marked,
 )
-from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report import (
+    BaselineErrors,
+    RecordingFacts,
+    RunFacts,
+    baseline_errors,
+    build_summary,
+    software_versions,
+)
 from rfdropo_bayes.report.baselines import with_fitted_commands
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
@@ -160,7 +166,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
-def earlier_draws(fit: Calibration | Path | None, method: str) -> Batch | None:
+def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner | None:
     """What an earlier calibration, or its folder, says of where climbs may start; None without one.
 
     Its optimum where it has one, the first of the rows, and as often its draws: of many parameters that rollouts do not
@@ -184,9 +190,9 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> Batch | None:
         content = read_summary(Path(fit) / SUMMARY) if (Path(fit) / SUMMARY).is_file() else {}
     draws = thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
     optimum = content.get("optimum") or {}
-    if not set(draws) <= set(optimum):
-        return draws
-    return {name: np.concatenate([np.full(len(column), optimum[name]), column]) for name, column in draws.items()}
+    if set(draws) <= set(optimum):
+        draws = {name: np.concatenate([np.full(len(own), optimum[name]), own]) for name, own in draws.items()}
+    return by_owner(record.free, draws)
 
 
 def inference_options(table: InferenceTable) -> dict[str, Any]:
@@ -215,10 +221,10 @@ def record_posterior(
     values = thin(result.draws, asked.draws)
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
-    fitted = list(problem.model.recordings.names)
+    fitted, scopes = list(problem.model.recordings.names), problem.model.scopes
     lasting = result.details.get("lasting", {}).get(problem.model.markers.name)
     left = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
-    slow = _unseen_days(asked, result, predictions, left, jax.random.fold_in(key, 3), show=show)
+    slow = _unseen_days(asked, problem, result, predictions, left, jax.random.fold_in(key, 3), show=show)
     cautions: list[Caution] = []
     if tested:
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
@@ -231,10 +237,7 @@ def record_posterior(
         predictions += found.recordings
         cautions = match_cautions(found)
     record = PosteriorRecord(
-        tuple(
-            ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
-            for p in problem.model.space.parameters
-        ),
+        scopes.infos,
         result.draws,
         prior,
         tuple(with_repeats_marked(predictions, [*asked.runs, *tested])),
@@ -245,18 +248,19 @@ def record_posterior(
             **attributes,
             NOISE: problem.model.noise,
             FITTED: fitted,
-            HELD: result.held,
+            HELD: [{"parameter": p.info.as_dict(), "value": result.held[p.name]} for p in scopes.known],
             MODEL_ERROR: None if left is None else left._asdict(),
             DAY_ERROR: None if slow is None else slow.as_dict(),
             OPENINGS: openings_of(asked.runs),
             **known_noise(problem),
         },
     )
-    return with_ratios(record, problem.names), cautions
+    return with_ratios(record, scopes.names), cautions
 
 
 def _unseen_days(
     asked: Fitting,
+    problem: CalibrationProblem,
     result: InferenceResult,
     predictions: Sequence[RecordingPrediction],
     left: ModelError | None,
@@ -272,7 +276,8 @@ def _unseen_days(
     optimum = result.optimum or {}
     if set(draws) <= set(optimum):
         draws = {name: np.full(2, optimum[name]) for name in draws}
-    return error_of_unseen_days(Days(asked.model, asked.runs, draws, predictions, left), key, show=show)
+    start = by_owner(problem.model.scopes.infos, draws)
+    return error_of_unseen_days(Days(asked.model, asked.runs, start, predictions, left), key, show=show)
 
 
 def row_log_likelihood(
@@ -310,12 +315,11 @@ def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecor
         powers = {"young_modulus": 1.0, "trunk_mass": -1.0}
         words = "stiffness over mass: what the motion of a trunk with length-driven cables determines"
         found.append(ProductOfPowers("young_modulus_over_trunk_mass", "Pa/kg", powers, words))
-    for payload in (name for name in names if name.partition(SEPARATOR)[0] == PAYLOAD):
-        own = payload.removeprefix(PAYLOAD)
+    for payload in (info for info in record.free if info.name in names and info.parameter == PAYLOAD):
         for name, unit in scales:
-            powers = {payload: 1.0, name: -1.0}
+            powers = {payload.name: 1.0, name: -1.0}
             words = f"payload over {name.replace('_', ' ')}: what motion determines, whatever their common scale is"
-            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}{own}", unit, powers, words))
+            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}", unit, powers, words, payload.scope.owner))
     drawn = [draws for draws in (record.posterior, record.prior) if draws]
     return record.with_derived([p for p in found if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
 
@@ -329,8 +333,9 @@ def gather_facts(
     tested: Sequence[Trajectory],
     record: PosteriorRecord,
     unmatched: Sequence[Caution] = (),
+    baselines: Mapping[str, BaselineErrors] | None = None,
 ) -> RunFacts:
-    """What the report says beside the posterior."""
+    """What the report says beside the posterior; ``baselines`` are those of `baseline_errors` by default."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
     simulator = problem.model.simulator
@@ -342,7 +347,7 @@ def gather_facts(
     strange = recorded_doubts(record)
     if robot is not None:
         strange += robot.unstated(run.name for run in (*fitted, *tested))
-        strange += implausible_fit(robot, problem.model.fixed, record)
+        strange += implausible_fit(robot, problem.model.scopes.fixed, record)
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -364,11 +369,11 @@ def gather_facts(
         model={
             "noise": problem.model.noise,
             "mechanisms": ", ".join(added) or "none",
-            "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.fixed.items())
+            "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.scopes.fixed.items())
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
-        baselines=baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
+        baselines=baselines or baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
         fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,
@@ -383,7 +388,7 @@ def gather_facts(
 
 def implausible_fit(robot: Robot, fixed: Mapping[str, float], record: PosteriorRecord) -> list[Caution]:
     """A caution where nine tenths of the draws, or a fixed value, are a mass or stiffness that no soft robot has."""
-    drawn = {info.name.partition(SEPARATOR)[0]: central_interval(record.flat(info.name)) for info in record.free}
+    drawn = {info.parameter: central_interval(record.flat(info.name)) for info in record.free}
     found = implausible_values(robot, {**{name: (value, value) for name, value in fixed.items()}, **drawn})
     return [] if found is None else [Caution(Code.IMPLAUSIBLE, found)]
 

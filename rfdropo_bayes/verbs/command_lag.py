@@ -1,4 +1,6 @@
-"""How late markers follow the commands of their rows: by what quadratic maps of the commands leave, without a model."""
+"""Delay of markers behind the commands of their rows, from residuals of quadratic maps of the commands, without a
+model.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +17,19 @@ from rfdropo_bayes.data.sample_times import sample_time
 DELAYS = (0.0, 0.1, 0.2, 0.4)
 """[s] of a motion after its commands."""
 MOST_ROWS = 2000
-"""Of a recording that are looked at."""
+"""Rows of a recording that are used."""
 RIDGE = 1e-6
-"""Of the maps, as a share of the mean square of their features."""
+"""Ridge penalty of the maps, as a share of the mean square of their features."""
 CLEARLY = 0.9
-"""Ratio of what two maps leave, root mean square, below which the better one is said to fit better."""
+"""Ratio of the root mean square residuals of two maps below which the better map is reported."""
 
 
 class Left(NamedTuple):
-    """What a quadratic map of the commands leaves of the markers' motion.
+    """Residual of the markers' motion after a quadratic map of the commands.
 
     Attributes:
-        rows: by which the commands come before the markers: 0, those of the same row.
-        error: root mean square [m].
+        rows: rows by which the commands precede the markers; 0 is the same row.
+        error: root mean square residual [m].
     """
 
     rows: int
@@ -35,7 +37,7 @@ class Left(NamedTuple):
 
 
 def left_by_rows(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)) -> list[Left]:
-    """What is left if each row shows what the command of another row did, so many rows before."""
+    """Residuals if each row shows the effect of the command some rows before, for each lag."""
     return [Left(lag, _left([(own, _shifted(sent, lag)) for own, sent in _series(runs)])) for lag in lags]
 
 
@@ -68,7 +70,7 @@ def _shifted(command: Float[np.ndarray, "row channel"], lag: int) -> Float[np.nd
 
 
 def _left(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """What one map for all recordings leaves, with a mean of each recording's own."""
+    """Residual of a single map for all recordings, with a separate mean per recording."""
     parts = []
     for position, command in series:
         whole = np.isfinite(position).all(axis=1) & np.isfinite(command).all(axis=1)
@@ -86,7 +88,7 @@ def _left(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
 
 
 def _quadratic(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row feature"]:
-    """Commands over their sizes, what of them pulls, and the products of all pairs."""
+    """Scaled commands, their positive parts, and the products of all pairs."""
     size = np.sqrt(np.mean(command**2, axis=0))
     scaled = command / np.where(size > 0.0, size, 1.0)
     one, other = np.triu_indices(scaled.shape[1])

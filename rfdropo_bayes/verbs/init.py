@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
@@ -76,7 +79,7 @@ def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]
 
 
 def with_given(guess: Guess, **given: Any) -> Guess:
-    """A guess in which what is given takes the place of what was guessed: units, and the time from row to row [s]."""
+    """A guess with given values in place of guessed values: units, and the time from row to row [s]."""
     given = {key: value for key, value in given.items() if value is not None}
     evidence = {key: words for key, words in guess.evidence.items() if key not in given}
     of_others = {"command_unit": guess.commands, "position_unit": names_of(guess.positions)}
@@ -103,8 +106,7 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
-    """A guess with what the robot says of it: units of positions and commands, and no tensions of motors that move two
-    cables."""
+    """A guess refined by the robot: units of positions and commands, and no tensions of motors with two cables."""
     if outline.pairs and guess.tensions:
         guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
     if "markers" in outline.assumed:
@@ -134,10 +136,10 @@ def write_first_files(
     Args:
         folder: to write to; it is made.
         outline: the robot.
-        recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset, and the
-            last third of the rows of one that stands alone.
-        commands: the file of commands of each, where they have any.
-        guess: what their columns are, see `of_robot`; None without recordings, when random commands are simulated.
+        recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
+            third of the rows of a single recording.
+        commands: the file of commands of each, if they have any.
+        guess: guess of their columns, see `of_robot`; None without recordings, when random commands are simulated.
 
     Raises:
         InputError: files of these names are there already, or the folder cannot be written to.
@@ -172,6 +174,10 @@ def write_first_files(
     plain = write(tables())
     first = _first_recording(plain, folder)
     if first is not None:
+        usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
+        if usual > 0.0:
+            robot.write_text(robot_text(replace(outline, usual_command=usual)), encoding="utf-8")
+            made = Robot.load(robot)
         slow, rows = slow_motion(made, first), rows_to_fit(first) if len(recordings) == 1 else None
         write(tables(frame=_frame(plain, made, guess), rows=rows), slow, first)
     return robot, experiment
@@ -188,9 +194,9 @@ def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
-    """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
+    """Lines of [data.columns] that bring the first row to the robot; empty if it is there already, or if no frame fits.
 
-    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
+    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is searched.
     """
     if experiment.data is None or experiment.data.columns is None:
         return []
@@ -232,7 +238,7 @@ def _entries(
 
 
 def assumed_of_columns(guess: Guess) -> list[str]:
-    """What the tables of `data_tables` assume or leave out, and a recording does not tell; a sentence each."""
+    """Assumptions and omissions of `data_tables` that no recording can settle; a sentence each."""
     said = [f'{key} = "{getattr(guess, key)}": {words}' for key, words in guess.evidence.items()]
     if guess.time is None and guess.sample_time is None:
         said.append(f'time = "{ROWS}": {NO_TIMES}')
@@ -256,8 +262,8 @@ def data_tables(
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
-    ``frame`` are the lines of axes and origin, where the first row tells them; ``cables`` the robot's, one for each
-    command, if tensions of them were measured; ``rows`` those to fit and to test of a recording that stands alone.
+    ``frame`` are the lines of axes and origin, if the first row determines them; ``cables`` the robot's, one for each
+    command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single recording.
     """
     entries = _entries(folder, recordings, commands, guess, rows)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
@@ -279,7 +285,7 @@ def data_tables(
         "[data]",
         f'format = "{guess.format}"',
         f"fit = [{', '.join(fit)}]",
-        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they say how good the fit is",
+        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they score the fit",
         *masked,
         "",
         "# Guessed from the names and sizes of the columns: look them over.",
@@ -325,7 +331,7 @@ def _clock(guess: Guess) -> list[str]:
     if guess.time is None:
         return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:
-        return ['time = "header"  # stamps where messages have them; "log": the times at which they were received']
+        return ['time = "header"  # stamps if messages have them; "log": the times at which they were received']
     return [f"time = {quoted(guess.time)}", _unit_line(guess, "time_unit")]
 
 
@@ -336,7 +342,8 @@ def _command_clock(guess: Guess) -> list[str]:
     return [
         f"command_time = {quoted(guess.command_time)}",
         _unit_line(guess, "command_time_unit"),
-        "# ASSUMED: both clocks begin together. Else: what the observations' clock shows [s] when this one shows zero.",
+        "# ASSUMED: both clocks begin together. Else: reading of the observations' clock [s] when the "
+        "commands' clock shows zero.",
         "command_offset = 0.0",
     ]
 
@@ -397,6 +404,6 @@ def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests
         "[inference]",
         'method = "laplace"      # rfdropo methods lists them',
         *(["blocks = 1              # rows at rest do not depend on the rows before them"] if rests else []),
-        "minutes = 3             # that calibrate may take on the machine where it runs, its report included",
+        "minutes = 3             # time limit of calibrate on its machine, report included",
         "",
     ]

@@ -41,13 +41,13 @@ MOST = 5
 LEFT = 0.4
 """Another arrangement is named if it leaves at most this share of the motion that the present one leaves."""
 LITTLE, SEEN = 0.4, 1e-3
-"""Agreement below which markers do not do what the commands ask, and the nominal motion [m] that it takes to say so."""
+"""Agreement below which markers do not follow the commands, and the least nominal motion [m] for this statement."""
 SOLVED = 0.5
 """Least share of the rows in which the rod must have an equilibrium for a comparison."""
 
 
 class Proposal(NamedTuple):
-    """Another arrangement of the commands: its agreement, the lines that bring it about, and its rivals in words."""
+    """Another arrangement of the commands: its agreement, the lines for it, and its alternatives in words."""
 
     agreement: float
     lines: tuple[str, ...]
@@ -71,12 +71,12 @@ class Motion(NamedTuple):
 
 
 def motion_cautions(motion: Motion, columns: CsvColumns | None, command_unit: str) -> list[Caution]:
-    """What a motion says against the frame, the order and the unit of commands.
+    """Cautions of a motion on the frame, the order and the unit of commands.
 
     Args:
         motion: recordings beside the nominal model.
-        columns: the table by which the recordings were read; None for formats that have none.
-        command_unit: in which a recording keeps its commands.
+        columns: table used to read the recordings; None for formats that have none.
+        command_unit: unit of the recordings' commands.
     """
     direction, size, proposal, unit = motion
     axes = None if columns is None else columns.axes
@@ -99,7 +99,7 @@ def motion_cautions(motion: Motion, columns: CsvColumns | None, command_unit: st
 
 
 def _proposed(direction: Direction, proposal: Proposal, axes: tuple[str, str, str] | None) -> Caution:
-    """Another arrangement in words, with what else would explain the motion as well."""
+    """Another arrangement in words, with alternatives that explain the motion equally well."""
     lines = "; ".join(proposal.lines)
     others = list(proposal.rivals)
     if proposal.mirrored:
@@ -114,11 +114,11 @@ def _proposed(direction: Direction, proposal: Proposal, axes: tuple[str, str, st
 
 
 class Compared(NamedTuple):
-    """A comparison with the robot at rest.
+    """Comparison with the robot at rest.
 
     Attributes:
-        words: about it.
-        cautions: what speaks against frame, order and unit of the commands.
+        words: summary.
+        cautions: on frame, order and unit of the commands.
         arrangement: of the commands under which the robot agrees; None if it has no equilibrium under them.
     """
 
@@ -128,15 +128,15 @@ class Compared(NamedTuple):
 
 
 def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> Compared:
-    """Compare what markers do with the robot at rest under the same commands, and look for what explains it better.
+    """Compare the motion of markers with the robot at rest under the same commands, and search a better arrangement.
 
     Args:
-        spec: of a robot; values are nominal or fixed.
-        recordings: in the frame of the base; the first `MOST` of them count.
-        columns: the table by which they were read.
+        spec: model of a robot; values are nominal or fixed.
+        recordings: in the frame of the base; the first `MOST` are used.
+        columns: table used to read them.
 
     Raises:
-        InputError: no marker that robot and recordings share.
+        InputError: no common marker of robot and recordings.
     """
     runs = recordings[:MOST]
     robot, late = resting(spec), best_delay(runs)
@@ -187,9 +187,10 @@ def _explained(robot: RestingRobot, rows: Rows, units: Sequence[Unit]) -> tuple[
 
 
 def _proposal(found: Finding, robot: Robot, columns: CsvColumns | None, names: Sequence[str]) -> Proposal | None:
-    """What was found, if it is another order, another sign, or sections turned against each other, and clearly better.
+    """The found arrangement, if it has another order, another sign, or sections turned against each other, and is
+    clearly better.
 
-    A turn of the whole is said as one of the frame, see `direction_doubt`.
+    A turn of the whole is reported as a turn of the frame, see `direction_doubt`.
     """
     changed = found.arrangement[:2] != (tuple(range(len(names))), (1,) * len(names))
     if not (changed or found.sections_differ) or found.agreement < AGREEING or found.left > LEFT:

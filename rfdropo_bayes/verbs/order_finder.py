@@ -1,7 +1,7 @@
-"""Which arrangement of the commands explains recordings: the simplest of those that a rod at rest agrees with best.
+"""Which arrangement of the commands explains recordings: the simplest with the best agreement of a rod at rest.
 
-As they are written; with the whole turned; with each section turned; with columns exchanged or reversed, and sections
-turned. What is proposed is told beside its rivals: arrangements that explain the motion as well.
+Tried are: as written; with the whole turned; with each section turned; with columns exchanged or reversed, and sections
+turned. A proposal is reported with its alternatives: arrangements that explain the motion equally well.
 """
 
 from __future__ import annotations
@@ -30,20 +30,22 @@ ROWS, SEARCHED = 100, 60
 WELL = 0.98
 """Agreement from which on no other arrangement is looked for."""
 ALIKE = 1.3
-"""Ratio of two shares of unexplained motion below which the simpler arrangement is taken, and rivals are named."""
+"""Ratio of two shares of unexplained motion below which the simpler arrangement is taken, and alternatives are
+named.
+"""
 RIVALS = 6
-"""Rivals that are simulated."""
+"""Number of simulated alternatives."""
 SAME_TURN = np.radians(1.0)
 
 
 class Finding(NamedTuple):
-    """What a search for another arrangement found.
+    """Result of a search for another arrangement.
 
     Attributes:
-        written: agreement of the robot and the commands as they are written.
-        arrangement: the simplest that explains the motion as well as the best; agreement: its correlation.
-        rivals: other arrangements that explain it as well, and their correlations.
-        mirror: correlation of the mirror image of the robot as it is written, turned.
+        written: agreement of the robot and the commands as written.
+        arrangement: the simplest arrangement as good as the best; agreement: its correlation.
+        rivals: alternatives of equal quality, and their correlations.
+        mirror: correlation of the robot's mirror image, turned.
     """
 
     written: Agreement
@@ -83,7 +85,7 @@ def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
 
     Args:
         resting: the robot as it is written, showing the markers of the rows.
-        rows: of recordings.
+        rows: rows of recordings.
     """
     robot = resting.simulator.robot
     finder = _Finder(resting, robot, rows.of(spread_rows(rows, ROWS)))
@@ -108,7 +110,7 @@ class _Finder:
         self._seen: dict[Arrangement, Agreement] = {}
 
     def agreement(self, arrangement: Arrangement) -> Agreement:
-        """Of the rod at rest with the recording."""
+        """Agreement of the rod at rest with the recording."""
         if arrangement not in self._seen:
             made = arranged(self.resting, arrangement).markers(arrangement.commands(self.rows.command))[0]
             both = np.isfinite(made) & np.isfinite(self.rows.position)
@@ -133,7 +135,7 @@ class _Finder:
         return [start, whole, *sections]
 
     def canonical(self, arrangement: Arrangement) -> Arrangement:
-        """Of all arrangements that are the same robot, the one with most columns in place, then least turned."""
+        """The equivalent arrangement with most columns in place, then least turned."""
         for section in range(self.sections.number):
             arrangement = max(
                 self._equals(arrangement, section),
@@ -196,10 +198,10 @@ def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key:
     """Lines that bring an arrangement about.
 
     Args:
-        arrangement: that was found.
-        robot: as it is written.
+        arrangement: found arrangement.
+        robot: robot as written.
         own: names of the columns.
-        key: how the order of columns is written, with the list in the place of {}.
+        key: template of the order of columns, with {} for the list.
     """
     lines = []
     if arrangement.columns != tuple(range(len(own))):

@@ -68,7 +68,7 @@ class HubBus(can.BusABC):
 
     Args:
         channel: "HOST:PORT", or the path of a Unix socket.
-        patience: how long to wait for the hub to appear [s].
+        patience: longest wait for the hub to appear [s].
     """
 
     def __init__(self, channel: str, patience: float = 5.0, **settings: Any) -> None:

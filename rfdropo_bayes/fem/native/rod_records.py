@@ -14,11 +14,24 @@ from rfdropo_bayes.fem.native.simd import aligned_zeros
 
 KINDS = 2
 """Coulomb's friction and the capstan's."""
-DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM = 0, 9, 18, 21, 24, 27, 33, 39, 45, 53
+DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM, HELD = (
+    0,
+    9,
+    18,
+    21,
+    24,
+    27,
+    33,
+    39,
+    45,
+    53,
+    59,
+)
 """First rows of an element's scratch: directors in its middle, these times W, chord, g, b, strains, their rates and the
 stresses; the section's tangent, of shear, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six
-without the law of fibres."""
-ELEMENT = FIRM + 6
+without the law of fibres; and how taut cables hold it in space: its force by stretch and shear (lower half, by
+columns), that by bending and twist (columns), and the moment by these (lower half)."""
+ELEMENT = HELD + 21
 
 
 class RodSamples(NamedTuple):
@@ -40,6 +53,7 @@ class Factors(NamedTuple):
     """What makes a solve a time step or a static iteration; (1, lanes) each."""
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
+    held: Float[np.ndarray, "1 lanes"]  # of what taut cables hold there
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
@@ -69,8 +83,11 @@ class RodWork(NamedTuple):
     weight: Float[np.ndarray, "rows lanes"]
     element: Float[np.ndarray, "rows lanes"]  # scratch of an element
     lever: Float[np.ndarray, "guide_entries3 lanes"]  # arms of the guides in space [m]
-    direction: Float[np.ndarray, "guides3 lanes"]  # from the point before to a guide
-    course: Float[np.ndarray, "guides lanes"]  # and how far [m]
+    offset: Float[np.ndarray, "guides3 lanes"]  # sums of these
+    direction: Float[np.ndarray, "guides3 lanes"]  # derivative of the way to a guide by its place
+    course: Float[np.ndarray, "guides lanes"]  # length of the way [m]
+    inverse: Float[np.ndarray, "guides lanes"]  # its second derivative is inverse - sharp * direction direction' [1/m]
+    sharp: Float[np.ndarray, "guides lanes"]
     slack: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
     commanded: Float[np.ndarray, "cables lanes"]

@@ -129,7 +129,7 @@ class SmcState(NamedTuple):
         block: index of the present block; -1 before the first.
         stage: number of stages done; random keys derive from it.
         log_evidence: log p(rows passed).
-        prefix_log_evidence: at every prefix passed, NaN elsewhere.
+        prefix_log_evidence: log evidence at every prefix passed, NaN elsewhere.
         ledger: cost and exclusions.
         trace: one dictionary per stage.
         seconds: time spent.
@@ -210,8 +210,8 @@ def step(
 
     Args:
         key: key of the whole replicate; the stage's own is derived from it, which makes a resumed run exact.
-        state: of the replicate.
-        problem: to be sampled.
+        state: state of the replicate.
+        problem: problem to sample.
         plan: sizes.
         config: settings.
     """
