@@ -35,7 +35,7 @@ def first_answer(
     model = build_model(spec, build_simulator(spec), fit)
     robot = arranged(resting(spec), arrangement)
     robot = robot.showing(shared_markers([*fit, *test], robot.simulator.marker_names))
-    return fit_at_rest(robot, model.space, fit, test, best_delay(fit), arrangement.commands)
+    return fit_at_rest(robot, model.scopes, fit, test, best_delay(fit), arrangement.commands)
 
 
 def rest_lines(fit: RestFit) -> list[tuple[str, str]]:

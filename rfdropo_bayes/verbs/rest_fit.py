@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.bayes.space import ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.data import Trajectory, group_repeats
 from rfdropo_bayes.report.baselines import mean_pose
 from rfdropo_bayes.report.fir import fit_fir
@@ -102,15 +102,15 @@ OWN = "own"
 """Key of the fitted robot among errors."""
 
 
-def scales_of(space: ParameterSpace, known: Sequence[str]) -> list[Scale]:
+def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
     """Priors of the inferred parameters that a robot at rest has, those of single recordings left out."""
-    drawn = space.sample(jax.random.key(0), DRAWS)
+    drawn = scopes.sample(jax.random.key(0), DRAWS)
     found = []
-    for parameter in space.parameters:
+    for parameter in scopes.parameters:
         draws, spec = np.asarray(drawn[parameter.name]), parameter.spec
         if parameter.name not in known or not np.ptp(draws) > 0.0:
             continue
-        family = (parameter.table or {}).get("distribution")
+        family = parameter.table.get("distribution")
         logarithmic = family in ("LogNormal", "LogUniform") and bool(np.all(draws > 0.0))
         inside = np.log(draws) if logarithmic else draws
         middle, sd = float(np.median(inside)), float(np.std(inside))
@@ -157,7 +157,7 @@ def least_squares(
 
 def fit_at_rest(
     robot: RestingRobot,
-    space: ParameterSpace,
+    scopes: Scopes,
     fit: Sequence[Trajectory],
     test: Sequence[Trajectory],
     late: float,
@@ -167,13 +167,13 @@ def fit_at_rest(
 
     Args:
         robot: showing the markers that all recordings have.
-        space: of the inferred parameters.
+        scopes: of the inferred parameters.
         fit: recordings that a fit may see.
         test: recordings that it may not; errors are those of the fitted ones if there are none.
         late: how long [s] after its commands the body is where they ask.
         sent: what the channels are sent, given the commands as they were recorded.
     """
-    scales = scales_of(space, [spec.name for spec in robot.simulator.parameters])
+    scales = scales_of(scopes, [spec.name for spec in robot.simulator.parameters])
     every = rows_of(fit, robot.shown, late)
     rows = every.of(spread_rows(every, FITTED))
 

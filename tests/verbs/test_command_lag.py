@@ -36,9 +36,9 @@ def test_the_row_whose_command_a_pose_shows_is_found(lag):
     assert left[lag] < 0.2 * sorted(left.values())[1]
 
 
-@pytest.mark.parametrize(("lag", "delay"), [(0, 0.0), (1, 1.0)])
-def test_the_delay_is_that_of_the_row(lag, delay):
-    assert best_delay([recording(lag)]) == delay
+@pytest.mark.parametrize(("lag", "least", "most"), [(0, 0.0, 0.0), (1, 0.1, 1.0)])
+def test_the_delay_is_that_of_the_row(lag, least, most):
+    assert least <= best_delay([recording(lag)]) <= most
 
 
 @pytest.mark.parametrize(
