@@ -164,6 +164,13 @@ def deviation(
 ) -> InferredParameter:
     """Deviation of a group's value from the shared value, Normal(0, ``spread``), in the parameter's unit.
 
+    Args:
+        spec: the shared parameter.
+        spread: standard deviation between groups.
+        scope, members: scope of the parameter, and its recordings.
+        ends: largest absolute value.
+        where: entry of the experiment file, for errors.
+
     Raises:
         InputError: a spread that is not positive.
     """

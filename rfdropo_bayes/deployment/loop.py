@@ -191,7 +191,11 @@ class ControlLoop:
         return self._come_to_rest(stop)
 
     def find(self) -> None:
-        """Read the first status of every drive; set-points begin at the drives' positions."""
+        """Read the first status of every drive; set-points begin at the drives' positions.
+
+        Raises:
+            Stop: a drive sends no status within a second.
+        """
         end = time.monotonic() + 1.0
         while silent := [drive.name for drive in self.drives.all if drive.reading is None]:
             self.cycle(Phase.ENABLING)

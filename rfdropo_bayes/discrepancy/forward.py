@@ -134,7 +134,7 @@ class Lanes:
         """Observations of each parameter set under the commands of its lane, and result codes.
 
         ``start`` (lane, 7) are initial poses of an object. ``check`` is called before every batch, and may raise. After
-        ``steps`` time steps, all by default, rows hold no meaning.
+        ``steps`` time steps, all by default, rows are meaningless.
         """
         limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
         lanes = (theta, start, commands)

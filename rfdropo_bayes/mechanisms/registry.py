@@ -138,7 +138,7 @@ class MechanismChoice:
     kind: Any
 
     def made_for(self, robot: Robot | BlackBox | None) -> Mechanism:
-        """The mechanism; one with parameters per cable (a class method ``for_robot``) is made for the robot, and
+        """The mechanism; a class with parameters per cable (a class method ``for_robot``) is made for the robot, and
         mechanisms of the library have its sizes."""
         if not isinstance(self.kind, type):
             return self.kind

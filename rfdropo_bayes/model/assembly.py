@@ -241,7 +241,7 @@ def check_spec(spec: ModelSpec, simulator: AnySimulator) -> None:
 
 
 def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
-    """The recordings of one role, ``"fit"`` or ``"test"``."""
+    """The recordings of one role, ``"fit"`` or ``"test"``; InputError without [data]."""
     if data is None:
         raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
     return load_recordings(data, folder, role=role)

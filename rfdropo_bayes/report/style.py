@@ -196,6 +196,7 @@ def thin(rows: int) -> np.ndarray:
 
 
 def label_with_unit(name: str, unit: str) -> str:
+    """Displayed name with its unit in brackets, if it has a unit."""
     return f"{display_name(name)} [{unit}]" if unit else display_name(name)
 
 

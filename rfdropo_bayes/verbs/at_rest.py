@@ -30,7 +30,7 @@ class Rows(NamedTuple):
     """Rows of recordings: sent commands, and seen marker positions."""
 
     command: Float[np.ndarray, "row channel"]
-    position: Float[np.ndarray, "row marker 3"]  # [m], not a number where a marker was not seen
+    position: Float[np.ndarray, "row marker 3"]  # [m], NaN if a marker was not seen
     time: Float[np.ndarray, " row"]  # [s] in its recording
 
     def of(self, index: np.ndarray) -> Rows:

@@ -226,7 +226,7 @@ def build_problem(
         InputError: [audit] leaves no candidate.
     """
     spreads, robot = spec.per_group, spec.robot
-    if groups is not None and groups.compared:  # what the groups do not share is to be found
+    if groups is not None and groups.compared:  # the difference between the groups is to be found
         spec = replace(spec, per_group={})
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}

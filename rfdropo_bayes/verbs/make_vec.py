@@ -128,6 +128,7 @@ def _check_length(task: Task, robot: Robot | BlackBox) -> None:
 
 
 def episode_settings(table: TrainingTable) -> Settings:
+    """Settings of episodes in [training]."""
     return Settings(
         table.actions,
         table.observation,

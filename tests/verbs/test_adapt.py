@@ -303,7 +303,7 @@ def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros, ca
     ]
     check = found.content["details"]["checks"]["b"]
     assert check["adapted"]["error_mm"] < check["from_first_row"]["error_mm"] + 1e3 * SIGMA
-    assert [c for c in found.cautions if "makes the rest of the recording worse" in c.sentence]
+    assert [c for c in found.cautions if "worsen the prediction of the rest of the recording" in c.sentence]
     (sentence,) = found.content["details"]["compared"]
     assert sentence.startswith("b, as far as it was not shown: from the first row ")
     assert "mm off, its 90 % bands held" in sentence
@@ -435,7 +435,7 @@ def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
     with pytest.raises(rb.InputError, match="nothing of the model differs between days"):
         rb.adapt(replace(same, record=replace(record, parameters=shared, posterior=draws)), run, show=False)
     silent = {**record.attrs, MODEL_ERROR: None}
-    with pytest.raises(rb.InputError, match="does not say what its model leaves"):
+    with pytest.raises(rb.InputError, match="has no residuals of the fitted recordings"):
         rb.adapt(replace(known, record=replace(record, attrs=silent)), run, show=False)
 
 
