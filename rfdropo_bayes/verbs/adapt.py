@@ -78,28 +78,26 @@ def adapt(
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
-    """Move what a day changes to one short recording of it; the body keeps its posterior.
+    """Fit the parameters of a new session to one short recording; the body keeps its posterior.
 
-    What moves are the deviations of the parameters in [model.per_group], and those in [model.per_recording]. A
-    parameter may be put into [model.per_group] now that was shared in the fit. The noise is what the fitted recordings
-    showed the model to leave, for as long as it lasted.
+    The fitted parameters are deviations of [model.per_group] and parameters of [model.per_recording]. A parameter that
+    was shared in the fit may be added to [model.per_group]. The noise has the size and the correlation time of the
+    residuals of the fitted recordings.
 
     Args:
         fit: a calibration, with its model.
-        recording: a recording of the new day, or its entry in [data].
-        seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
-            rest is predicted.
-        group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
-        test: other recordings of the day, of which nothing but the first row is looked at; the report says how well
-            they are predicted.
-        draws: of the posterior.
+        recording: a recording of the new session, or its entry in [data].
+        seconds: length of the beginning that is used; all by default. The report then shows the prediction of the rest.
+        group: name of the session; by default the recording's group in [model.groups], or else its name.
+        test: other recordings of the session, of which only the first row is used; the report scores their predictions.
+        draws: number of posterior draws.
         seed: seed of all random numbers; by default from the model's experiment.
-        out: folder that gets what a calibration writes; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
+        out: folder for the files of a calibration; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
         show: whether to show progress, see `Progress`.
 
     Raises:
-        InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
+        InputError: no parameter varies between sessions, or the fit has no residuals.
     """
     fit = given_fit(fit, "adapt")
     if isinstance(recording, RecordingEntry):
@@ -223,7 +221,7 @@ class Adapted(NamedTuple):
 
 
 def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
-    """Fit the day to as much of the recording as is looked at, and predict the rest."""
+    """Fit the session to the used part of the recording, and predict the rest."""
     fit, _, scopes, own, head, _, _, day, left = asked
     simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
@@ -508,7 +506,7 @@ def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], B
 def _checks(
     before: Sequence[RecordingPrediction], after: Sequence[RecordingPrediction]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """How well recordings that were not looked at are predicted before and after, by recording."""
+    """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
         p.name: {
@@ -533,7 +531,7 @@ def _fared(prediction: RecordingPrediction) -> dict[str, float]:
 
 
 def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    """Before and after an adaptation in the same words, of each recording that it did not look at."""
+    """Sentence on each unused recording: its prediction error before and after the adaptation."""
     found = []
     for name, check in checks.items():
         words = [
