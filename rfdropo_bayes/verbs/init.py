@@ -24,6 +24,7 @@ from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_te
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
+from rfdropo_bayes.verbs.command_lag import left_by_rows
 from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, rows_to_fit
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
@@ -189,7 +190,9 @@ def write_first_files(
     timed = guess.time is not None or guess.sample_time is not None
     frame, slow = _frame(plain, made, guess), slow_motion(made, first) if timed else NO_MOTION
     rows = rows_to_fit(first) if len(recordings) == 1 else None
-    placed = write(tables(frame=frame, rows=rows), slow, first)
+    poses = _of_poses(first, timed) if slow is not None and guess.command_time is None else None
+    tables = partial(tables, rows=rows, poses=poses)
+    placed = write(tables(frame=frame), slow, first)
     seen = _first_recording(placed, folder)
     columns = None if placed.data is None else placed.data.columns
     if seen is None or columns is None or not usual:
@@ -208,8 +211,19 @@ def write_first_files(
         if not np.allclose(turned, np.eye(3)) or np.linalg.norm(found.frame.shift) > FAR_ORIGIN * made.length:
             frame = moved_frame(columns, turned, -turned @ found.frame.shift)
             found = found._replace(frame=found.frame._replace(shift=np.zeros(3)))
-    write(tables(guess=ordered, frame=frame, rows=rows), slow, first, found.frame)
+    write(tables(guess=ordered, frame=frame), slow, first, found.frame)
     return robot, experiment
+
+
+def _of_poses(first: Trajectory, timed: bool) -> str | None:
+    """Reason to take the command of a row for the command of its pose; None if the pose follows the row before."""
+    if not timed:
+        return NO_MOTION
+    own, before = left_by_rows([first], (0, 1))
+    if own.error > before.error:
+        return None
+    errors = f"{1e3 * own.error:.3g} mm, of the row before {1e3 * before.error:.3g} mm"
+    return f"a quadratic map of the commands of a pose's own row leaves {errors}"
 
 
 def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
@@ -288,11 +302,13 @@ def data_tables(
     frame: Sequence[str] = (),
     cables: Sequence[str] = (),
     rows: tuple[list[int], list[int]] | None = None,
+    poses: str | None = None,
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
     ``frame`` are the lines of axes and origin, if the first row determines them; ``cables`` the robot's, one for each
-    command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single recording.
+    command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single recording;
+    ``poses`` the reason to take each command for that of the pose in its row.
     """
     entries = _entries(folder, recordings, commands, guess, rows)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
@@ -327,6 +343,7 @@ def data_tables(
         *counts,
         *_other_units(guess),
         *_command_clock(guess),
+        *([f"commands_with_poses = true  # ASSUMED: {poses}"] if poses else []),
         "positions = [",
         *(f"    {quoted(triple)}," for triple in guess.positions),
         "]",
