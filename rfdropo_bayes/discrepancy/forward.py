@@ -259,6 +259,7 @@ class Forward:
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
+        self.compiling = 0.0  # seconds that rollouts took to compile
 
     @cached_property
     def identity(self) -> str:

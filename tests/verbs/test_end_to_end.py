@@ -66,8 +66,8 @@ def test_a_recording_goes_through_every_verb(tmp_path):
         errors.append(float(np.sqrt(np.mean((centre - new.position) ** 2))))
     np.testing.assert_allclose(errors[0], errors[1], rtol=1e-6)
     assert errors[0] < 3.0 * NOISE
-    options = {"noise": {"standard_deviation": NOISE}, "ports": False, "bootstraps": 199, "show": False}
-    found = rb.audit(model, runs[:2], test=runs[2:], fit=day, minutes=10.0, out=tmp_path / "audit", **options)
+    options, noise = rb.AuditOptions(minutes=10.0, ports=False, bootstraps=199), {"standard_deviation": NOISE}
+    found = rb.audit(model, runs[:2], options, test=runs[2:], fit=day, noise=noise, out=tmp_path / "audit", show=False)
     assert found.verdict == "no_discrepancy"
     extended = rb.load(tmp_path / "audit").extended
     assert integrator_of(extended.spec) == "quasi-static"
