@@ -113,7 +113,7 @@ class InferredParameter:
 
 @dataclass(frozen=True)
 class Pooled:
-    """How one parameter is pooled.
+    """Pooling of one parameter.
 
     Attributes:
         spread: standard deviation between groups, in the parameter's unit: the scale of its half-normal prior, or its
@@ -163,6 +163,13 @@ def deviation(
     where: str,
 ) -> InferredParameter:
     """Deviation of a group's value from the shared value, Normal(0, ``spread``), in the parameter's unit.
+
+    Args:
+        spec: the shared parameter.
+        spread: standard deviation between groups.
+        scope, members: scope of the parameter, and its recordings.
+        ends: largest absolute value.
+        where: entry of the experiment file, for errors.
 
     Raises:
         InputError: a spread that is not positive.

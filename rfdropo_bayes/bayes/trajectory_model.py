@@ -107,11 +107,11 @@ class TrajectoryModel:
 
     @cached_property
     def programs(self) -> Programs:
-        """What is compiled of it."""
+        """Compiled functions of the model."""
         return Programs(self)
 
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
-        """The parameters that the simulator is given for one recording.
+        """Parameters of the simulator for one recording.
 
         A body whose poses are measured starts at the first of them.
         """
@@ -127,7 +127,7 @@ class TrajectoryModel:
 
         Args:
             values: inferred parameters, scalars.
-            steps: simulate only this many time steps (rows beyond hold no meaning); None for all, differentiable in
+            steps: simulate only this many time steps (later rows are meaningless); None for all, differentiable in
                 reverse mode.
 
         Returns:

@@ -274,9 +274,12 @@ class Drive:
         return found
 
     def disable(self) -> bool:
-        """Bring a drive that is found powered to rest, before anything is configured; True if it was.
+        """Switch off the power of a drive before its configuration; True if it was powered.
 
-        It is commanded by SDO: process data of whoever had it last may still be configured.
+        Commands go by SDO, as process data of an earlier master may still be configured.
+
+        Raises:
+            InputError: the drive is still powered after a second.
         """
         end = time.monotonic() + 1.0
         found, previous = False, 0

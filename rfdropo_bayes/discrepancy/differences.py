@@ -135,8 +135,8 @@ def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, 
     name = specs[0].name if len(specs) == 1 else stem(specs)
     described = specs[0].description if len(specs) == 1 else f"{name.replace('_', ' ')} ({len(specs)} of them)"
     elsewhere = next(name for name in groups.names if name != group) if groups.compared else "other groups"
-    cause = f"{described}: not the same in {group} as in {elsewhere}"
-    remedy = f"measure it in {group} and in {elsewhere}, and undo what changed"
+    cause = f"{described}: differs between {group} and {elsewhere}"
+    remedy = f"measure it in {group} and in {elsewhere}, and undo the change"
     change = OwnParameter(name, tuple(specs), cause, remedy)
     return Candidate(name, tuple(places), change, name, group)
 

@@ -101,7 +101,7 @@ def _read_late(
 ) -> Float[Array, "*step channel"]:
     """Value of ``read`` by ``late`` steps earlier, not before step 0, linear between steps."""
     at = step - late
-    # Interpolating towards the past keeps the derivative right at zero delay, where only later times count.
+    # Interpolation towards the past keeps the derivative right at zero delay, at which only later times count.
     after = jnp.maximum(jnp.ceil(at), 0).astype(int)
     weight = jnp.where(at > 0, after - at, 0.0)[..., None]
     newer = read(after)
@@ -233,7 +233,7 @@ class Backlash(InCommandUnit, SteppedActuation):
         """Drag the cable's end along with the drive."""
         half, (lead, last) = values["backlash"], memory
         move = given - last
-        # Written with strict comparisons, so that without play the derivative stays that of the last move.
+        # Strict comparisons keep the derivative of the last move without play.
         ahead = lead + jnp.where(jnp.abs(move) > REST, move, 0.0)
         lead = jnp.where(ahead > half, half, jnp.where(ahead < -half, -half, ahead))
         return (lead, given), given - lead
@@ -470,7 +470,7 @@ class GuideAzimuth(MemorylessActuation):
 
 
 def _strains(cable: Cable, ends: Sequence[float], turn: float) -> Float[np.ndarray, " strain"]:
-    """How much of a cable the bending about both axes and the stretch of each segment take up, by its length."""
+    """Shortening of a cable by bending about both axes and by stretch of each segment, relative to its length."""
     azimuth, radius, found, begin = math.radians(cable.azimuth_deg) + turn, cable.guide_radius_m[-1], [], 0.0
     for end in ends:
         length = max(min(end, cable.guide_z_m[-1]) - begin, 0.0)

@@ -54,12 +54,12 @@ def _strongest(series: np.ndarray, main: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class ClassEffect:
-    """What one class of candidates would explain, row by row as in `Residuals`.
+    """Part of the residuals explained by a class of candidates, row by row as in `Residuals`.
 
     Attributes:
         names: candidates of the class, the leading one first.
         before, after: mean square of the whitened residual of the markers, without and with its linear effect.
-        markers, recordings: the same two for each marker and each group of repeats, by name.
+        markers, recordings: both mean squares of each marker and each group of repeats, by name.
     """
 
     names: tuple[str, ...]
@@ -70,7 +70,7 @@ class ClassEffect:
 
     @property
     def share(self) -> float:
-        """Share of the sum of squares that it would explain."""
+        """Explained share of the sum of squares."""
         return 1.0 - float(self.after.sum() / max(float(self.before.sum()), 1e-300))
 
 
@@ -295,7 +295,7 @@ def signal_figure(signal: Signal) -> Figure:
 
 @style.styled
 def class_figure(residuals: Residuals, effect: ClassEffect) -> Figure:
-    """What a class of candidates would explain, against time, command, direction, marker and recording."""
+    """Residuals with and without a class of candidates, against time, command, direction, marker and recording."""
     figure = Figure(figsize=(style.WIDTH, 2.2))
     every = figure.subplots(1, 5, sharey=True)
     channel = _strongest(residuals.command, residuals.main)

@@ -38,7 +38,7 @@ def render_audit(
         seen: data of its figures.
         content: content of audit.json.
         title: title of the experiment.
-        config: the experiment file as it was run.
+        config: the experiment file of the run.
         outline: outline of the robot.
     """
     return render(
@@ -124,7 +124,7 @@ def shown(answer: Answer) -> figures.Shown:
 
 
 def class_effects(answer: Answer) -> list[figures.ClassEffect]:
-    """What the leading classes of candidates would explain of the base model's residuals, whether they join or not."""
+    """Effects of the leading classes of candidates on the base model's residuals, adopted or not."""
     first, rules = answer.causes.screens[0], answer.problem.rules
     heads: list[list[ScreenRow]] = []
     for row in first.rows:

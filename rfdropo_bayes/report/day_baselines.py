@@ -1,4 +1,4 @@
-"""Predictors of a new day that know no robot: its first row, earlier days of the same commands, and these scaled."""
+"""Predictors of a new day without a model: its first row, earlier days with the same commands, and scaled copies."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def day_baselines(
     earlier: Sequence[MeasuredPath],
     openings: Mapping[str, Mapping[str, str]],
 ) -> dict[str, BaselineErrors]:
-    """Errors of what may be said of a day without a model.
+    """Errors of predictions of a day without a model.
 
     Args:
-        shown: what was looked at of the day.
-        tested: what is predicted of it.
+        shown: the known part of the day.
+        tested: the predicted part.
         earlier: fitted recordings.
-        openings: how their commands begin, see `command_openings`.
+        openings: first commands of each, see `command_openings`.
     """
     scaled = scaled_copy(shown, earlier, openings)
     predictors: dict[str, tuple[str, str, Predictor]] = {
-        "first_row": ("first row of the day held", "the first pose that was shown of the day, for ever", _held(shown)),
+        "first_row": ("first row of the day held", "the first known pose of the day, held constant", _held(shown)),
         "copied": (
             "earlier days copied",
             "mean of the fitted recordings of the same commands at the same time",
@@ -37,7 +37,7 @@ def day_baselines(
         ),
         "scaled_copy": (
             "earlier days copied and scaled",
-            "the same copy, with one scale and one shift for each marker as what was shown of the day has them",
+            "the same copy, with a scale and a shift of each marker fitted to the known part of the day",
             scaled,
         ),
     }
@@ -59,7 +59,7 @@ def copied(
     """The mean of earlier recordings of the same commands, at the same time.
 
     Raises:
-        InputError: none has the same commands, or a marker was never seen in them.
+        InputError: no recording has the same commands, or none of these shows a marker.
     """
     own = command_openings(recording)
     alike = [path for path in earlier if same_opening(own, openings.get(path.name, {}))]
@@ -82,7 +82,7 @@ def copied(
 def scaled_copy(
     shown: Trajectory, earlier: Sequence[MeasuredPath], openings: Mapping[str, Mapping[str, str]]
 ) -> Predictor:
-    """`copied`, with the scale and the shift of each marker that fit best to what was shown."""
+    """`copied`, with a scale and a shift of each marker by least squares on the known part of the day."""
 
     def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
         copy, found = copied(shown, earlier, openings), copied(recording, earlier, openings)

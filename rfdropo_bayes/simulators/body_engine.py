@@ -190,7 +190,7 @@ class Engine:
 
     @property
     def lanes(self) -> int:
-        """How many rollouts it likes to be given at once."""
+        """Preferred number of rollouts per call."""
         if self.backend.name == "jax":
             return 64
         return 512 if self.is_rod else 64
@@ -217,7 +217,7 @@ class Engine:
         cube: CubeInputs | None = None,
         loads: BodySignals | None = None,
     ) -> Motion:
-        """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning. At rest a
+        """Roll out from the initial state; ``steps`` limits the steps computed; later rows are meaningless. At rest a
         step is an equilibrium.
 
         Derivatives of the compiled backend are differences along each tangent.

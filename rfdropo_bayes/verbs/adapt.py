@@ -1,4 +1,4 @@
-"""Another day: one short recording moves what a day changes, and the body stays: ``adapt``, and ``rfdropo adapt``."""
+"""Adaptation to another session by one short recording, with a fixed body: ``adapt``, and ``rfdropo adapt``."""
 
 from __future__ import annotations
 
@@ -63,46 +63,47 @@ from rfdropo_bayes.verbs.predict import fitted_scopes, model_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
 DRAWS = 100
-MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
+MUCH_WORSE = 2.0**0.5  # above this, more than half of the squared error exceeds the residuals of the fitted sessions
 
 
 def adapt(
     fit: Calibration,
-    recording: Trajectory,
+    recording: Trajectory | RecordingEntry,
     *,
     seconds: float | None = None,
     group: str | None = None,
     test: Sequence[Trajectory] = (),
     draws: int = DRAWS,
-    seed: int = 0,
+    seed: int | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
-    """Move what a day changes to one short recording of it; the body keeps its posterior.
+    """Fit the parameters of a new session to one short recording; the body keeps its posterior.
 
-    What moves are the deviations of the parameters in [model.per_group], and those in [model.per_recording]. A
-    parameter may be put into [model.per_group] now that was shared in the fit. The noise is what the fitted recordings
-    showed the model to leave, for as long as it lasted.
+    The fitted parameters are deviations of [model.per_group] and parameters of [model.per_recording]. A parameter that
+    was shared in the fit may be added to [model.per_group]. The noise has the size and the correlation time of the
+    residuals of the fitted recordings.
 
     Args:
         fit: a calibration, with its model.
-        recording: of the new day.
-        seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
-            rest is predicted.
-        group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
-        test: other recordings of the day, of which nothing but the first row is looked at; the report says how well
-            they are predicted.
-        draws: of the posterior.
-        seed: of all that is random.
-        out: folder that gets what a calibration writes; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
+        recording: a recording of the new session, or its entry in [data].
+        seconds: length of the beginning that is used; all by default. The report then shows the prediction of the rest.
+        group: name of the session; by default the recording's group in [model.groups], or else its name.
+        test: other recordings of the session, of which only the first row is used; the report scores their predictions.
+        draws: number of posterior draws.
+        seed: seed of all random numbers; by default from the model's experiment.
+        out: folder for the files of a calibration; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
         show: whether to show progress, see `Progress`.
 
     Raises:
-        InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
+        InputError: no parameter varies between sessions, or the fit has no residuals.
     """
-    model = model_of(given_fit(fit, "adapt"))
+    fit = given_fit(fit, "adapt")
+    if isinstance(recording, RecordingEntry):
+        fit, recording = _recorded(fit, recording)
+    model = model_of(fit)
     recording, test = given_recording(recording, "adapt"), given_recordings(test, "adapt, test")
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.spec.groups) if group is None else group
@@ -115,7 +116,7 @@ def adapt(
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
     asked = Day(fit, moved, scopes, own, head, tested, "" if rest is None else rest.name, day, left)
-    run = partial(_adapt, asked, draws, seed, show)
+    run = partial(_adapt, asked, draws, model.settings.seed if seed is None else seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -126,15 +127,15 @@ def adapt(
 
 
 class Day(NamedTuple):
-    """A day that a calibration is adapted to.
+    """A session to which a calibration is adapted.
 
     Attributes:
-        fit: the calibration; model: that of the adapted run.
-        scopes: parameters of the body, the day and its recordings; own: those of the day.
-        head: the recording, as far as it is looked at; tested: what is predicted.
-        rest: name of what is left of the recording, among those; empty without.
-        name: of the day.
-        left: what the model leaves of the recordings that were fitted.
+        fit: the calibration; model: model of the adapted run.
+        scopes: parameters of the body, the session and its recordings; own: parameters of the session.
+        head: the used part of the recording; tested: predicted recordings.
+        rest: name of the unused part of the recording among ``tested``; empty without it.
+        name: name of the session.
+        left: residuals of the model on the fitted recordings.
     """
 
     fit: Calibration
@@ -193,22 +194,22 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
 
 
 def _without_a_model(asked: Day) -> dict[str, BaselineErrors]:
-    """What the day's first row and copies of the fitted recordings say of it."""
+    """Errors of predictions from the first row and from copies of the fitted recordings."""
     record = asked.fit.record
     earlier = [MeasuredPath.of_prediction(each) for each in record.recordings if each.split == "fit"]
     return day_baselines(asked.head, asked.tested, earlier, record.attrs.get(OPENINGS, {}))
 
 
 class Adapted(NamedTuple):
-    """A day as it was fitted.
+    """A fitted session.
 
     Attributes:
-        found: draws of body and day; body: those of the body before.
-        problem: of the recording, under the noise that was found.
-        predictions: of the recording, and of what was not looked at.
-        cautions: what speaks against them.
-        rollouts: that it took.
-        slow: the error left on the day where it goes beyond what was shown.
+        found: draws of body and session; body: earlier draws of the body.
+        problem: problem of the recording, with the fitted noise.
+        predictions: predictions of the recording and of the unused data.
+        cautions: reasons to doubt them.
+        rollouts: number of rollouts.
+        slow: remaining error of the session for motion beyond the used recording.
     """
 
     found: DayFit
@@ -221,7 +222,7 @@ class Adapted(NamedTuple):
 
 
 def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
-    """Fit the day to as much of the recording as is looked at, and predict the rest."""
+    """Fit the session to the used part of the recording, and predict the rest."""
     fit, _, scopes, own, head, _, _, day, left = asked
     simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
@@ -265,7 +266,7 @@ def _named(recordings: Sequence[Trajectory]) -> str:
 
 
 def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayError | None:
-    """The slow error of the day, where markers go farther than they did in the recording that was shown."""
+    """The slow error of the session, for markers that move farther than in the used recording."""
     slow = recorded_day_error(record)
     if slow is None:
         return None
@@ -274,7 +275,7 @@ def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayErr
 
 
 def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPrediction]:
-    """What the fit says of the recordings that are tested from their commands and first rows alone."""
+    """Predictions of the tested recordings by the original fit, from their commands and first rows alone."""
     record, model, names = asked.fit.record, model_of(asked.fit), [run.name for run in asked.tested]
     if not names:
         return []
@@ -296,7 +297,7 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
 
 
 def _first_row(head: Trajectory) -> Trajectory:
-    """Two rows, the fewest that a recording has, of which the first alone counts where it was measured."""
+    """Two rows, the fewest that a recording has, of which only the measured first row counts."""
     rows = head.slice_rows(0, 1).with_attributes(name=head.name)
     mask = rows.position_mask.copy()
     mask[1] &= not mask[0].any()
@@ -304,7 +305,7 @@ def _first_row(head: Trajectory) -> Trajectory:
 
 
 def _with_first_row(rest: Trajectory, head: Trajectory) -> Trajectory:
-    """The rest of a recording with the first row of what was looked at."""
+    """The unused part of a recording with the first row of the used part."""
     mask = rest.position_mask.copy()
     mask[0] = head.position_mask[0]
     return _masked(rest, mask)
@@ -333,53 +334,36 @@ def _own_of_day(fit: PosteriorRecord, scopes: Scopes, recording: str, day: str) 
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
-            remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
+            remedy=(
+                "name the parameters that do, e.g. --set model.per_group.initial_displacement=0.002, and a new --group"
+            ),
         )
     return own
 
 
-def run_adaptation(
-    run: Path,
-    model: Model,
-    entry: RecordingEntry,
-    out: Path,
-    *,
-    seconds: float | None = None,
-    group: str | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
-    show: bool | None = None,
-) -> Calibration:
-    """`adapt` a run's folder to a recording in the format of its experiment; lost markers are left out.
-
-    Args:
-        run: folder of a calibration, or of an earlier adaptation.
-        model: that was fitted, with the [data] of its experiment, see `fitted_model`.
-        entry: names the file of observations, that of the commands where the format has one, and the episode.
-        out, seconds, group, seed, overwrite, show: see `adapt`.
+def _recorded(fit: Calibration, entry: RecordingEntry) -> tuple[Calibration, Trajectory]:
+    """The recording of a file in the format of the fit's experiment, without lost markers, and the fit with it as data.
 
     Raises:
-        InputError: bad input.
+        InputError: an experiment without [data], or several recordings.
     """
+    model = model_of(fit)
     read = model.settings
     if read.data is None:
         where = model.name if model.file is None else str(model.file.path)
-        raise InputError("the experiment has no [data]", where=where, remedy="say in which format recordings are")
-    found = load_recordings(_alone(read.data, entry), model.folder)
+        raise InputError("the experiment has no [data]", where=where, remedy="name the format of the recordings")
+    data = _alone(read.data, entry)
+    found = load_recordings(data, model.folder)
     if len(found) > 1:
         raise one_at_a_time(read.data, entry.observations, len(found), "adapt to")
-    fit = Calibration.of_posterior(run, model)
-    fit = replace(fit, model=Model.of(model.spec, replace(read, data=_alone(read.data, entry))))
-    chosen = read.seed if seed is None else seed
-    options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
-    return adapt(fit, found[0], out=out, **options)
+    return replace(fit, model=Model.of(model.spec, replace(read, data=data))), found[0]
 
 
 def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
     """The model of a run's folder.
 
     Raises:
-        InputError: no file says which model.
+        InputError: no file describes the model.
     """
     if not (run / CONFIG).is_file():
         raise InputError(f"holds no {CONFIG}", where=str(run), remedy="name the folder of a calibration")
@@ -387,7 +371,7 @@ def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
 
 
 def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:
-    """The first seconds, and the whole recording with their measurements taken out; None where none is left.
+    """The first seconds, and the whole recording without their measurements; None if nothing is left.
 
     Raises:
         InputError: less than two rows.
@@ -409,7 +393,7 @@ def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, T
 
 
 def model_error_of(record: PosteriorRecord) -> ModelError:
-    """What the fit's model leaves: as the fit says, or as its predictions of the fitted recordings show.
+    """Residuals of the fit's model, from its file or from its predictions of the fitted recordings.
 
     Raises:
         InputError: it holds neither.
@@ -417,7 +401,7 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
     found = recorded_model_error(record)
     if found is None:
         raise InputError(
-            "the posterior does not say what its model leaves of the fitted recordings",
+            "the posterior has no residuals of the fitted recordings",
             where=POSTERIOR,
             remedy="calibrate again: it was written by an earlier version",
         )
@@ -439,7 +423,7 @@ def _alone(data: DataSpec, entry: RecordingEntry) -> DataSpec:
 
 
 def day_scopes(fit: Calibration, model: Model, recordings: Sequence[str], day: str) -> Scopes:
-    """The body's parameters without the noise of the fit, and those of a day, whether they have draws or not."""
+    """The body's parameters without the noise of the fit, and the parameters of a session, with or without draws."""
     noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
     pooled = pooling(model.spec, model.simulator.parameters, recordings)
     found = fitted_scopes(fit).of_day(day, recordings, fit.record.attrs[FITTED], pooled)
@@ -483,8 +467,9 @@ def _cautions(found: DayFit) -> list[Caution]:
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence, grave=found.unconverged > len(found.chosen) // 2))
     if found.power < 1.0:
         sentence = (
-            f"few of the body's draws explain the recording: their evidences were raised to the power "
-            f"{found.power:.2g}, so that a tenth of the draws is left; the model lacks what this day shows"
+            "few of the body's draws explain the recording: their evidences were raised to the power "
+            f"{found.power:.2g}, so that a tenth of the draws is left; the model lacks an effect of this "
+            "session"
         )
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
     return cautions
@@ -493,7 +478,7 @@ def _cautions(found: DayFit) -> list[Caution]:
 def _record(
     asked: Day, adapted: Adapted, result: InferenceResult, prior: Mapping[str, np.ndarray], seed: int
 ) -> PosteriorRecord:
-    """The draws, with what predictions of further recordings need."""
+    """The draws, with the data needed to predict further recordings."""
     problem, attrs = adapted.problem, asked.fit.record.attrs
     recordings, noise = problem.model.recordings, problem.model.markers.known
     elsewhere, drawn = _of_other_groups(asked, len(adapted.found.chosen))
@@ -513,7 +498,8 @@ def _record(
 
 def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:
     """Parameters that other groups and recordings have of their own, and their values under each draw of the body
-    before: the folder of a day predicts recordings of the other days, too."""
+    before: the folder of a session also predicts recordings of other sessions.
+    """
     known = asked.scopes.names
     others = [p for p in fitted_scopes(asked.fit).parameters if p.scope.owner and p.name not in known]
     return others, thin({p.name: asked.fit.record.posterior[p.name] for p in others}, draws) if others else {}
@@ -522,7 +508,7 @@ def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], B
 def _checks(
     before: Sequence[RecordingPrediction], after: Sequence[RecordingPrediction]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """How well recordings that were not looked at are predicted before and after, by recording."""
+    """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
         p.name: {
@@ -547,7 +533,7 @@ def _fared(prediction: RecordingPrediction) -> dict[str, float]:
 
 
 def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    """Before and after an adaptation in the same words, of each recording that it did not look at."""
+    """Sentence on each unused recording: its prediction error before and after the adaptation."""
     found = []
     for name, check in checks.items():
         words = [
@@ -560,7 +546,8 @@ def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
 def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
     before, after = check["from_first_row"]["error_mm"], check["adapted"]["error_mm"]
     sentence = (
-        f"what was shown of the day makes the rest of the recording worse: {after:.3g} mm off, from the first row "
-        f"alone {before:.3g} mm; the day has what its first row says of it, and the rest has served to see that"
+        f"the session's data worsen the prediction of the rest of the recording: {after:.3g} mm, but "
+        f"{before:.3g} mm from the first row alone; the result therefore uses the first row alone, a "
+        "choice made on the rest"
     )
     return Caution(Code.DAY_UNMATCHED, sentence)

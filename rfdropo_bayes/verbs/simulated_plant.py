@@ -73,6 +73,9 @@ def true_simulator(
     Args:
         robot, experiment, changes: see `trunk`.
         base: instead of the experiment's robot.
+
+    Raises:
+        InputError: channels, markers or the unit of commands differ from the robot's.
     """
     overrides = [f"{name}={tomli_w.dumps({'x': value})[4:].strip()}" for name, value in changes.items()]
     if experiment:

@@ -85,7 +85,7 @@ def test_an_effect_too_small_to_say_how_much_it_explains_is_named_and_not_belitt
     assert content["findings"][0]["mechanism"] == "play"
     assert content["gain"]["explained_fraction"] < 0.2  # by chance: the interval goes from 0 to 100 %
     assert content["verdict"] == "unexplained"
-    assert "do not say how much of the discrepancy" in content["sentence"]
+    assert "do not determine the explained share of the discrepancy" in content["sentence"]
 
 
 def test_effects_that_look_the_same_are_one_class():
@@ -599,7 +599,7 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     assert [step.name for step in answer.causes.steps] == ["play"]
     assert [step.name for step in answer.adopted] == ["play"]
     assert content["unsupported"][0] in ("delay", "lag")
-    assert "unseen ones do not support: not adopted" in content["sentence"]
+    assert "unseen recordings do not support: not adopted" in content["sentence"]
     assert len(content["omnibus"]) == 2
     assert content["gain"]["rmse_extended_mm"] < content["gain"]["rmse_base_mm"]
 

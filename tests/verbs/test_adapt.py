@@ -18,6 +18,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
 from rfdropo_bayes.data import RecordingEntry
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.posteriors import SHARED, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
@@ -303,7 +304,7 @@ def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros, ca
     ]
     check = found.content["details"]["checks"]["b"]
     assert check["adapted"]["error_mm"] < check["from_first_row"]["error_mm"] + 1e3 * SIGMA
-    assert [c for c in found.cautions if "makes the rest of the recording worse" in c.sentence]
+    assert [c for c in found.cautions if "worsen the prediction of the rest of the recording" in c.sentence]
     (sentence,) = found.content["details"]["compared"]
     assert sentence.startswith("b, as far as it was not shown: from the first row ")
     assert "mm off, its 90 % bands held" in sentence
@@ -345,9 +346,10 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
 
     monkeypatch.setattr(adaptation, "load_recordings", read)
     (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
-    entry = RecordingEntry(observations="b.nc")
+    record = replace(known.record, attrs={**known.record.attrs, INTEGRATOR: "sdirk2"})
+    fit = rb.Calibration(record, {}, "", adaptation.fitted_model(tmp_path), tmp_path)
     with pytest.raises(rb.InputError, match="read"):
-        adaptation.run_adaptation(tmp_path, adaptation.fitted_model(tmp_path), entry, tmp_path / "out")
+        rb.adapt(fit, RecordingEntry(observations="b.nc"), out=tmp_path / "out")
     assert asked["missing"] == "mask"
 
 
@@ -435,7 +437,7 @@ def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
     with pytest.raises(rb.InputError, match="nothing of the model differs between days"):
         rb.adapt(replace(same, record=replace(record, parameters=shared, posterior=draws)), run, show=False)
     silent = {**record.attrs, MODEL_ERROR: None}
-    with pytest.raises(rb.InputError, match="does not say what its model leaves"):
+    with pytest.raises(rb.InputError, match="has no residuals of the fitted recordings"):
         rb.adapt(replace(known, record=replace(record, attrs=silent)), run, show=False)
 
 

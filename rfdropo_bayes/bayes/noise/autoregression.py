@@ -2,7 +2,7 @@
 
 Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
 predicted from the min(k, p) rows before it (Levinson-Durbin). Noise shared by columns, such as from a shaking mount,
-has the same memory as the rest (a separable covariance); across a gap in some of the columns alone its whitening is
+has the memory of the other columns (a separable covariance); across a gap in some of the columns alone its whitening is
 approximate.
 
 Memory is defined in seconds, not in rows: in recordings of another rate each row is predicted under the autocorrelation
@@ -71,7 +71,7 @@ class Autoregression:
 
     @property
     def unpredicted(self) -> Autoregression:
-        """White noise of the size of what the rows before do not predict."""
+        """White noise with the size of the innovations."""
         scale = self.scale * float(self.predictors[1][-1])
         return replace(self, scale=scale, autocorrelation=np.ones(1), source=INNOVATIONS, correlation=None)
 
@@ -117,7 +117,7 @@ class Autoregression:
             given["source"],
             np.inf if freedom is None else freedom,
             None if across is None else np.array(across),
-            given.get("step"),  # earlier versions do not say
+            given.get("step"),  # missing in earlier versions
         )
 
     @cached_property

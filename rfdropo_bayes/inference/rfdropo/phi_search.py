@@ -345,6 +345,9 @@ def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: 
         sigma: initial step, as a share of the box.
         population: candidates per generation.
         seed: seed of its random numbers.
+
+    Raises:
+        InputError: an unknown name.
     """
     if name == "cma":
         return CovarianceAdaptation(d, high, sigma * high, population, seed)

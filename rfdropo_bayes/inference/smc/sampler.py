@@ -122,7 +122,7 @@ class ReplicatePlan(NamedTuple):
 
 
 class SmcState(NamedTuple):
-    """Everything a replicate needs to go on.
+    """State of a replicate between two stages.
 
     Attributes:
         population: particles; their rows reach to the end of the present block.
@@ -182,9 +182,12 @@ def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
 
 
 def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan, config: SmcConfig) -> SmcState:
-    """Prior draws, no rollouts yet.
+    """Prior draws, before any rollout.
 
-    Draws that their coordinates cannot hold keep their share of the prior, without weight.
+    Draws outside the range of their coordinates keep their share of the prior, with weight zero.
+
+    Raises:
+        InputError: no draw has a finite prior density.
     """
     n = plan.particles
     u, base, drawn = representable_draws(problem, key, n)
