@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rfdropo_bayes.errors import InputError
 
-# The rollout of a value and those of a central difference call out of a program at once; one thread is left to copy.
+# The rollouts of a value and of a central difference are simultaneous callbacks; one thread is left to copy.
 CALLBACK_THREADS = 4
 
 

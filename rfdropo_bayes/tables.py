@@ -74,8 +74,8 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
         message = first["msg"].removeprefix("Value error, ")
         # A whole table or list would fill the screen; its name says enough.
         given = f" = {first['input']!r}" if isinstance(first["input"], str | int | float | bool) else ""
-        # What a whole file says wrong has no key, and its message says what to mend.
-        what, remedy = (f"{'.'.join(path)}{given}: {message}", "mend the value") if path else (message, "")
+        # An error of the whole file has no key, and its message has the remedy.
+        what, remedy = (f"{'.'.join(path)}{given}: {message}", "correct the value") if path else (message, "")
         raise InputError(what, where=where, remedy=remedy) from None
 
 

@@ -150,8 +150,8 @@ def test_links_of_reports_lead_to_files_and_headings(page: Path) -> None:
 
 
 def test_what_contributing_points_to_is_there() -> None:
-    """Modules in the second column of "Where things are", tests in the last; a bare name is beside the last."""
-    lines = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Where things are")[1].splitlines()
+    """Modules in the second column of "Code map", tests in the last; a bare name is beside the last."""
+    lines = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Code map")[1].splitlines()
     rows = [line.split("|")[1:-1] for line in lines if line.startswith("| ")]
     missing = []
     for row in rows:

@@ -239,7 +239,7 @@ def _through(table: dict[str, Any], transform: transforms.Transform, where: str)
     if not isinstance(transform, transforms.AffineTransform):
         return None
     shift, factor = _plain(transform.loc, "loc", where), _plain(transform.scale, "scale", where)
-    if family.startswith("Log"):  # what is shifted is log-normal no more
+    if family.startswith("Log"):  # a shifted variable is not log-normal
         sized: dict[str, float] = {name: factor * table[name] for name in ("median", "low", "high") if name in table}
         return {**table, **sized} if shift == 0.0 and factor > 0.0 else None
     if family == "HalfNormal":

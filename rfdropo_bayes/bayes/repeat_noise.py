@@ -17,9 +17,9 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 
-CLOCKS_AGREE = 0.1  # of a sample time: what the clocks of repeats may differ by
+CLOCKS_AGREE = 0.1  # of a sample time: largest difference of the clocks of repeats
 SURE = 1e-4  # p-value under the noise within recordings, below which shifts are there
-LEAST = 0.5  # of the noise's standard deviation: what is smaller changes no conclusion
+LEAST = 0.5  # of the noise's standard deviation: smaller differences change no conclusion
 ROWS = 10  # fewer tell no constant from slow noise
 
 Groups = tuple[tuple[int, ...], ...]
@@ -94,7 +94,7 @@ def deviations(
             own = own & (own.sum(axis=0) > 1)
             parts.append(np.where(own, errors[list(group)] - mean, 0.0))
             counted.append(own)
-            freedom += own.sum() - own.any(axis=0).sum()  # a mean for each row and column, of those that are there
+            freedom += own.sum() - own.any(axis=0).sum()  # a mean for each row and column that has values
             values += int(own.sum())
     return np.concatenate(parts), np.concatenate(counted), freedom / max(values, 1)
 

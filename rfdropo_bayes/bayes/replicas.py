@@ -24,7 +24,7 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
         return None
     single = jax.tree.map(lambda field: jnp.asarray(field[0]), observed)
     seen = problem.model.seen(single, {name: jnp.asarray(truth[name]) for name in problem.names})
-    first, second, third = jax.random.split(key, 3)  # the data sets of a seed are those of earlier versions
+    first, second, third = jax.random.split(key, 3)  # the order fixes the data sets of a seed
     keys = {"markers": jax.random.split(first, 1)[0], "tension": second, "weighed": third}
     keys |= {"motor_angle": jax.random.fold_in(key, 3), "object_pose": jax.random.fold_in(key, 4)}
     keys |= {"orientation": jax.random.fold_in(key, 5)}

@@ -56,7 +56,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
     for sentence in summary["headline"]:
         style = COLOURS[found.verdict] if sentence == found.sentence else ""
         console.print(Text(sentence, style=style), soft_wrap=True)
-    moved = summary["details"].get("moved", [])  # by an adaptation: what the reader looks for
+    moved = summary["details"].get("moved", [])  # by an adaptation: its main result
     rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
     rows.sort(key=lambda row: row[0] not in moved)
     console.print(_parameters(rows[:MOST_ROWS]))

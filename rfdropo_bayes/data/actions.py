@@ -12,7 +12,7 @@ from rfdropo_bayes.errors import InputError
 CABLES = 8
 CABLE_NAMES = tuple(f"cable{index}" for index in range(CABLES))
 DISPLACEMENT = 5e-3  # [m] per action, nominal
-INITIAL = -1  # recorded in the row of the initial state, where no action has been taken yet
+INITIAL = -1  # in the row of the initial state, before the first action
 SETTINGS = {"displacement_per_action": DISPLACEMENT, "updates_per_action": 5, "displacement_per_update": 1e-3}
 
 

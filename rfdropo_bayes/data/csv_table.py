@@ -139,7 +139,7 @@ class CsvTable:
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
         bare = [lines[0].removeprefix("#"), *lines[1:]]
-        if dialect_of(bare).separator == " ":  # NumPy marks the names so where it separates by spaces
+        if dialect_of(bare).separator == " ":  # NumPy marks the names this way if it separates by spaces
             lines = bare
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal

@@ -30,13 +30,13 @@ from rfdropo_bayes.data.identities import Change, changed_names
 from rfdropo_bayes.data.sample_times import check_times, clock_notes, evened
 from rfdropo_bayes.errors import InputError
 
-NOTES = "notes"  # among the settings of a recording: what is allowed of it, and perhaps not meant
+NOTES = "notes"  # key of a recording's settings: valid but suspicious facts
 
 TOLERANCE = 1.5e-3  # [m]
-MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, in excess of what the neighbouring rows show
+MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, beyond the acceleration of the neighbouring rows
 LONGEST_RUN = 0.25  # [s]
-MOST_ROWS = 250  # of a run: as many as the longest has at 1 kHz; motion capture is not faster, and memory grows with it
-FAR = 10e-3  # [m] from a zero to where the marker is before and after
+MOST_ROWS = 250  # of a run: the longest run at 1 kHz; motion capture is not faster, and memory grows with it
+FAR = 10e-3  # [m] from a zero to the marker before and after
 FAR_STEPS = 3.0  # the same in steps of a fast row
 _VELOCITY_ROWS = 5
 _DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
@@ -182,8 +182,7 @@ def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[
     if not changes or not renamed.any():
         return []
     shown = "; ".join(
-        f"row {change.row}, where {' and '.join(names[m] for m in sorted(change.taken_by))} change names"
-        for change in changes[:3]
+        f"row {change.row}: {' and '.join(names[m] for m in sorted(change.taken_by))}" for change in changes[:3]
     ) + ("; ..." if len(changes) > 3 else "")
     return [
         f"markers change names in {shown}: {int(renamed.sum())} positions under other names than in row 0 are left "

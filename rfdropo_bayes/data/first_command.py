@@ -136,7 +136,7 @@ def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
     position = trajectory.position[rows][:, mask.mean(axis=0) > 0.5].reshape(len(rows), -1)
     time = time[rows]
     if not _changes(trajectory) and not _sets_out(position):
-        return None  # a motion that dies away under one command may have begun anywhere
+        return None  # a decaying motion under a single command may have begun anywhere
     scale = np.abs(trajectory.command).max()
     best: dict[str, tuple[float, float, np.ndarray]] = {}
     for lag in LAGS:

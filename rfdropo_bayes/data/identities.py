@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
 
-APART = 5e-3  # [m]: markers that are nearer to each other are not told apart
+APART = 5e-3  # [m]: nearer markers are not distinguishable
 NEARER = 0.25  # share of the distance from itself within which the other marker was expected
 
 

@@ -126,7 +126,7 @@ def read_mapped(
     if format == rosbag.FORMAT and source is None:
         source, clock = rosbag.read_commands(path, columns), rosbag.clock_of(columns)
         columns = changed(columns, where=str(path), command_time=clock, command_time_unit="s")
-        if columns.time is None:  # rows are numbered from the first one on, and so are the times of commands
+        if columns.time is None:  # rows are numbered from 0, and so are the times of commands
             source.frame[clock] -= table.frame[clock].iloc[0]
     if format == motive_csv.FORMAT and source is None:
         raise InputError(

@@ -34,11 +34,11 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "deg": ("rad", np.pi / 180.0),
     "N": ("N", 1.0),
     "N m": ("N m", 1.0),
-    "-": ("-", 1.0),
+    **dict.fromkeys(("-", "V", "A", "%"), ("-", 1.0)),
 }
 COUNTS = "counts"
 """Encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "-"]
+CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "V", "A", "%", "-"]
 
 
 ROWS = "rows"
@@ -218,7 +218,7 @@ class CsvColumns(BaseModel):
         ):
             if names is not None and len(names) != count:
                 what = "marker in positions" if key == "markers" else "channel in commands"
-                raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
+                raise ValueError(f"{key} has {len(names)} entries instead of {count}, one for each {what}")
         if len(self.orientations or ()) != len(self.sections or ()):
             raise ValueError("give one name in sections for each of orientations")
         for turn in self.orientations or ():

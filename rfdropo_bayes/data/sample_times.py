@@ -20,14 +20,14 @@ _NANOSECONDS = 1e9
 _DECIMAL_COMMA = r"(?<=:\d\d),(?=\d)"  # of seconds, as loggers of Python write them
 
 SHORT = 0.1  # share of the local interval below which a row came in one delivery with the row before
-BUNCHED = 0.1  # share of such rows from which on stamps are those of deliveries
+BUNCHED = 0.1  # share of such rows above which stamps are of arrival
 LONGEST_WINDOW, SHORTEST_WINDOW = 100, 8  # rows that a local interval is a mean of: several deliveries
-JUMP = 10.0  # intervals: a longer one is a jump of the clock, or lost rows
+JUMP = 10.0  # intervals: a longer interval is a jump of the clock, or lost rows
 COARSE = 0.1  # share of repeated stamps from which on the clock is coarser than the rows
-ONE_RATE = 1.1  # times between rows that differ by less are those of one rate: clocks jitter
+ONE_RATE = 1.1  # times between rows that differ by less are of the same rate: clocks jitter
 GRAIN = 0.02  # of the usual interval: stamps of single precision that are coarser are said
-ON_GRID = 0.2  # of the grain: stamps are as near to single precision where text has rounded them
-SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: what follows a moving robot lies between
+ON_GRID = 0.2  # of the grain: largest distance of rounded stamps from single precision
+SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: range of recordings of a moving robot
 SET_BACK = 0.01  # share of rows out of order up to which the clock was set back; else rows are not sorted
 
 
@@ -245,7 +245,7 @@ def clock_notes(time: Float[np.ndarray, " rows"]) -> list[str]:
             f"rows are {usual:.4g} s apart, from row 0 on: if this is wrong, correct time_unit under "
             f"[data.columns] ({', '.join(PER_SECOND)})"
         )
-    long = float(np.quantile(np.delete(gaps, short - 1), 0.95))  # between deliveries, where there are any
+    long = float(np.quantile(np.delete(gaps, short - 1), 0.95))  # between deliveries, if there are any
     jumps = np.flatnonzero(gaps > JUMP * max(usual, long)) + 1
     for row in jumps[:1]:
         more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""

@@ -24,7 +24,7 @@ class BusTable(BaseModel):
 
     Attributes:
         interface: "hub", or any interface of python-can ("socketcan" on a robot).
-        channel: as the interface wants it; HOST:PORT or a path for the hub.
+        channel: channel of the interface; HOST:PORT or a path for the hub.
         bitrate: bit rate [bit/s], if the interface sets it.
         options: further arguments of the interface.
     """
@@ -50,7 +50,7 @@ def open_bus(table: BusTable) -> can.BusABC:
         options["hop_limit"] = 0
     try:
         return can.Bus(interface=table.interface, channel=table.channel, **(options | table.options))
-    except Exception as error:  # each interface raises what its driver raises
+    except Exception as error:  # each interface passes on the exceptions of its driver
         raise InputError(
             f"cannot be opened ({type(error).__name__}: {error})",
             where=f"bus {table.interface} {table.channel}",

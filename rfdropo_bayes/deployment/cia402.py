@@ -175,7 +175,7 @@ def controlword_towards(state: DriveState, target: DriveState, previous: int) ->
     decision of its own (transition 16). A fault is reset only on the way to another state than FAULT.
 
     Args:
-        state: that the drive reports.
+        state: state that the drive reports.
         target: SWITCH_ON_DISABLED, READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED or QUICK_STOP_ACTIVE.
         previous: controlword sent last; the fault reset bit is cleared after each use, so that it can rise again.
 
@@ -193,7 +193,7 @@ def controlword_towards(state: DriveState, target: DriveState, previous: int) ->
     if target is DriveState.QUICK_STOP_ACTIVE:
         return int(
             Controlword.QUICK_STOP
-        )  # from lower states it leads to SWITCH ON DISABLED, where nothing moves either
+        )  # from lower states it leads to SWITCH ON DISABLED, in which nothing moves either
     if state is DriveState.QUICK_STOP_ACTIVE or target is DriveState.SWITCH_ON_DISABLED:
         return int(Controlword.DISABLE_VOLTAGE)
     if _RANK[state] < _RANK[target]:

@@ -25,7 +25,7 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
     """Measure and ask; nothing is written to any drive.
 
     Args:
-        bus: to look for drives on; None leaves that out.
+        bus: bus to search for drives; None skips the search.
         rate_hz: rate of the loop whose jitter is measured.
         seconds: length of each idle run.
         idle_runs: number of idle runs.
@@ -99,7 +99,7 @@ def scan(bus: BusTable, patience: float = 0.5) -> dict[str, dict[str, int]]:
             network.subscribe(0x580 + node, take)
         for node in range(1, 128):
             _ask(network, node, objects.Object.DEVICE_TYPE, 0)
-            time.sleep(0.002)  # a bus of 125 kbit/s carries so many
+            time.sleep(0.002)  # a bus of 125 kbit/s carries this rate
         time.sleep(patience)
         nodes = sorted(node for node, index, _ in answers if index == objects.Object.DEVICE_TYPE)
         for node in nodes:

@@ -32,8 +32,8 @@ from rfdropo_bayes.robots import Robot
 JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
 FORMAT = "drive-session"
 SCHEMA_VERSION = 3
-_WRITE = 0.02  # [s]: how often what is waiting is written
-_SYNC = 1.0  # [s]: how often the disk is told to keep what it has
+_WRITE = 0.02  # [s]: time between writes
+_SYNC = 1.0  # [s]: time between syncs of the disk
 _HEADER = 4096  # [bytes]
 
 
@@ -57,9 +57,9 @@ def record_type(channels: int, markers: int) -> np.dtype[np.void]:
             ("controlword", "<u2", (channels,)),
             ("position", "<f8", (markers, 3)),
             ("seen", "?", (markers,)),
-            ("object_pose", "<f8", (POSE,)),  # centre in m, quaternion x, y, z, w; where the object was last seen
+            ("object_pose", "<f8", (POSE,)),  # centre in m, quaternion x, y, z, w; last seen pose
             ("object_seen", "?"),  # anew
-            ("seen_at", "<f8"),  # when markers and object were where this cycle saw them
+            ("seen_at", "<f8"),  # exposure time of the markers and the object in this cycle
         ]
     )
 
@@ -68,8 +68,8 @@ class SessionLog:
     """Writes a session's folder while it runs.
 
     Args:
-        folder: to write to; it must not hold a session yet.
-        robot: that is driven.
+        folder: folder to write to; it must not hold a session yet.
+        robot: robot to drive.
         facts: about the session, kept in the recording's settings.
         frames: name of the file of CAN frames; its ending chooses the format.
 

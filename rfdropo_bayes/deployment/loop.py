@@ -27,7 +27,7 @@ from rfdropo_bayes.deployment.watch import AfterStop, Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
-_AWAY = 1e-4  # [m]: a braked drive so far from the command in force holds another one
+_AWAY = 1e-4  # [m]: a braked drive farther than this from its command holds another command
 _ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep
 
 
@@ -127,7 +127,7 @@ class ControlLoop:
             if state is DriveState.OPERATION_ENABLED:
                 drive.target = drive.motor.counts(length, drive.offset)
             elif drive.reading is not None:
-                drive.target = drive.reading.position  # a drive must find itself where it is when it is enabled
+                drive.target = drive.reading.position  # a drive must find its own position as target when it is enabled
         try:
             self.drives.exchange(_ANSWER * self.period, meanwhile)
         except can.CanError as error:
@@ -135,7 +135,7 @@ class ControlLoop:
         try:
             self.markers.update(self.pulse)
             if phase is not Phase.BRAKED:
-                if self.demanded is not None:  # what follows from a stop by another thread is not its cause
+                if self.demanded is not None:  # consequences of a stop by another thread are not its cause
                     raise self.demanded
                 self.watch.check(tick, self._expected, tension=not self._pulling)
         finally:
@@ -191,7 +191,11 @@ class ControlLoop:
         return self._come_to_rest(stop)
 
     def find(self) -> None:
-        """Read the first status of every drive; set-points begin at the drives' positions."""
+        """Read the first status of every drive; set-points begin at the drives' positions.
+
+        Raises:
+            Stop: a drive sends no status within a second.
+        """
         end = time.monotonic() + 1.0
         while silent := [drive.name for drive in self.drives.all if drive.reading is None]:
             self.cycle(Phase.ENABLING)

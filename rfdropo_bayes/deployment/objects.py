@@ -24,7 +24,7 @@ class Object(IntEnum):
     CONSUMER_HEARTBEAT = 0x1016  # node << 16 | ms
     PRODUCER_HEARTBEAT = 0x1017  # [ms]
     IDENTITY = 0x1018
-    ERROR_BEHAVIOUR = 0x1029  # :1, where communication fails: 0 PRE-OPERATIONAL, 1 none, 2 STOPPED
+    ERROR_BEHAVIOUR = 0x1029  # :1, if communication fails: 0 PRE-OPERATIONAL, 1 none, 2 STOPPED
     RPDO = 0x1400
     RPDO_MAP = 0x1600
     TPDO = 0x1800
@@ -46,7 +46,7 @@ class Object(IntEnum):
     RATED_TORQUE = 0x6076  # [mN m]; vendors differ
     TORQUE = 0x6077  # [per mille of rated]
     TARGET_POSITION = 0x607A
-    POSITION_RANGE = 0x607B  # where positions wrap; 0, 0 for nowhere
+    POSITION_RANGE = 0x607B  # range in which positions wrap; 0, 0 for none
     HOME_OFFSET = 0x607C
     POSITION_LIMIT = 0x607D
     POLARITY = 0x607E
@@ -61,7 +61,7 @@ class Object(IntEnum):
 
 
 _DEVICE, _AXIS, AXES = 0x6000, 0x800, 8  # first index of a device profile; indices of an axis; axes of a node at most
-PDOS_OF_AXIS = 64  # process data of the second axis follow so many numbers after those of the first
+PDOS_OF_AXIS = 64  # offset of the second axis's process data from the first's
 
 
 def of_axis(index: int, axis: int) -> int:

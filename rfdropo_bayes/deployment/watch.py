@@ -81,7 +81,7 @@ class Watch:
     def _check_emergencies(self) -> None:
         while self._drives.emergencies:
             emergency = self._drives.emergencies.popleft()
-            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not say which axis it means
+            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not name the axis
             if emergency.code == 0x8611:
                 raise Stop(Cause.FOLLOWING_ERROR, f"{drive} does not follow its set-points")
             if emergency.code:
@@ -133,7 +133,7 @@ class AfterStop:
     """Looks at drives after a quick stop, which they should hold: some enable themselves again, others let go.
 
     Args:
-        drives: that are stopped.
+        drives: drives that are stopped.
     """
 
     def __init__(self, drives: Drives) -> None:

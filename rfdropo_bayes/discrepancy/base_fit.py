@@ -1,4 +1,4 @@
-"""The base model's noise and posterior mode, point after point: where a search has come to is an answer, too."""
+"""The base model's noise and posterior mode, point by point: each intermediate point is a result."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.errors import InputError
 
-AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
+AGAIN = 3  # times that a base fit is continued from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3, "orientation": 0.01}
 
 
 @dataclass(frozen=True)
 class Reached:
-    """Where the search for a base model has come to.
+    """Intermediate point of the search for a base model.
 
     Attributes:
         target: data, noise and simulator.
         x: coordinates of all parameters.
-        fit: that ended there; None before a climb has ended.
+        fit: fit that ended there; None before the first optimisation has ended.
     """
 
     target: FitTarget
@@ -52,7 +52,7 @@ class Reached:
 
     @classmethod
     def at(cls, target: FitTarget, fit: Fit) -> Reached:
-        """Where a fit ended."""
+        """End point of a fit."""
         return cls(target, fit.x, fit)
 
     def settled(self) -> tuple[FitTarget, Fit]:
@@ -88,7 +88,7 @@ def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | N
 
 
 def beginning(problem: AuditProblem, target: FitTarget) -> Reached:
-    """Where the search begins: at an earlier calibration, or in the middle of the priors."""
+    """Start of the search: an earlier calibration, or the centre of the priors."""
     coordinates = target.forward.coordinates
     return Reached(target, coordinates.null if problem.start is None else coordinates.encode(problem.start))
 
@@ -96,8 +96,9 @@ def beginning(problem: AuditProblem, target: FitTarget) -> Reached:
 def base_fits(
     problem: AuditProblem, begun: Reached, seed: int, report: Callable[[str], None] = lambda line: None
 ) -> Iterator[Reached]:
-    """Better and better base models, from a given start or from where `calibrate`'s search leads; climbed on while
-    rollouts beside it are better. Where the noise is estimated from residuals, noise and fit in turn at the end."""
+    """A sequence of improving base models, from a given start or from `calibrate`'s search. The optimisation continues
+    while nearby rollouts are better. If the noise is estimated from residuals, noise and fit alternate at the end.
+    """
     target = begun.target
     _announce(target, problem.start is None, report)
     coordinates, known = target.forward.coordinates, target.noise.source != RESIDUALS
@@ -111,7 +112,7 @@ def base_fits(
     for _ in range(AGAIN):
         yield Reached.at(judge, replace(fit, promise=np.inf))
         better = better_nearby(judge, fit)
-        if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
+        if better is None:  # for a motion with kinks, as with slack cables, slopes predict gains that do not exist
             fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
             break
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
@@ -128,7 +129,7 @@ def base_model(
     report: Callable[[str], None] = lambda line: None,
     deadline: Deadline | None = None,
 ) -> tuple[FitTarget, Fit]:
-    """Noise and base fit; where the noise is estimated from residuals, the two in turn.
+    """Noise and base fit, alternating if the noise is estimated from residuals.
 
     Raises:
         InputError: the time was up before the base model was fitted.
@@ -149,29 +150,35 @@ def under_residual_noise(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
     """Noise and fit in turn."""
     converged = fit.converged
     for _ in range(2):
-        target = replace(target, noise=residual_noise(target, fit))
-        fit = climb(target, fit.x, fit.free)
+        target, fit = fit_with_noise(replace(target.measured, noise=residual_noise(target, fit)), fit.x, fit.free)
     return target, fit if converged else replace(fit, promise=np.inf)
 
 
 def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
-    """Autoregressions fitted to what a model leaves of every recording."""
-    measured = target.measurements
+    """What is taken for noise of what a model leaves of every recording, if nothing else says what the noise is.
+
+    An autoregression, unless the residuals change more slowly than the noise of a measurement: those are a misfit, and
+    an autoregression would explain it away. Noise is then only what the rows before do not predict, so that the model
+    counts as far off, see `inadequacy`.
+    """
+    measured = target.measured.measurements
     left = np.array(measured.spread)
     for group, error in zip(measured.members, target.errors(fit.x), strict=True):
         left[list(group)] += error
-    return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+    noise = measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+    return Stacked(tuple(part.unpredicted if part.doubtful else part for part in noise.parts))
 
 
 def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) -> None:
-    """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
-    derivatives, which take as long to compile as rollouts did."""
+    """Announce the first fit and its expected time, from the measured pace of rollouts and the time to compile
+    derivatives, which equals the rollouts'.
+    """
     forward, own = target.forward, target.forward.coordinates
     counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
     points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)
     points[:, : own.base] += np.linspace(-0.5, 0.5, len(points))[:, None] * own.prior_sd[: own.base]
     took = []
-    for _ in range(2):  # the first one compiles
+    for _ in range(2):  # the first call compiles
         began = time.monotonic()
         forward.observe(np.clip(points, *own.bounds))
         took.append(time.monotonic() - began)

@@ -1,5 +1,6 @@
-"""How long an audit may take, and where its time goes: when it is up, the audit stops between two batches of rollouts,
-and says what it knows."""
+"""Time limit and time profile of an audit: after the limit it stops between two batches of rollouts, and reports its
+present results.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +29,12 @@ class Deadline:
     """A limit on the time of a whole run, by the clock on the wall: on a busy machine, less is done within it.
 
     Attributes:
-        minutes: from its making on; infinite for no limit.
-        where: the setting that holds them.
-        share: part of the time after which rollouts stop.
+        minutes: limit from its creation; infinite for no limit.
+        where: setting of the limit.
+        share: share of the time after which rollouts stop.
         reached: whether anything was left undone.
-        why: "time" or "interrupt" then.
-        waited: seconds that the run has waited for processors which other programs held, see `delay`.
+        why: its reason, "time" or "interrupt".
+        waited: seconds of waiting for processors used by other programs, see `delay`.
     """
 
     minutes: float = float("inf")
@@ -50,7 +51,7 @@ class Deadline:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the time within as that of a stage; of stages within one another, as that of the innermost."""
+        """Count the time within for a stage; nested stages count for the innermost."""
         self._charge()
         self._stages.append(name)
         try:
@@ -60,7 +61,7 @@ class Deadline:
             self._stages.pop()
 
     def recall(self, seconds: float) -> None:
-        """Count what an earlier part of the run has spent on what is now looked up."""
+        """Count the time that an earlier part of the run spent on a result that is now looked up."""
         self._spent[self._stages[-1]] = self._spent.get(self._stages[-1], 0.0) + seconds
 
     @property
@@ -94,16 +95,16 @@ class Deadline:
 
     @contextmanager
     def stopping(self, report: Callable[[str], None]) -> Iterator[None]:
-        """What may be stopped within, by the time or by Ctrl-C: it then ends here."""
+        """Block that the time limit or Ctrl-C may end; execution continues after it."""
         try:
             yield
         except (OutOfTime, KeyboardInterrupt):
             self.reached, self.why = True, self.why or INTERRUPT
-            report("the time is up" if self.why == TIME else "stopping: the answer is what is known by now")
+            report("the time is up" if self.why == TIME else "stopping: the answer has the present results")
 
     @contextmanager
     def granted(self, seconds: float | None = None) -> Iterator[None]:
-        """So much time from now on; by default what is kept for the end, once the time is up."""
+        """Grant ``seconds`` from now; by default the reserve for the end, once the time is up."""
         minutes, share = self.minutes, self.share
         if seconds is None:
             seconds = 60.0 * KEPT * minutes if self.why == TIME else PATIENCE
@@ -115,7 +116,7 @@ class Deadline:
 
     @contextmanager
     def reserve(self) -> Iterator[None]:
-        """Use the time that is kept for the gain, too."""
+        """Also use the time reserved for the gain."""
         share, self.share = self.share, 1.0
         try:
             yield

@@ -1,8 +1,8 @@
-"""The audit's last word: what acts on the robot that the library does not have, described as a law at a port.
+"""Last part of an audit: an effect on the robot that the library lacks, described as a law at a port.
 
-It is asked where the library leaves something: beside the base model, and where that finds nothing better than what the
-library named, beside the model with what it named. A library candidate that a law beats clearly on unseen recordings
-stands in for the law, and is not adopted as a cause.
+It runs if the library leaves a misfit: beside the base model and, if that is no better than the named mechanisms,
+beside the model with them. A library candidate that a law beats clearly on unseen recordings stands in for the law, and
+is not adopted as a cause.
 """
 
 from __future__ import annotations
@@ -27,16 +27,15 @@ from rfdropo_bayes.discrepancy.repairs import without
 
 @dataclass(frozen=True)
 class Described:
-    """What a search for laws says of an audit.
+    """Result of a search for laws in an audit.
 
     Attributes:
         found: ports and law.
-        steps: of the library's mechanisms that the law stands beside, in the model.
-        stand_ins: mechanisms of the library that the law takes the place of.
-        gain: of the law on recordings that no fit has seen, against the model without it; None where there is no
-            law, or the time was up.
-        overall: the same against the base model.
-        held_out: predictions of these recordings: of the base model, and last of the model with the law.
+        steps: library mechanisms in the model beside the law.
+        stand_ins: library mechanisms that the law replaces.
+        gain: gain of the law on unseen recordings over the model without it; None without a law, or if the time was up.
+        overall: the same over the base model.
+        held_out: predictions of these recordings: by the base model, and last by the model with the law.
         holds: whether unseen recordings clearly support the law.
     """
 
@@ -68,11 +67,11 @@ class Described:
 def describe(
     problem: AuditProblem, model: Named, held_out: HeldOut | None, report: Callable[[str], None] = lambda line: None
 ) -> Iterator[Described]:
-    """Where something acts that the library does not have, and by what law; nothing where nobody asks.
+    """Port and law of an effect that the library lacks; nothing if not requested.
 
     Args:
-        problem: with the ports of its simulator.
-        model: the base model, and what the library named.
+        problem: problem with the ports of its simulator.
+        model: the base model with the named mechanisms.
         held_out: predictions of unseen recordings by the base model and after each step; None without steps.
         report: called with a line of words now and then.
     """
@@ -84,7 +83,7 @@ def describe(
         if not model.steps:
             yield alone
             return
-        yield replace(alone, holds=False)  # until it is compared with what the library named
+        yield replace(alone, holds=False)  # until it is compared with the named mechanisms
         seen = alone.held_out if alone.holds else None
         if held_out is not None and seen is not None and seen.beside(held_out.after(len(model.steps))).clear:
             report(f"the law takes the place of {' and '.join(model.names)}")
@@ -99,10 +98,10 @@ def describe(
 def _without_stand_ins(
     problem: AuditProblem, model: Named, alone: Described, described: Described, report: Callable[[str], None]
 ) -> Described:
-    """The law beside those mechanisms only that unseen recordings ask for once it is in the model.
+    """The law beside only the mechanisms that unseen recordings still support with it.
 
-    What acts beside a named cause has stand-ins among the later ones. The law is looked for anew without these, and
-    kept if unseen recordings are not clearly likelier with them.
+    Later mechanisms may be stand-ins for an effect beside a named cause. The law is searched again without them, and
+    kept unless unseen recordings are clearly likelier with them.
 
     Args:
         alone: the law beside the base model.
@@ -120,7 +119,7 @@ def _without_stand_ins(
 
 
 def _without(model: Named, gone: Sequence[str]) -> Named:
-    """A model less some of its mechanisms, judged anew."""
+    """A model without some of its mechanisms, with a new noise model."""
     for name in gone:
         model = model.extended(without(model.asked, model.steps, model.names.index(name), model.base))
     judge, fit = fit_with_noise(model.judge.measured, model.fit.x, model.fit.free)
@@ -128,7 +127,7 @@ def _without(model: Named, gone: Sequence[str]) -> Named:
 
 
 def _needed(problem: AuditProblem, described: Described) -> list[str]:
-    """Mechanisms beside a law without which unseen recordings are clearly less likely; the last one is asked first."""
+    """Mechanisms beside a law without which unseen recordings are clearly less likely; the last is tested first."""
     assert described.last is not None
     judge, fit, coordinates = described.last.target, described.last.fit, described.last.target.forward.coordinates
     finer = DISCRETISATION in described.beside
@@ -151,7 +150,7 @@ def _needed(problem: AuditProblem, described: Described) -> list[str]:
 
 
 def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) -> Described:
-    """The law beside a model, and what it is worth on unseen recordings."""
+    """The law beside a model, and its gain on unseen recordings."""
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
@@ -169,7 +168,7 @@ def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) 
         found = found.cut(max(held_out.count - 1 - named, 0))
         if not found.terms:
             return Described(found, model.steps)
-    # As with what the library names, a law is cut to what unseen recordings support.
+    # Like named mechanisms, a law is cut to its supported terms.
     kept = held_out.supported_from(named) - named or len(found.terms)
     if kept < len(found.terms):
         report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")
@@ -187,7 +186,7 @@ def holds_on(rules: Rules, gain: Gain) -> bool:
 def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
     """Coefficients of a law: mean, deviation, quantiles and unit, by the model's normal approximation.
 
-    Shapes of features stand beside them; their deviation is None where they are not inferred.
+    Shapes of features stand beside them; their deviation is None if they are not inferred.
     """
     if described.sizes is None:
         return []

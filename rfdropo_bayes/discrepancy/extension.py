@@ -29,8 +29,9 @@ from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow, screen
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 SCANNED = tuple((k + 0.5) / 32 for k in range(32))
-"""Quantiles of the prior of a candidate's size among which a climb's start is looked for. Of a delay of 70 ms under
-a noise of 0.3 mm the summit is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms."""
+"""Quantiles of the prior of a candidate's size that are tried as starts of an optimisation. The optimum of a delay of
+70 ms under a noise of 0.3 mm is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms.
+"""
 TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
 # Nats of evidence that a parameter which the data fix costs under a prior twice as wide. Widths are chosen by hand: a
 # family of many parameters must not owe its place to that choice.
@@ -42,18 +43,18 @@ class Rules:
     """Numbers the verdict depends on, fixed in advance.
 
     Attributes:
-        family: probability that the screen names anything where nothing is wrong.
-        class_cosine: signatures more alike than this are one class.
-        classes: leading classes that are refitted; members: candidates refitted in all.
-        effects: most mechanisms that are added to a model that is not far off.
-        evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
-            the number of candidates more, since with so many to choose from a few together imitate most things. One
-            that brings so much less than the best is no longer its equal.
-        bootstraps: simulated data sets behind every p-value.
-        minutes: for the whole audit; when they are up it finishes with what it knows.
-        base_passes, extended_passes: p-values of the joint test from which a model is let pass.
+        family: probability that the score tests name a candidate although the model is right.
+        class_cosine: cosine above which signatures are one class.
+        classes: number of leading classes to refit; members: total number of candidates to refit.
+        effects: most mechanisms added to a model that is not misspecified.
+        evidence: log Bayes factor required to add a mechanism. Later mechanisms need the logarithm of the number of
+            candidates in addition, since a few of many candidates together imitate most effects. Candidates within this
+            difference of the best are equivalent.
+        bootstraps: number of simulated data sets per p-value.
+        minutes: limit of the whole audit; it then finishes with its present results.
+        base_passes, extended_passes: p-values of the joint test above which a model passes.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
-        matters: distance of a marker [m] below which a discrepancy does not; None where nobody says.
+        matters: distance of a marker [m] below which a discrepancy does not matter; None if not stated.
     """
 
     family: float = 0.02
@@ -73,18 +74,18 @@ class Rules:
 
 @dataclass(frozen=True)
 class Added:
-    """One mechanism that joined the model.
+    """One mechanism added to the model.
 
     Attributes:
-        name: of the mechanism.
-        members: its equivalence class, itself first: what looks the same and explains as much, and what has as much
-            evidence once it is refitted, but for `Rules.evidence`.
-        before: the screen of the model without it.
-        fit: of the model with it.
-        log_bayes_factor: of the model with against that without it, by Laplace.
-        refits: log Bayes factors of all candidates that were refitted at this step.
-        judge: the target under which the fit was found, see `inadequacy`. From the step `DISCRETISATION` on it has the
-            finer simulator.
+        name: name of the mechanism.
+        members: its equivalence class, itself first: candidates with the same signature and explained share, and
+            refitted candidates within `Rules.evidence`.
+        before: score tests of the model without it.
+        fit: fit of the model with it.
+        log_bayes_factor: log Bayes factor of the models with and without it, by Laplace.
+        refits: log Bayes factors of all refitted candidates of this step.
+        judge: the target under which the fit was found, see `inadequacy`. It has the finer simulator from the step
+            `DISCRETISATION` on.
     """
 
     name: str
@@ -98,13 +99,13 @@ class Added:
 
 @dataclass(frozen=True)
 class Refits:
-    """The candidates that were fitted beside a model so far.
+    """The candidates refitted beside a model so far.
 
     Attributes:
-        rows: of the screen, those that are significant.
-        drops: what each of these may take from the sum of squares.
-        fits: of the model with each candidate that was refitted.
-        waiting: leading candidates that were not refitted yet.
+        rows: significant rows of the score tests.
+        drops: possible drop of the sum of squares for each of them.
+        fits: fit of the model with each refitted candidate.
+        waiting: leading candidates without a refit.
     """
 
     rows: tuple[ScreenRow, ...]
@@ -113,7 +114,7 @@ class Refits:
     waiting: tuple[str, ...]
 
     def with_fit(self, name: str, fit: Fit) -> Refits:
-        """The same with one more fit, or with a better one."""
+        """The same with one more fit, or with a better fit."""
         waiting = tuple(each for each in self.waiting if each != name)
         return replace(self, fits={**self.fits, name: fit}, waiting=waiting)
 
@@ -124,14 +125,14 @@ class Refits:
 
 @dataclass(frozen=True)
 class ExtensionSearch:
-    """What may be asked of one model: which of the candidates does it lack?
+    """The search for candidates that a model lacks.
 
     Attributes:
-        target: data, noise and simulator; every candidate is in the simulator, at its null value. Its noise
-            is that under which the present model is judged, see `inadequacy`; its simulator that of the present model.
-        candidates: that may be named.
+        target: data, noise and simulator; every candidate is in the simulator, at its null value. Noise and simulator
+            are the present model's, see `inadequacy`.
+        candidates: mechanisms that may be named.
         rules: see `Rules`.
-        seed: of all bootstraps.
+        seed: seed of all bootstraps.
         finer: the simulator on a finer mesh and time step, for the candidate `DISCRETISATION`; None without it.
         report: called with a line of words as the search goes on.
     """
@@ -152,18 +153,19 @@ class ExtensionSearch:
         return next((each for each in self.candidates if each.name == name), None)
 
     def room(self, steps: int) -> int:
-        """How many mechanisms may still be added: a model that is far off lacks more than a few, and rows that count
-        as few keep out what only imitates them."""
+        """Number of mechanisms that may still be added. A misspecified model may lack many, and down-weighted rows keep
+        out imitations.
+        """
         return len(self.candidates) if self.target.known is not None else self.rules.effects - steps
 
     def screened(self, fit: Fit, without: Sequence[str] = ()) -> Screen:
-        """Test a fit and screen the candidates that are not in it.
+        """Test a fit and its missing candidates.
 
-        An error of the mesh or time step that is too small to be named is no discrepancy either: where the residuals
-        of the finer simulator pass more easily, it is they that count. Too small is one that the screen does not see,
-        or that moves the markers by no more than the noise: see `_below_the_noise`.
+        An error of mesh or time step that is too small to be named is not counted as a discrepancy: the residuals of
+        the finer simulator are used if they pass more easily. An error is too small if the score test does not see it,
+        or if it moves the markers by less than the noise, see `_below_the_noise`.
         """
-        # Of a family of parameters, some may be in the model by themselves.
+        # Some members of a family of parameters may be in the model already.
         left = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
         free = [
             c
@@ -246,9 +248,9 @@ class ExtensionSearch:
         """The best of the refitted candidates with its class; None if no candidate is worth it.
 
         Args:
-            found: the screen of the model without it.
+            found: score tests of the model without it.
             tried: the refits so far.
-            further: whether the model has mechanisms already, so that one more must bring more.
+            further: whether the model has mechanisms already, so that another needs more evidence.
         """
         gains = tried.gains(found.fit)
         price = np.log(len(self.candidates)) if further else 0.0
@@ -258,10 +260,10 @@ class ExtensionSearch:
         best = max(worth, key=lambda name: gains[name] - WIDER * len(tried.fits[name].free))
         enough = self.rules.class_cosine**2 * tried.drops[best]
         able = [row for row in tried.rows if tried.drops[row.name] > enough]
-        # What looks the same near null may be another thing at the size that it has.
+        # Candidates with equal signatures near null may differ at their fitted size.
         able = [row for row in able if gains.get(row.name, np.inf) > gains[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
-        # What brings nearly as much, whatever it looks like, is no less likely a cause.
+        # A candidate of nearly equal gain is as likely a cause, for any signature.
         members += tuple(n for n in worth if n not in members and gains[n] > gains[best] - self.rules.evidence)
         judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
         return Added(best, members, found, tried.fits[best], gains[best], gains, judge)
@@ -274,8 +276,9 @@ class ExtensionSearch:
         return lead(self.target, fit, row.probe, row.lm)
 
     def _leading(self, significant: Sequence[ScreenRow], drops: Mapping[str, float], fit: Fit) -> list[ScreenRow]:
-        """The best candidates of the leading classes, and further members of these while there is room; those that
-        cannot bring what a mechanism must are left out, and those whose rollouts are slow come last."""
+        """The best candidates of the leading classes, and further members of these while there is room; candidates that
+        cannot reach the required evidence are skipped, and candidates with slow rollouts come last.
+        """
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
         able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
         heads: list[ScreenRow] = []
@@ -288,7 +291,7 @@ class ExtensionSearch:
             elif alike:
                 rest.append(row)
         chosen = [*heads, *rest][: self.rules.members]
-        # A refit on a finer mesh costs as much as all others: only where it could win.
+        # A refit on a finer mesh costs as much as all others: only if it could win.
         chosen = [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
         return sorted(chosen, key=lambda row: self._costly(row.name))
 
@@ -301,7 +304,7 @@ class ExtensionSearch:
         return any(parameters[index].physical in costly for index in candidate.indices)
 
     def _class_of(self, best: ScreenRow, able: Sequence[ScreenRow]) -> tuple[str, ...]:
-        """The best, and of those that explain as much of these data the ones that look the same."""
+        """The best candidate, and candidates of the same signature that explain the data equally well."""
         assert best.probe is not None
         alike = [
             row.name
@@ -329,7 +332,7 @@ class ExtensionSearch:
             found = self._climbed_from_all_sizes(candidate.indices[0], fit.x, start, free)
         else:
             found = climb(self.target, start, free)
-        # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
+        # The model without the candidate is a special case: a worse result is a failed optimisation.
         if found.residual @ found.residual > fit.residual @ fit.residual:
             found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
         return found
@@ -337,10 +340,10 @@ class ExtensionSearch:
     def _climbed_from_all_sizes(
         self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
     ) -> Fit:
-        """A fit with a candidate of one parameter, climbed from the best of its sizes until no other one is better.
+        """A fit with a candidate of one parameter, optimised from the best of its sizes until no other size is better.
 
-        Of a shift in time the likelihood has a summit wherever jumps of commands meet the steps of the simulation or
-        the rows of a recording; on one of them a climb from no shift ends.
+        The likelihood of a time shift has an optimum wherever jumps of commands meet the steps of the simulation or the
+        rows of a recording; an optimisation from zero shift stops at one of them.
         """
         found = climb(self.target, self._best_size(index, base, start), free)
         while True:
@@ -361,9 +364,10 @@ class ExtensionSearch:
         return points[int(np.argmax(heights(self.target, points, "sizes")))]
 
     def _from_afar(self, name: str, fit: Fit) -> Fit:
-        """A fit with one amplitude that leaves most of a large misfit, or a better one from the middle of the base
-        parameters' priors: the base model's optimum, where it has made up for the effect, may be in another valley than
-        that of both together."""
+        """A fit with one amplitude that leaves most of a large misfit, or a better fit from the centre of the base
+        parameters' priors. The base model's optimum, which compensates for the effect, may be in another basin than the
+        joint optimum.
+        """
         candidate = self.candidate(name)
         if candidate is None or len(candidate.indices) != 1 or not far_off(self.target, fit.x):
             return fit
@@ -377,15 +381,17 @@ class ExtensionSearch:
         return best
 
     def surpasses(self, new: Fit, old: Fit, worth: float) -> bool:
-        """Whether a model may take the place of one that was chosen before: it must bring so many nats, and that also
-        under priors of its further parameters that are twice as wide."""
+        """Whether a model may replace an earlier choice: it must bring ``worth`` nats, also under priors of its further
+        parameters that are twice as wide.
+        """
         further = max(len(new.free) - len(old.free), 0)
         return new.log_evidence > old.log_evidence + worth + WIDER * further
 
 
 def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None:
-    """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
-    where the finer rollouts do not end well."""
+    """Root mean square distance [m] by which a finer mesh and time step move the measured markers; None after a failed
+    finer rollout.
+    """
     seen, fine = finer.observe(fit.x[None])
     if not fine[0]:
         return None
@@ -395,10 +401,10 @@ def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None
 
 
 def _without_numerical_error(fit: Fit, probe: Probe) -> Float[np.ndarray, " n"]:
-    """Residuals of the simulation without its error in space and time, as two resolutions tell it.
+    """Residuals of the simulation without its error in space and time, estimated from two resolutions.
 
-    What halving the steps changes is a part of the error: half of it at the first order of the time steps, three
-    quarters at the second order of the mesh. So the whole is once to twice the change; the data say how much.
+    The change by halving the steps is a part of the error: half at first order of the time steps, three quarters at
+    second order of the mesh. The error is therefore one to two times the change; the data determine the factor.
     """
     base = span(fit.jacobian)
     change, left = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]

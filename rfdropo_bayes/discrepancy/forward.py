@@ -26,8 +26,8 @@ from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 # Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
-# computes what many lanes have in common once, be it padding or the value beside its slopes: of 16, 32, 48 and 64
-# lanes, 48 took the least time for the Jacobians of both real robots, two thirds of that of 16.
+# shares common work of lanes, such as padding and the value beside its slopes: of 16, 32, 48 and 64 lanes, 48 took the
+# least time for the Jacobians of both real robots, two thirds of the time with 16.
 WIDTH = 48
 NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
 
@@ -45,11 +45,11 @@ class Lanes:
     """A simulator behind two compiled functions of a fixed number of lanes.
 
     Args:
-        simulator: with the base model's mechanisms and every candidate at its null value.
-        marker_index: which of its markers are measured.
-        width: lanes of one call, the last of a batch being padded; None for what suits the engine.
-        slope_rollouts: what a derivative costs, that of the value included.
-        fields: parts of an observation that are data; beside the pose of an object it starts where it is told to.
+        simulator: simulator with the base model's mechanisms and every candidate at its null value.
+        marker_index: indices of its measured markers.
+        width: lanes per call, with the last call of a batch padded; None for the engine's choice.
+        slope_rollouts: rollouts per derivative, including the value.
+        fields: parts of an observation that are data; if the pose of an object is included, its start is an input.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Lanes:
 
     @property
     def difference(self) -> float | None:
-        """Relative step of its derivatives; None where they are exact."""
+        """Relative step of its derivatives; None if they are exact."""
         engine: Any = getattr(self.simulator, "engine", None)
         backend = getattr(engine, "backend", None)
         if backend is None or backend.name != "numba":
@@ -131,10 +131,10 @@ class Lanes:
         check: Callable[[], None] = _no_limit,
         steps: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
-        """What each set of parameters shows under the commands of its lane, and result codes.
+        """Observations of each parameter set under the commands of its lane, and result codes.
 
-        ``start`` (lane, 7) are the poses that an object starts from. ``check`` is called before every batch, and may
-        raise. After ``steps`` time steps, all by default, rows hold no meaning.
+        ``start`` (lane, 7) are initial poses of an object. ``check`` is called before every batch, and may raise. After
+        ``steps`` time steps, all by default, rows are meaningless.
         """
         limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
         lanes = (theta, start, commands)
@@ -148,7 +148,7 @@ class Lanes:
         commands: Commands,
         check: Callable[[], None] = _no_limit,
     ) -> Fields:
-        """Derivatives along tangents of those parts of an observation that are data."""
+        """Derivatives along tangents of the parts of an observation that are data."""
         lanes = (theta, tangent, start, commands)
         return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
 
@@ -219,7 +219,7 @@ class RoutedLanes(Lanes):
         return self._routed(self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1), run)
 
     def _routed(self, slow: np.ndarray, run: Callable[[Lanes, np.ndarray, Any], Any]) -> Any:
-        """What the two simulators find for the lanes that are theirs, put together again."""
+        """Results of the two simulators for their lanes, merged."""
         routes = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
         order = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes])
         found = [run(lanes, np.flatnonzero(mask), kept) for mask, lanes, kept in routes if mask.any()]
@@ -227,16 +227,16 @@ class RoutedLanes(Lanes):
 
 
 class Forward:
-    """What a set of recordings should show, as a function of the audit's coordinates.
+    """Predicted observations of a set of recordings, as a function of the audit's coordinates.
 
     Args:
         lanes: the simulator.
-        coordinates: what a point means.
-        commands: of the recordings, stacked.
-        chosen: which of these are simulated, by name.
-        rows: observations that are wanted of each; all by default.
-        deadline: of the rollouts; none by default.
-        start: poses (recording, 7) that an object starts from, where its poses are data.
+        coordinates: map from points to parameters.
+        commands: stacked commands of the recordings.
+        chosen: names of the simulated recordings.
+        rows: number of observations of each; all by default.
+        deadline: deadline of the rollouts; none by default.
+        start: initial poses (recording, 7) of an object, if its poses are data.
     """
 
     def __init__(
@@ -258,7 +258,7 @@ class Forward:
         self.count = len(chosen)
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
-        self.pace = 0.0  # seconds that a whole rollout took last, of different ones that fill a call
+        self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
 
     @cached_property
     def identity(self) -> str:
@@ -294,12 +294,12 @@ class Forward:
         return changed
 
     def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:
-        """What every recording shows at each point (point, recording, ...), and True where all rollouts ended well.
+        """Observations of every recording at each point (point, recording, ...), and whether all rollouts succeeded.
 
-        Only the first ``rows`` rows, all by default, are simulated; later ones hold no meaning.
+        Only the first ``rows`` rows, all by default, are simulated; later rows are meaningless.
 
-        Beside the parts of an observation there are ``offset`` [m], by which measured positions are shifted against
-        simulated ones, and the parameters that channels want and rollouts do not.
+        The fields also have ``offset`` [m], the shift of measured against simulated positions, and parameters of
+        channels that rollouts do not use.
         """
         points = np.atleast_2d(points)
         theta = self.coordinates.physical_values(points, self.slots)
@@ -324,10 +324,10 @@ class Forward:
         return shown, fine.reshape(len(points), -1).all(axis=1)
 
     def observe_one(self, point: Float[np.ndarray, " d"]) -> Fields:
-        """What every recording shows at one point.
+        """Observations of every recording at one point.
 
         Raises:
-            NoLikelihoodError: a rollout there did not end well.
+            NoLikelihoodError: a rollout failed.
         """
         found, fine = self.observe(point[None])
         if not fine[0]:
@@ -336,13 +336,14 @@ class Forward:
         return {name: part[0] for name, part in found.items()}
 
     def tangents(self, points: Points, directions: Points) -> Fields:
-        """Derivatives of `observe`, of what is data, along a direction at each point; one-sided where a mechanism is so
-        at null."""
+        """Derivatives of `observe` for data fields along a direction at each point; one-sided for one-sided mechanisms
+        at null.
+        """
         theta = self.coordinates.physical_values(points, self.slots)
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
         flat, start, commands = self._per_lane(theta, points)
         along = tangent.reshape(flat.shape)
-        # Recordings that a direction does not touch, such as those of another group, stay as they are.
+        # Recordings that a direction does not affect, such as another group's, are unchanged.
         moved = np.flatnonzero(along.any(axis=1))
         moved = moved if len(moved) else np.arange(1)
         found = self.lanes.differentiate(
@@ -364,11 +365,11 @@ class Forward:
         return found
 
     def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
-        """What a rollout depends on beside the simulator's parameters."""
+        """Further inputs of a rollout beside the simulator's parameters."""
         return np.zeros((len(points), 0))
 
     def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
-        """What is measured of what rollouts show, one row a lane."""
+        """Measured fields from the observations of rollouts, one row per lane."""
         return found
 
     def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:

@@ -375,7 +375,7 @@ def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Fl
         if own.any():
             mean[own], error[own] = power[own].mean(axis=0), np.sqrt(2.0 / (len(pattern) * own.sum()))
     surprise = (mean - 1.0) / error
-    # Where nothing is sure, the surest is all there is to go by.
+    # If nothing is significant, the most significant bands are used.
     excess = np.where(surprise >= min(SURE, surprise.max()), np.maximum(mean - 1.0, 0.0), 0.0)
     share = excess / (excess + 1.0) if excess.any() else np.ones_like(excess)
     at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)

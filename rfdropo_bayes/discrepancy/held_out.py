@@ -1,4 +1,4 @@
-"""Recordings that no fit has seen, as a model and its extensions predict them, and what they support."""
+"""Recordings that no fit has seen, predicted by a model and its extensions, and the supported steps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it 
 
 def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
     """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
-    as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
+    as the common scale of stiffness and mass, a draw would lie outside the range of the approximation.
+    """
     centre = target.errors(fit.x)
     points = np.repeat(fit.x[None], len(fit.free), axis=0)
     slopes, _ = target.error_slopes(points, np.eye(len(fit.x))[fit.free])
@@ -39,17 +40,17 @@ def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Recordings that no fit has seen, as the base model and the model after each step predict them.
+    """Recordings that no fit has seen, predicted by the base model and the model after each step.
 
     Attributes:
-        which: in words.
+        which: description of the recordings.
         unseen: the measurements.
-        predictions: of the base model, then after each step.
-        patterns: what each of these models leaves where it was fitted, see `measure_gain`.
-        noise: of the measurements.
-        judges: the noise under which each of the models is judged, see `inadequacy`.
-        spreads: deviation of what each of them leaves, by column.
-        seed: of the gain's interval.
+        predictions: predictions of the base model, then after each step.
+        patterns: residuals of each model on its fitted data, see `measure_gain`.
+        noise: noise of the measurements.
+        judges: noise model of each model, see `inadequacy`.
+        spreads: deviation of each model's residuals, by column.
+        seed: seed of the gain's interval.
     """
 
     which: str
@@ -63,30 +64,30 @@ class HeldOut:
 
     @property
     def count(self) -> int:
-        """Models that predict; fewer than were asked where the motion of one of them ended."""
+        """Number of predicting models; fewer than requested if a rollout failed."""
         return len(self.predictions)
 
     def gain(self, before: int, after: int) -> Gain:
-        """What the model after some steps is worth beside that after fewer."""
+        """Gain of the model after ``after`` steps over the model after ``before`` steps."""
         return self.after(after).beside(self.after(before))
 
     def beside(self, other: HeldOut) -> Gain:
-        """What the last model is worth beside the last one of another sequence of steps."""
+        """Gain of the last model over the last model of another sequence of steps."""
         rng, judge, pattern = np.random.default_rng([self.seed, 4]), other.judges[-1], other.patterns[-1]
         first, second, spread = other.predictions[-1], self.predictions[-1], self.spreads[-1]
         return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
 
     def after(self, steps: int) -> HeldOut:
-        """The same of no more than so many steps."""
+        """The same with at most ``steps`` steps."""
         parts = ("predictions", "patterns", "judges", "spreads")
         return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
 
     def supported(self) -> int:
-        """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
+        """Number of steps that the unseen recordings clearly support, each compared with the last supported step."""
         return self.supported_from(0)
 
     def supported_from(self, first: int) -> int:
-        """The same of the steps after the first so many, which are taken as they are."""
+        """The same for the steps after the first ``first``, which are accepted."""
         last = first
         for after in range(first + 1, len(self.predictions)):
             if self.gain(last, after).clear:
@@ -95,11 +96,11 @@ class HeldOut:
 
 
 class JudgedModel(NamedTuple):
-    """A model that predicts recordings which it has not seen.
+    """A model that predicts unseen recordings.
 
     Attributes:
-        judge: target under which it was fitted.
-        fit: the model.
+        judge: target of its fit.
+        fit: its fit.
         finer: whether it runs on the finer simulator.
     """
 
@@ -145,7 +146,7 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
 
 @contextmanager
 def _up_to_the_last(predicted: Sequence[Any]) -> Iterator[None]:
-    """End where a model's rollout does not end well, with the models before it; an error where there are none."""
+    """Stop at the first model with a failed rollout, with the models before it; an error if there are none."""
     try:
         yield
     except NoLikelihoodError:
@@ -162,8 +163,9 @@ def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) 
 def _left_out(
     problem: AuditProblem, judges: Sequence[FitTarget], target: FitTarget, fits: Sequence[Fit]
 ) -> tuple[str, Unseen, list[UnseenErrors]]:
-    """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
-    the later rows of all from the earlier ones."""
+    """Predict each group of repeats from the others; if a group has parameters that no other determines (as a single
+    group has), predict the later rows of all from the earlier rows.
+    """
     measured = target.measurements
     groups = len(measured.members)
     kinds = problem.kinds(target.forward.recordings)
@@ -195,7 +197,7 @@ def _left_out(
 
 
 def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray, "group time"]:
-    """Rows of every recording that come after the share of its measured ones that is fitted, wherever its gaps are."""
+    """Rows of every recording after the fitted share of its measured rows, with gaps anywhere."""
     seen = np.asarray(valid.any(axis=2))
     before: np.ndarray = np.cumsum(seen, axis=1) - seen
     return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
@@ -203,13 +205,13 @@ def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray,
 
 @dataclass(frozen=True)
 class Kept:
-    """What unseen recordings say of named causes.
+    """Named causes after the test on unseen recordings.
 
     Attributes:
-        named: the steps that they support, all of them where they support none, and the screen of the model with them.
-        held_out: their predictions by the base model and after each of these steps; None where no step can be
-            simulated, or there is none.
-        unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
+        named: supported steps (all steps if none is supported), with score tests of the model.
+        held_out: predictions of these recordings by the base model and after each step; None without a step that can be
+            simulated.
+        unsupported: mechanisms supported by fitted but not by unseen recordings.
     """
 
     named: Named
@@ -218,8 +220,9 @@ class Kept:
 
 
 def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
-    """The steps that recordings which no fit has seen support: first as all steps are predicted, then without those
-    that a later one carried."""
+    """The steps supported by unseen recordings: first from predictions of all steps, then without steps that depend on
+    a later step.
+    """
     report, clock = named.search.report, named.search.target.forward.deadline
     if not named.steps:
         yield Kept(named, None)
@@ -255,10 +258,10 @@ def _kept(asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
 
 
 def _without_carried(problem: AuditProblem, named: Named, held_out: HeldOut) -> tuple[Named, HeldOut]:
-    """Steps less those that were supported beside a later one only, and without which that one does as well.
+    """Steps without any step supported only together with a later step that does equally well alone.
 
-    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
-    it were the last step, must clearly predict unseen recordings better than the model without it.
+    Two mechanisms may pay only together. To test this, the first is removed: the model with it must predict unseen
+    recordings clearly better than the model without it.
     """
     for index in range(len(named.steps) - 1):
         if held_out.gain(index, index + 1).clear or named.steps[index].name == DISCRETISATION:

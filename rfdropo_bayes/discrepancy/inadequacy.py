@@ -20,7 +20,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
 from rfdropo_bayes.inference import lasting_series
 
-POOR = 2.0  # squared residual per value, in the noise's variance, from which on a model is far off
+POOR = 2.0  # squared residual per value, in the noise's variance, above which a model is misspecified
 ROUNDS = 6  # of noise and fit in turn
 SETTLED = 0.1  # relative change of the noise between rounds
 

@@ -48,10 +48,10 @@ from rfdropo_bayes.mechanisms.ports import Port, PortMap
 LEAST = 0.01
 """Share of the residuals beyond the noise that a term must explain in left-out recordings."""
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
-EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
+EXCHANGES = 2  # rounds in which another term may replace the chosen term
 FRESH = 3  # terms that are refitted in each round
 GLANCE = 4  # steps of a refit that only ranks
-TIED = 10.0  # nats by which a refit must be worse to be told apart from the best
+TIED = 10.0  # nats by which a refit must be worse to be distinguished from the best
 PIECES = 3  # parts of a single recording, which are left out in turn
 NULLS = 199  # simulated data sets behind the p-values of ports
 COLLINEAR = 1e-6  # share of a column that the base parameters must leave
@@ -267,10 +267,10 @@ class LinearModel(NamedTuple):
 
     Attributes:
         known: target of the simulator without a law.
-        terms: of the law that the model has.
+        terms: terms of the model's law.
         fit: the model.
         found: responses, with the residual and the slopes of the fit.
-        precision: of the base parameters, see `left_out_gains`.
+        precision: precision of the base parameters, see `left_out_gains`.
     """
 
     known: FitTarget
@@ -355,7 +355,7 @@ class LawSearch:
                     ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
         except OutOfTime:
             self.report("the time was up before the law was found")
-        # The time may be up between a term and what is left beside it.
+        # The time limit may fall between a term and the evidence after it.
         terms, gate = terms[: len(afterwards)], next(iter(gates), None)
         centre = found.basis.centre - found.begun
         return FoundLaw(self.ports, first, terms, ties, afterwards, centre, gate, offered)

@@ -171,7 +171,7 @@ def ports_sentence(answer: Answer) -> str:
     if not rows:
         return ""
     left = answer.extended.residual
-    if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as what is left, and shrinks the signal
+    if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as the residuals, and shrinks the signal
         return f" Of all ports, a signal at {rows[0].port.words} explains most of it; {_no_law(answer)}."
     size = f"{rows[0].amplitude:.2g}" + ("" if rows[0].port.unit == "-" else f" {rows[0].port.unit}")
     others = ", ".join(row.port.words for row in rows[1 : 1 + MOST_TIES])

@@ -1,7 +1,7 @@
-"""Naming causes: step after step, each of them a whole answer.
+"""Naming of causes, step by step; each step is a complete result.
 
-`name_causes` is a generator. Whoever stops listening, because the time is up or the user says so, has the last `Named`
-that it gave, with all that was found until then.
+`name_causes` is a generator. A caller that stops early, by the time limit or by the user, has the last `Named` with all
+findings so far.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from rfdropo_bayes.discrepancy.screen import Screen, p_in_words
 
 @dataclass(frozen=True)
 class Named:
-    """The base model, and what has been named so far.
+    """The base model, and the causes named so far.
 
     Attributes:
-        search: what may be asked of the base model.
+        search: search beside the base model.
         base: its fit.
-        steps: mechanisms that have joined it.
-        screen: of the model with all of them; None before it was screened.
-        tried: candidates that were refitted beside that model; None before the first.
+        steps: mechanisms added to it.
+        screen: score tests of the model with all steps; None if not tested yet.
+        tried: candidates refitted beside that model; None before the first.
     """
 
     search: ExtensionSearch
@@ -36,7 +36,7 @@ class Named:
 
     @property
     def judge(self) -> FitTarget:
-        """The target under which the last model is judged."""
+        """The target with the noise of the last model."""
         return self.steps[-1].judge if self.steps else self.search.target
 
     @property
@@ -46,17 +46,17 @@ class Named:
 
     @property
     def names(self) -> list[str]:
-        """Of the mechanisms in it."""
+        """Names of the added mechanisms."""
         return [step.name for step in self.steps]
 
     @property
     def asked(self) -> ExtensionSearch:
-        """What may be asked of the last model."""
+        """Search beside the last model."""
         return self.search.under(self.judge)
 
     @property
     def screens(self) -> list[Screen]:
-        """Of the base model, and of the model after each step; the last one if it was screened."""
+        """Score tests of the base model and after each step; for the last model only if tested."""
         return [*(step.before for step in self.steps), *([] if self.screen is None else [self.screen])]
 
     @property
@@ -81,7 +81,7 @@ class Named:
         return replace(self, steps=tuple(steps), screen=None, tried=None)
 
     def with_best(self) -> Named:
-        """The best of the candidates that were refitted so far joins the model, where it is worth it."""
+        """The model with the best refitted candidate, if it has enough evidence."""
         step = self.best
         return self if step is None else self.extended([*self.steps, step])
 
@@ -95,12 +95,12 @@ class Named:
 
 
 def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
-    """Forward-stepwise extension of a base model; the last answer has the screen of the final model.
+    """Forward-stepwise extension of a base model; the last result has the score tests of the final model.
 
-    The base model of an answer is another one than before where a candidate has led to a better optimum of it.
+    The base model is replaced if a candidate has led to a better optimum of it.
     """
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
-    named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was climbed again: once each
+    named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
     while True:
         named = _judged(named)
         found = named.asked.screened(named.fit, named.names)
@@ -138,7 +138,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
 
 
 def _judged(named: Named) -> Named:
-    """The last model under the noise by which it is judged now that it has got better."""
+    """The last model with the noise of its present residuals."""
     if not named.steps:
         return named
     judge, fit = fit_with_noise(named.judge.measured, named.fit.x, named.fit.free)
@@ -146,7 +146,7 @@ def _judged(named: Named) -> Named:
 
 
 def without_needless_steps(named: Named) -> Named:
-    """Without the steps that later ones have made needless."""
+    """Without steps that later steps made redundant."""
     return named.extended(without_needless(named.asked, named.base, named.steps))
 
 

@@ -196,7 +196,7 @@ def with_exact_columns(
 
 def under(found: Responses, judge: FitTarget, other: FitTarget) -> Responses:
     """The same responses in deviations of the noise of another target; residual and slopes stay as they are."""
-    if judge.known is None:  # whose noise is that of the measurement, and stays
+    if judge.known is None:  # it has the measurement noise, which is kept
         return found
 
     def each(part: Float[np.ndarray, "group value k"]) -> Float[np.ndarray, "group value k"]:

@@ -53,7 +53,7 @@ def prequential(target: FitTarget, fit: Fit) -> Prequential:
     known, design = fit.residual[measured.count.size :], fit.jacobian[measured.count.size :]  # weighed before all rows
     before, precision = precision @ mean, precision + design.T @ design
     mean = np.linalg.solve(precision, before + design.T @ known)
-    starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block has what is left over, too
+    starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block also has the remaining rows
     scores, p, surprise = [], [], []
     for start, end in zip(starts, [*starts[1:], shape[1]], strict=True):
         rows = slice(start, end)
@@ -81,7 +81,7 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
     Args:
         found: the scores.
         markers: names, three channels each.
-        level: of the p-values, shared by all blocks.
+        level: level of the p-values, shared by all blocks.
     """
     failing = np.flatnonzero(found.p <= level / len(found.p))
     if len(failing) == 0:

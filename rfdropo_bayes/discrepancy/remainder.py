@@ -52,7 +52,7 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     unit = Autoregression(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
     parts = _parts(np.asarray(measurements.valid[:, rows, own].any(axis=2)), unit)
     seen = np.concatenate([data[part.groups][:, part.seen].reshape(-1) for part in parts])
-    most = max(LARGEST, 3.0 * float(np.sqrt(np.mean(seen**2))))  # a stated noise may be a thousandth of what is left
+    most = max(LARGEST, 3.0 * float(np.sqrt(np.mean(seen**2))))  # a stated noise may be a thousandth of the residuals
     amplitudes = np.concatenate([[0.0], np.geomspace(SMALLEST, most, AMPLITUDES)])
     best = (0.0, 0.0, LENGTHS[0])
     for length in LENGTHS:

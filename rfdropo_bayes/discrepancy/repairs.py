@@ -1,14 +1,12 @@
-"""What a search that takes one step after the other does not see by itself.
+"""Repairs of errors of a stepwise search.
 
-`paying_pair`, where the best step leaves more than twice the noise's variance: compliance and pretension of cables pay
-    only together.
-`climbed_again`, before a step joins: a candidate must not be named for what base parameters can do, or for having moved
-    a climb on that had stopped early.
-`without_needless`, after a further step: of a lag found first, and a delay and another lag found later, the first comes
-    down to nothing; what two causes together look like may be named before either of them.
+`paying_pair`, if the best step leaves more than twice the noise's variance: compliance and pretension of cables pay
+    only together. `climbed_again`, before a step joins: a candidate must not be named for an effect of base parameters,
+    or for continuing an optimisation that stopped early. `without_needless`, after a further step: a first lag may
+    vanish after a delay and another lag are found, since a mixture of two causes may be named before either.
 
-Two more concern single refits, see `ExtensionSearch`: all sizes of an amplitude are looked through, as shifts in time
-have a summit at every jump of a command; and a model that stays far off is climbed from afar, too.
+Two more concern single refits, see `ExtensionSearch`: all sizes of an amplitude are tried, as time shifts have an
+optimum at every jump of a command; and a misspecified model is also optimised from a distant start.
 """
 
 from __future__ import annotations
@@ -30,15 +28,15 @@ PAIRS = 3  # that are refitted
 
 
 def paying_pair(search: ExtensionSearch, found: Screen, named: Sequence[str], single: Added | None) -> list[Added]:
-    """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
+    """Two mechanisms at once, if the best leaves most of a large misfit; empty if they do not pay.
 
-    Pairs are ranked by what the linear model says of them, and the leading ones are refitted.
+    Pairs are ranked by the linear model, and the leading pairs are refitted.
 
     Args:
-        search: of the present model.
-        found: its screen.
+        search: search beside the present model.
+        found: its score tests.
         named: mechanisms in it.
-        single: the best single one; None without one.
+        single: the best single mechanism; None without it.
     """
     if search.room(len(named)) < 2:
         return []
@@ -87,13 +85,13 @@ def _refit_pair(search: ExtensionSearch, fit: Fit, rows: Sequence[ScreenRow]) ->
 
 
 def climbed_again(search: ExtensionSearch, step: Added) -> Fit | None:
-    """The model before a step, climbed from where the step led; None where that is no better."""
+    """The model before a step, optimised again from the step's result; None if that is no better."""
     before, target = step.before.fit, search.target
     free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
     emptied = step.fit.x.copy()
     emptied[added] = before.x[added]
-    # What base parameters can do, too, is theirs: a gain of all cables, beside the radius of their drums. Else it
-    # would be credited to the candidate.
+    # An effect that base parameters can also explain belongs to them, such as a gain of all cables and the radius of
+    # their drums. Otherwise it would be credited to the candidate.
     place = {index: k for k, index in enumerate(free)}
     own, others = ([place[index] for index in chosen] for chosen in (before.free, added))
     done = step.fit.jacobian[:, others] @ (step.fit.x[added] - before.x[added])
@@ -105,7 +103,7 @@ def climbed_again(search: ExtensionSearch, step: Added) -> Fit | None:
 
 
 def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tuple[Added, ...]:
-    """Steps less those without whose parameters the last model has as much evidence."""
+    """Steps without redundant steps: the last model has equal evidence without their parameters."""
     if len(steps) < 2:
         return tuple(steps)
     last, null = steps[-1], search.target.forward.coordinates.null
@@ -125,7 +123,7 @@ def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added])
 
 
 def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: Fit) -> tuple[Added, ...]:
-    """Steps less one of them that has parameters, the later ones refitted without it."""
+    """Steps without one step with parameters; later steps are refitted without it."""
     candidate, null = search.candidate(steps[index].name), search.target.forward.coordinates.null
     assert candidate is not None
     gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
@@ -141,7 +139,7 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
 
 
 def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:
-    """What a fit's normal approximation says that a model loses at best where some coordinates are held at a point."""
+    """Least loss [nat] of a model with some coordinates fixed at a point, by the fit's normal approximation."""
     place = [int(np.flatnonzero(fit.free == index)[0]) for index in moved]
     apart = fit.x[moved] - point[moved]
     return 0.5 * float(apart @ np.linalg.solve(fit.covariance[np.ix_(place, place)], apart))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
-RANK_TOLERANCE = 1e-5  # of the largest singular value: what base parameters are taken to span
+RANK_TOLERANCE = 1e-5  # of the largest singular value: limit of the base parameters' span
 VISIBLE = 1.0  # a candidate of the size its prior expects must move the whitened data by so much in all
 
 

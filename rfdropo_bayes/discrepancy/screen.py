@@ -92,13 +92,13 @@ def screen(
         finer: residuals of the finer simulator with the same parameters.
     """
     seen = [probe for probe in probes if probe.mark.rank > 0]
-    # As in the simulated data sets, what the parameters could still take is no discrepancy: a prior holds a size of
-    # many of its deviations back from where the data have it.
+    # As in the simulated data sets, a further step of the parameters is no discrepancy: a prior holds back a size of
+    # many of its deviations.
     left = np.stack([fit.residual] if finer is None else [fit.residual, finer])
     residuals = project_out(span(fit.jacobian), left.T).T
     observed, surprises = _statistics(target, residuals, seen)
     simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
-    if target.noise.source == RESIDUALS:  # whose mean square is that of the residuals by construction
+    if target.noise.source == RESIDUALS:  # their mean square equals the residuals' by construction
         del observed["variance"], simulated["variance"]
     most = reference.max(axis=1) if seen else np.zeros(bootstraps)
     if seen:  # without candidates there is no test by them, and no p-value of one that says nothing

@@ -57,12 +57,12 @@ class Balance(NamedTuple):
 
     base_force: Float[Array, "rows 3"]  # of the clamp on the body [N]; cables pull on their anchors besides
     base_moment: Float[Array, "rows 3"]  # about the origin of the robot's frame [N m]
-    contact_force: Float[Array, "rows 3"]  # of what touches the body on it [N]
+    contact_force: Float[Array, "rows 3"]  # of touching bodies on the body [N]
     kinetic_energy: Float[Array, " rows"]  # [J]
     elastic_energy: Float[Array, " rows"]  # [J]
     gravitational_energy: Float[Array, " rows"]  # [J]; zero with every node at the origin
     cable_work: Float[Array, " rows"]  # done by the cables on the body [J]
-    contact_work: Float[Array, " rows"]  # done on the body by what touches it [J]
+    contact_work: Float[Array, " rows"]  # done on the body by touching bodies [J]
     damping_loss: Float[Array, " rows"]  # to Rayleigh damping [J]
 
     @property
@@ -84,7 +84,7 @@ UNITS = dict.fromkeys(Balance._fields, "J") | {"base_force": "N", "base_moment":
 class _Step(NamedTuple):
     """Forces [N] and powers [W] of one step."""
 
-    residual: Float[Array, "nodes 3"]  # what the equation of motion lacks
+    residual: Float[Array, "nodes 3"]  # residual of the equation of motion
     cable: Float[Array, ""]
     damping: Float[Array, ""]
 

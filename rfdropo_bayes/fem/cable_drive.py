@@ -16,7 +16,7 @@ class DriveLimits(NamedTuple):
     at the START of the previous step: a cable that is commanded faster follows at about half the rate, one step late.
     """
 
-    displacement: Float[np.ndarray, " cables"]  # largest displacement [m]; infinite where there is no limit
+    displacement: Float[np.ndarray, " cables"]  # largest displacement [m]; infinite without a limit
     rate: float = np.inf  # largest difference from the measured displacement [m per step]
 
     def apply(self, commanded: Float[Array, " cables"], measured: Float[Array, " cables"]) -> Float[Array, " cables"]:

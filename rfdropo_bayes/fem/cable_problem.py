@@ -86,7 +86,7 @@ def settle_cables(
             largest = jnp.maximum(jnp.max(jnp.abs(free), axis=0), jnp.max(jnp.abs(velocity), axis=0))
             still = jnp.max(jnp.abs(moving), axis=0) <= TOLERANCE * largest
             share = jnp.where(still, 1.0, searched(now.impulse, change, velocity, moving))
-            # The set of the step before is not that of its impulses: no Newton step leads on from there.
+            # The constraint set of the step before does not match its impulses: no Newton step continues from it.
             share = jnp.where(now.iteration > 0, share, 0.0)
             return now.impulse + share * change, pulling(velocity + share * moving), still & (now.iteration > 0)
 

@@ -1,8 +1,11 @@
 """Displacement-driven cables that can pull but not push, through guides on the sections of a rod.
 
-A cable runs straight from a fixed anchor through guide points of the body to the last of them, where it is tied. Its
+A cable runs straight from a fixed anchor through guide points of the body to the last guide, to which it is tied. Its
 length may not exceed the commanded one; tension and slack are complementary (Signorini's condition, which
 ``fem.constraints`` solves).
+
+Guides have a size: they touch before the segment between them has zero length. A segment shorter than ``ROUND`` of its
+rest length counts as longer, by a smooth law, which keeps its direction defined and its stiffness bounded.
 """
 
 from __future__ import annotations
@@ -18,18 +21,34 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.components import Matrix, Vector, cross, dot, times
+from rfdropo_bayes.fem.components import Matrix, Vector, cross, dot, skew, times
 from rfdropo_bayes.fem.rod import Rod, attach
+
+ROUND = 0.25
+"""Share of its rest length below which a segment counts as longer. ASSUMED: necks compressed this far stand for
+touching discs; with half of it, a step of 10 ms passes through the contact.
+"""
+TINY = 1e-30
+"""[m2] Keeps the derivative of a way without length finite."""
 
 
 class CableLayout(NamedTuple):
-    """Cables of a rod; rows of unused guides repeat the last used one. NumPy arrays, fixed for a simulation."""
+    """Cables of a rod; rows of unused guides repeat the last used one. NumPy arrays, fixed for a simulation.
+
+    The way to a guide begins at the guide before it, or at the anchor. It runs beside elements, whose ends it holds
+    against each other as a taut string does: one beside several elements is taken to hold each of them, one beside a
+    part of an element that part.
+    """
 
     anchor: Float[np.ndarray, "cables 3"]  # fixed in space [m]
     station: Int[np.ndarray, "cables guides 2"]  # of a guide, as in ``rod.PointMap``
     weight: Float[np.ndarray, "cables guides 2"]
     arm: Float[np.ndarray, "cables guides 2 3"]  # [m]
     used: Bool[np.ndarray, "cables guides"]
+    way: Float[np.ndarray, "cables guides"]  # to a guide, at rest [m]
+    element: Int[np.ndarray, "cables guides pieces"]  # that the way to a guide runs beside
+    share: Float[np.ndarray, "cables guides pieces"]  # of the way's stiffness that the element sees; zero for none
+    along: Float[np.ndarray, "cables guides pieces"]  # share of the way in the middle of the piece
 
 
 def cable_layout(
@@ -44,7 +63,23 @@ def cable_layout(
     anchors, points, used = routed(anchors, guides)
     bound = attach(body, points.reshape(-1, 3))
     station, weight, arm = (part.reshape(*used.shape, *part.shape[1:]) for part in bound)
-    return CableLayout(anchors, station, weight, arm, used)
+    return CableLayout(anchors, station, weight, arm, used, *_ways(body, anchors, points, used))
+
+
+def _ways(
+    body: Rod, anchors: np.ndarray, points: np.ndarray, used: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Lengths of the ways to all guides, and their pieces beside elements: element, share of stiffness and place."""
+    before = np.concatenate([anchors[:, None], points[:, :-1]], axis=1)
+    way = np.where(used, np.linalg.norm(points - before, axis=-1), 1.0)
+    low, rise = np.minimum(before, points)[..., 2, None], (points - before)[..., 2, None]
+    ends = np.clip(body.station, low, low + np.abs(rise))
+    covered, middle = np.where(used[..., None], np.diff(ends), 0.0), 0.5 * (ends[..., 1:] + ends[..., :-1])
+    share = covered * way[..., None] / np.diff(body.station) ** 2
+    along = (middle - before[..., 2, None]) / np.where(rise == 0.0, 1.0, rise)
+    pieces = max(int(np.max(np.sum(share > 0.0, axis=-1), initial=1)), 1)
+    element = np.sort(np.argsort(share == 0.0, axis=-1, kind="stable")[..., :pieces], axis=-1)
+    return way, element, np.take_along_axis(share, element, -1), np.take_along_axis(along, element, -1)
 
 
 def routed(
@@ -63,7 +98,7 @@ def routed(
     for cable, points in enumerate(guides):
         points = np.asarray(points, dtype=float).reshape(-1, 3)
         if len(points) == 0:
-            raise InputError("no guide point", where=f"cable {cable}", remedy="give the point where it is tied")
+            raise InputError("no guide point", where=f"cable {cable}", remedy="give the point to which it is tied")
         steps = np.linalg.norm(np.diff(np.concatenate([anchors[cable : cable + 1], points]), axis=0), axis=1)
         if not np.all(steps > 1e-9):
             raise InputError("two successive points coincide", where=f"cable {cable}", remedy="remove one of them")
@@ -91,10 +126,12 @@ class Threads(NamedTuple):
 
 
 class Courses(NamedTuple):
-    """Where cables run."""
+    """Courses of cables."""
 
-    length: Float[Array, "cables guides ..."]  # from the point before to each guide [m]; zero where unused
-    direction: Float[Array, "3 cables guides ..."]  # unit vectors, zero where unused
+    length: Float[Array, "cables guides ..."]  # from the previous point to each guide [m]; zero if unused
+    direction: Float[Array, "3 cables guides ..."]  # its derivative by the guide's place, zero if unused
+    inverse: Float[Array, "cables guides ..."]  # its second derivative is inverse - sharp * direction direction' [1/m]
+    sharp: Float[Array, "cables guides ..."]
     lever: Float[Array, "3 cables guides sides ..."]  # of the guides, in space [m]
 
     @property
@@ -112,8 +149,9 @@ def _sides(layout: CableLayout) -> int:
 
 
 def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"]:
-    """Stations of the guides. Cables that share those of their guides, which most do, are told by a first axis of one:
-    then fewer parts are gathered."""
+    """Stations of the guides. Cables that share the stations of their guides, as most do, have a first axis of length
+    1, so that fewer parts are gathered.
+    """
     station = layout.station[:, :, : _sides(layout)]
     if not len(station):
         return station
@@ -125,7 +163,8 @@ def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"
 def _gathered(values: Float[Array, "k n ..."], index: Int[np.ndarray, " m"]) -> Float[Array, "m k ..."]:
     """Parts of the second axis, which becomes the first.
 
-    On lanes a loop copies long rows. Without, a product with ones and zeros is quick in both modes of differentiation.
+    On lanes a loop copies long rows. Without lanes, a product with a 0-1 matrix is fast in both modes of
+    differentiation.
     """
     if values.ndim == 2:
         return (index[:, None] == np.arange(values.shape[1])).astype(float) @ values.T
@@ -140,7 +179,7 @@ def threads(layout: CableLayout) -> Threads:
 
 
 def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matrix) -> Courses:
-    """Where the cables run, from the places and frames of the stations."""
+    """Courses of the cables, from the places and frames of the stations."""
     index, lanes = _stations(layout), position.shape[2:]
     parts = _gathered(jnp.concatenate([position, frame.reshape(9, *frame.shape[2:])]), index.ravel())
     parts = jnp.moveaxis(parts, 0, 1).reshape(12, *index.shape, *lanes)
@@ -153,8 +192,14 @@ def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matri
     used = layout.used.reshape(*layout.used.shape, *[1] * (place.ndim - 3))
     unit = np.array([1.0, 0.0, 0.0]).reshape(3, *[1] * (place.ndim - 1))
     segment = jnp.where(used, points[:, :, 1:] - points[:, :, :-1], unit)
-    length = jnp.sqrt(dot(segment, segment))
-    return Courses(jnp.where(used, length, 0.0), jnp.where(used, segment / length, 0.0), lever)
+    near = (ROUND * layout.way).reshape(used.shape)
+    distance = jnp.sqrt(dot(segment, segment) + TINY)
+    share = jnp.minimum(distance / near, 1.0)
+    square, far = share * share, distance > near
+    length = jnp.where(far, distance, near * (0.375 + square * (0.75 - 0.125 * square)))
+    inverse = jnp.where(far, 1.0 / distance, (1.5 - 0.5 * square) / near)
+    sharp = jnp.where(far, inverse, 1.0 / (inverse * inverse * near**3))
+    return Courses(jnp.where(used, length, 0.0), jnp.where(used, segment * inverse, 0.0), inverse, sharp, lever)
 
 
 def _entries(station: Int[np.ndarray, " bound"], used: Bool[np.ndarray, " bound"], stations: int) -> np.ndarray:
@@ -195,11 +240,56 @@ def _at_stations(
     bound: Bool[np.ndarray, "guides sides"],
     stations: int,
 ) -> Float[Array, "stations k ..."]:
-    """Sums over what is bound to each station."""
+    """Sums over the parts bound to each station."""
     flat = parts.reshape(len(parts), -1, *parts.shape[3:])
     flat = jnp.concatenate([flat, jnp.zeros_like(flat[:, :1])], axis=1)
     index = _entries(station.ravel(), bound.ravel(), stations)
     return sum((_gathered(flat, places) for places in index[1:]), _gathered(flat, index[0]))
+
+
+class Held(NamedTuple):
+    """How taut cables hold the ends of elements: forces and moments of changes of strain times length, in space."""
+
+    force: Matrix  # by stretch and shear [N/m]
+    mixed: Matrix  # force by bending and twist [N]
+    moment: Matrix  # by bending and twist [N m]
+
+
+def _outer(a: Vector, b: Vector) -> Matrix:
+    return a[:, None] * b[None]
+
+
+def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ..."], elements: int) -> Held:
+    """Stiffness of the cables at a tension [N]: P times the change of every segment, with P the second derivative of
+    its length.
+
+    Together with the rod's forces that turn with its sections, this is the exact tangent of a body loaded by cables
+    only.
+    """
+    offset = sum((course.lever[:, :, :, side] for side in range(1, course.lever.shape[3])), course.lever[:, :, :, 0])
+    before = jnp.concatenate([offset[:, :, :1], offset[:, :, :-1]], axis=2)
+    lanes = [1] * (offset.ndim - 3)
+    parts = []
+    for piece in range(layout.share.shape[2]):
+        share, along = (part[:, :, piece].reshape(*part.shape[:2], *lanes) for part in (layout.share, layout.along))
+        taut, arm = tension[:, None] * share, along * offset + (1.0 - along) * before
+        a, way, turn = taut * course.inverse, course.direction, cross(course.direction, arm)
+        b = taut * course.sharp
+        one = jnp.eye(3).reshape(3, 3, *[1] * a.ndim)
+        force = one * a - _outer(way, b * way)
+        mixed = _outer(way, b * turn) - skew(a * arm)
+        moment = one * (a * dot(arm, arm)) - _outer(arm, a * arm) - _outer(turn, b * turn)
+        parts.append(jnp.stack([force, mixed, moment]).reshape(27, *a.shape))
+    whole = jnp.stack(parts, axis=3)
+    index, bound = layout.element, layout.share > 0.0
+    if not len(index):
+        return Held(*jnp.zeros((3, 3, 3, elements, *whole.shape[4:])))
+    longest = np.argmax(bound.sum(axis=(1, 2)))
+    if np.all((index == index[longest]) | ~bound):
+        sums = _at_stations(jnp.sum(whole, axis=1), index[longest], bound.any(axis=0), elements)
+    else:
+        sums = sum(_at_stations(whole[:, c], index[c], bound[c], elements) for c in range(len(index)))
+    return Held(*jnp.moveaxis(sums, 0, 1).reshape(3, 3, 3, elements, *whole.shape[4:]))
 
 
 def lengths(course: Courses) -> Float[Array, "cables ..."]:

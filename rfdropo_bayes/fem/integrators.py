@@ -46,8 +46,9 @@ class Stage(NamedTuple):
     elapsed: float  # that passes in it
     length: float  # p
     carried: float  # share of the change in the stage before with which all goes on
-    predicted: bool  # whether forces are those where the velocity leads, else those where the stage starts
-    wide: Any = 1.0  # of a stage with impacts: its p for the motion, in ``length``; what has a memory keeps its own
+    predicted: bool  # whether forces are taken at the predicted position, else at the start of the stage
+    # of a stage with impacts: its p for the motion, in ``length``; variables with memory keep their own
+    wide: Any = 1.0
 
     @property
     def span(self) -> Any:

@@ -19,17 +19,17 @@ class Push(NamedTuple):
 
     touch: Touch
     cube: Cube
-    state: CubeState  # where the contacts were looked for
+    state: CubeState  # state at which the contacts were found
     twist: Float[Array, "6"]  # velocity and spin at the end of the stage without contacts
     before: Float[Array, "pairs 3"]  # impulses of the stage before, in space [N s]
-    wide: Scalar | None = None  # length of the stage, in those of the stage before
+    wide: Scalar | None = None  # length of the stage, in units of the previous stage's
 
 
 class PushedRows(NamedTuple):
     """The contacts in the constraint problem of a stage, three rows each."""
 
     rows: Float[Array, "stations 6 rows"]
-    base: Float[Array, " rows"]  # of the relative velocities, what the cube does without contacts [m/s]
+    base: Float[Array, " rows"]  # of the relative velocities, the cube's motion without contacts [m/s]
     compliance: Float[Array, "rows rows"]  # of the cube [1/kg]
     contacts: Contacts
 
@@ -40,7 +40,7 @@ class Released(NamedTuple):
     cube: CubeState
     touch: Float[Array, "pairs 3"]  # impulses of all pairs that can touch, in space [N s]
     sudden: Float[Array, "stations 6"]  # impacts on the body [N s], [N m s]
-    sudden_twist: Float[Array, "6"]  # and what they change the cube's velocity and spin by
+    sudden_twist: Float[Array, "6"]  # and their change of the cube's velocity and spin
 
 
 def meet(

@@ -37,7 +37,7 @@ class CubeState(NamedTuple):
 
 def solid_gyration_radius(side: Scalar) -> Float[Array, ""]:
     """Radius of gyration [m] of a homogeneous cube, a / sqrt(6)."""
-    return jnp.asarray(side) * (1.0 / np.sqrt(6.0))  # XLA rounds a quotient in one way where it folds constants
+    return jnp.asarray(side) * (1.0 / np.sqrt(6.0))  # XLA rounds a quotient differently when it folds constants
 
 
 def cube_at(position: Float[Array, "3"], yaw: Scalar, axis: Float[Array, "3"] | Float[np.ndarray, "3"]) -> CubeState:
@@ -85,7 +85,7 @@ def moved(state: CubeState, twist: Float[Array, "6"], time_step: Scalar) -> Cube
     velocity, spin = twist[:3], twist[3:]
     half = 0.5 * time_step * spin
     square = jnp.sum(half**2)
-    # sin(a) / a and cos(a) of half the angle, differentiable where it does not turn.
+    # sin(a) / a and cos(a) of half the angle, differentiable at zero.
     angle = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
     vector = half * jnp.where(square > 0.0, jnp.sin(angle) / angle, 1.0)
     scalar = jnp.where(square > 0.0, jnp.cos(angle), 1.0)

@@ -1,12 +1,13 @@
 """Geometrically exact rod elements between two stations: strains, their rates, forces and tangent.
 
-Strains are those of Simo and Reissner in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with
-q_v the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
-Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
-forces turn: under guided cables those of the rod and of the cables cancel nearly.
+Strains are Simo and Reissner's in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with q_v
+the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
+Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent neglects the rotation of the forces. The
+forces of guided cables rotate with the rod's: the sum of both is the stiffness of taut strings between sections, which
+depends on the strains alone (``cables.held``).
 
-An arc is longer than its chord: the stretch of an element is that of its chord, and h^2 / 24 times its squared
-curvature. Without that an element that is pressed together between its ends would be too stiff in bending.
+An arc is longer than its chord: the stretch of an element is its chord's plus h^2 / 24 times its squared curvature.
+Without this term an axially compressed element would be too stiff in bending.
 
 Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
 moment, or velocity and spin, in space.
@@ -19,6 +20,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.fem.cables import Held
 from rfdropo_bayes.fem.components import (
     Matrix,
     Quaternion,
@@ -105,7 +107,7 @@ def strain_rates(elements: Elements, twist: Six) -> Six:
 
 
 def station_forces(elements: Elements, resultant: Six) -> Six:
-    """Forces and moments on all stations of the sections' forces and moments, those in the elements' frames."""
+    """Forces and moments on all stations from the sections' forces and moments in the elements' frames."""
     force = times(elements.frame, resultant[:3])
     bowed = jnp.concatenate([resultant[3:5] + _bow(elements) * resultant[2], resultant[5:]])
     moment = _less_turn(elements, times(elements.frame, bowed))
@@ -117,12 +119,23 @@ def station_forces(elements: Elements, resultant: Six) -> Six:
     return jnp.concatenate([first, none], axis=1) + jnp.concatenate([none, second], axis=1)
 
 
-def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> Stiffness:
-    """Stiffness of the elements, from the stiffness of the sections: a diagonal, and a diagonal or a matrix."""
+def held_resultant(elements: Elements, held: Held, rates: Six) -> Six:
+    """Forces and moments of the sections in the elements' frames, of cables that hold them against strain rates."""
+    stretching, bending = (elements.length * times(elements.frame, part) for part in (rates[:3], rates[3:]))
+    force = times(held.force, stretching) + times(held.mixed, bending)
+    moment = transposed_times(held.mixed, stretching) + times(held.moment, bending)
+    return jnp.concatenate([transposed_times(elements.frame, force), transposed_times(elements.frame, moment)])
+
+
+def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held: Held | None = None) -> Stiffness:
+    """Stiffness of the elements, from the stiffness of the sections, a diagonal and a diagonal or a matrix, and of the
+    cables that hold them."""
     frame, way = elements.frame, elements.way
     c = product(frame * (stretch / elements.length)[None], transposed(frame))
     turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
     bent = product(turned / elements.length, transposed(frame))
+    if held is not None:
+        c, bent = c + held.force, bent + held.moment
     for _ in range(2):  # W from the left, then, as the matrix is symmetric, from the right
         row = transposed_times(bent, elements.bend)
         bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
@@ -133,4 +146,13 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix) -> St
     lever_a, lever_b = turn + fold, turn - fold
     a, b = product(c, lever_a), product(c, lever_b)
     back_a, back_b = transposed(lever_a), transposed(lever_b)
-    return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)
+    if held is None:
+        return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)
+    mixed = held.mixed - (elements.share * times(held.mixed, elements.bend))[:, None] * elements.bend[None]
+    more = transposed(mixed)
+    turning_a, turning_b = bent - product(more, lever_a), bent + product(more, lever_b)
+    a, b = a - mixed, b + mixed
+    return Stiffness(
+        c, a, b, product(back_a, a) + turning_a, product(back_b, b) + turning_b,
+        product(back_b, a) + product(more, lever_a) - bent,
+    )  # fmt: skip

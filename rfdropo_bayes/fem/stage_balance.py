@@ -1,8 +1,8 @@
 """Forces and energies of rollouts of a rod: they are simulated again, stage by stage.
 
-Over a step of two stages the momentum changes by all impulses of the second and by those of the first times
-1 + going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the
-velocities at the ends of the stages add up to the way, so that work is summed by stages.
+Over a step of two stages the momentum changes by all impulses of the second stage and by the first stage's times 1 +
+going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the
+velocities at the ends of the stages add up to the displacement, so that work is summed by stages.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rod_elements import strain_rates
 from rfdropo_bayes.fem.sections import linear
-from rfdropo_bayes.fem.stage_solve import inertia_times, linearised, matrix_times
+from rfdropo_bayes.fem.stage_solve import Way, inertia_times, linearised, matrix_times
 
 
 class _Done(NamedTuple):
     """Impulses [N s], [N m s] and work [J] of a stage, or of a step."""
 
-    residual: Float[Array, "stations 6"]  # of what holds and touches the body
+    residual: Float[Array, "stations 6"]  # of holding and touching bodies
     held: Float[Array, ""]  # its work
     pulled: Float[Array, ""]  # work of the cables
     lost: Float[Array, ""]  # to Rayleigh damping
 
 
 class _Reached(NamedTuple):
-    """Where a step ends, and what it did."""
+    """End state of a step, and its effects."""
 
     position: Float[Array, "stations 3"]
     done: _Done
@@ -63,9 +63,11 @@ def cable_wrench(system: System, state: State, tension: Float[Array, " cables"])
 
 
 def _done(system: System, prepared: Prepared, before: State, after: State, begun: StageBegun, length: Scalar) -> _Done:
-    """What a stage did, of this length [s]."""
+    """Effects of a stage of this length [s]."""
     body, twist = begun.body, twist_of(after)
-    line, cable = linearised(body), length * cable_wrench(system, begun.at, after.tension)
+    way = Way(system.clamped_stations, begun.stage.predicted, system.cables)
+    line = linearised(way, body, threads(system.cables), begun.at.tension)
+    cable = length * cable_wrench(system, begun.at, after.tension)
     change = (twist - twist_of(before)).T
     residual = (matrix_times(body, line, change) - line.right).T - cable
     rates = strain_rates(line.elements, twist.T)
@@ -118,10 +120,10 @@ def stepped_balance(
     """Forces and energies of a rollout of a rod.
 
     Args:
-        state: where it starts, with the commanded displacements before the first step.
-        displacement: commanded at the end of every step [m].
-        integrator: how a step is taken.
-        scene, cube: what the body touches.
+        state: initial state, with the commanded displacements before the first step.
+        displacement: commanded displacement at the end of every step [m].
+        integrator: scheme of a step.
+        scene, cube: bodies in contact.
 
     Raises:
         InputError: cables with friction.
@@ -133,7 +135,9 @@ def stepped_balance(
         1
     ]
     body = stage_body(system, prepared, first, time_step)
-    still = -linearised(body).right.T / time_step - cable_wrench(system, first, first.tension)
+    way = Way(system.clamped_stations, True, system.cables)
+    right = linearised(way, body, threads(system.cables), first.tension).right
+    still = -right.T / time_step - cable_wrench(system, first, first.tension)
     held = (jnp.arange(len(still)) < system.clamped_stations)[:, None]
     acting = jnp.concatenate([still[None], reached.done.residual / time_step])
     clamp = jnp.where(held, acting, 0.0)

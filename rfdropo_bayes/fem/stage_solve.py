@@ -4,9 +4,9 @@ A stage finds the change d of velocities and spins, and the impulses g of all co
 
     A d = r + J' g,    g = P(J (v + d) + b)
 
-Everything dear runs on lanes of a batch (``lanes``). A derivative is one more right-hand side of the system that is
-factorised already: that of what the equations lack when the inputs change and the solution does not, which needs no
-matrix. In reverse it is the transposed system's.
+All expensive operations run on lanes of a batch (``lanes``). A derivative is one more right-hand side of the factorised
+system: the residual of the equations when the inputs change and the solution does not, which needs no matrix. Reverse
+mode uses the transposed system.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import rod_elements
 from rfdropo_bayes.fem.cable_problem import settle_cables
-from rfdropo_bayes.fem.cables import CableLayout, Threads, courses, lengths, station_rows
+from rfdropo_bayes.fem.cables import CableLayout, Courses, Held, Threads, courses, held, lengths, station_rows
 from rfdropo_bayes.fem.chain import Chain, Eliminated, Factor, ascend, descend, eliminate
 from rfdropo_bayes.fem.components import (
     Matrix,
@@ -49,9 +49,9 @@ class StageBody(NamedTuple):
     section: Sections
     mass: Float[Array, "stations ..."]  # [kg]
     inertia: Float[Array, "3 stations ..."]  # about the sections' axes [kg m2]
-    position: Vector  # where forces are taken [m]
+    position: Vector  # points at which forces are taken [m]
     orientation: Quaternion
-    twist: Six  # velocities and spins where the stage starts
+    twist: Six  # velocities and spins at the start of the stage
     load: Six  # forces and moments besides [N], [N m]
     span: Scalar  # p [s]
     lookahead: Scalar  # [s] times the tangent times the change of velocity is the change of force
@@ -70,7 +70,7 @@ class Bonds(NamedTuple):
     reach: Float[Array, " cables"]  # commanded lengths [m]
     previous: Float[Array, " cables"]  # impulses that the iterations start from [N s]
     give: Scalar  # of every cable's length per tension [m/N]
-    follows: Scalar  # length of the stage for what has a memory [s]
+    follows: Scalar  # length of the stage for variables with memory [s]
     rows: Float[Array, "stations 6 others"] | None = None  # of friction and contacts
     base: Float[Array, " others"] | None = None  # velocities in these rows besides the body's
     compliance: Float[Array, "others others"] | None = None  # in these rows besides the body's
@@ -79,7 +79,7 @@ class Bonds(NamedTuple):
 
 
 class Way(NamedTuple):
-    """What is static: how many stations are held, whether forces are taken where the velocity leads, and the cables."""
+    """Static settings: number of held stations, whether forces are taken at the predicted position, and the cables."""
 
     held: int
     predicted: bool
@@ -87,9 +87,9 @@ class Way(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Of a stage."""
+    """Solution of a stage."""
 
-    change: Float[Array, "6 stations"]  # of velocities and spins; zero where the body is held
+    change: Float[Array, "6 stations"]  # of velocities and spins; zero at held stations
     impulse: Float[Array, " rows"]  # of all constraints [N s]
     converged: Float[Array, ""]  # 1 if the impulses were found, else 0
 
@@ -100,11 +100,13 @@ class Linearised(NamedTuple):
     elements: Elements
     slope: Sections
     frame: Matrix  # of the stations
+    course: Courses  # of the cables
+    held: Held  # of the elements between them
     right: Six
 
 
 class Kept(NamedTuple):
-    """What a derivative of the solution needs."""
+    """Data for derivatives of the solution."""
 
     factor: Factor
     columns: Float[Array, "stations 6 rows"]  # C^-1 J'
@@ -119,28 +121,34 @@ def inertia_times(body: StageBody, frame: Matrix, twist: Six) -> Six:
     return jnp.concatenate([body.mass * twist[:3], turning])
 
 
-def linearised(body: StageBody) -> Linearised:
-    """The right-hand side of a stage, and what its matrix is made of."""
+def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array, "cables ..."]) -> Linearised:
+    """The right-hand side of a stage, and the parts of its matrix, at the tensions [N] of the previous stage."""
+    frame = rotation(body.orientation)
+    course = courses(way.layout, thread, body.position, frame)
+    between = held(way.layout, course, tension, len(body.length))
     elements = rod_elements.shape(body.length, body.position, body.orientation)
     slope = slopes(body.section, elements.strain)
     rates = rod_elements.strain_rates(elements, body.twist)
     resultant = answer(body.section, elements.strain) + body.behind * linear(slope, rates)
     if body.branch is not None and body.gain is not None:
         resultant = resultant + body.gain * linear(body.section, elements.strain - body.branch)
-    frame = rotation(body.orientation)
+    if not way.predicted:
+        resultant = resultant + body.span * rod_elements.held_resultant(elements, between, rates)
     momentum = inertia_times(body, frame, body.twist)
     force = rod_elements.station_forces(elements, resultant) + body.load - body.loss * momentum
     gyroscopic = cross(body.twist[3:], momentum[3:])
     right = body.span * (force - jnp.concatenate([jnp.zeros_like(gyroscopic), gyroscopic]))
     if body.carried is not None:
         right = right + body.carried
-    return Linearised(elements, slope, frame, right)
+    return Linearised(elements, slope, frame, course, between, right)
 
 
 def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
     """A times a field."""
-    strained = linear(line.slope, rod_elements.strain_rates(line.elements, change))
-    stiff = -body.span * body.lookahead * rod_elements.station_forces(line.elements, strained)
+    rates = rod_elements.strain_rates(line.elements, change)
+    strained = body.lookahead * linear(line.slope, rates)
+    strained = strained + body.span * rod_elements.held_resultant(line.elements, line.held, rates)
+    stiff = -body.span * rod_elements.station_forces(line.elements, strained)
     result = stiff + (1.0 + body.span * body.loss) * inertia_times(body, line.frame, change)
     if body.added is None:
         return result
@@ -151,7 +159,8 @@ def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
 def matrix(body: StageBody, line: Linearised) -> Chain:
     """A."""
     scale = body.span * body.lookahead
-    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, scale * line.slope.bending)
+    taut = Held(*(body.span**2 * part for part in line.held))
+    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, scale * line.slope.bending, taut)
     grown = 1.0 + body.span * body.loss
     straight = jnp.eye(3).reshape(3, 3, *[1] * body.mass.ndim) * (grown * body.mass)
     if body.added is not None:
@@ -160,9 +169,8 @@ def matrix(body: StageBody, line: Linearised) -> Chain:
     return Chain(element, straight, turning)
 
 
-def all_rows(way: Way, body: StageBody, bonds: Bonds, frame: Matrix) -> tuple[Array, Array]:
+def all_rows(way: Way, body: StageBody, bonds: Bonds, course: Courses) -> tuple[Array, Array]:
     """J of all constraints (stations, 6, rows), and the lengths of the cables [m]."""
-    course = courses(way.layout, bonds.thread, body.position, frame)
     rows = -station_rows(way.layout, bonds.thread, course.lever, course.pull, body.mass.shape[0])
     if bonds.rows is not None:
         rows = jnp.concatenate([rows, bonds.rows], axis=2)
@@ -177,7 +185,7 @@ def along(rows: Float[Array, "stations 6 rows"], twist: Six) -> Float[Array, " r
 def free_velocities(
     way: Way, body: StageBody, bonds: Bonds, moving: Float[Array, "rows ..."], reached: Float[Array, "cables ..."]
 ) -> Float[Array, "rows ..."]:
-    """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
+    """b: velocities of the constraints at the start of the stage, cables with their remaining lengths."""
     cables = len(reached)
     slack = (bonds.reach - reached) / body.span
     free = slack if way.predicted else moving[:cables] + slack
@@ -186,8 +194,8 @@ def free_velocities(
 
 def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Eliminated, Float[Array, "rows ..."]]:
     """Elimination, and the velocities of the constraints without them; on lanes."""
-    line = linearised(body)
-    rows, reached = all_rows(way, body, bonds, line.frame)
+    line = linearised(way, body, bonds.thread, bonds.previous / body.span)
+    rows, reached = all_rows(way, body, bonds, line.course)
     found = eliminate(matrix(body, line), line.right, rows, body.twist, way.held)
     return found, free_velocities(way, body, bonds, found.moving, reached) + found.reached
 
@@ -232,9 +240,9 @@ def _solve(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Kept]:
 
 
 def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bonds) -> tuple[Array, Array]:
-    """What the equations of a stage lack at a solution, as functions of the inputs."""
-    line = linearised(body)
-    rows, reached = all_rows(way, body, bonds, line.frame)
+    """Residuals of a stage's equations at a solution, as functions of the inputs."""
+    line = linearised(way, body, bonds.thread, bonds.previous / body.span)
+    rows, reached = all_rows(way, body, bonds, line.course)
     pulled = jnp.einsum("sir,r->is", rows, found.impulse)
     forces = matrix_times(body, line, found.change) - line.right - pulled
     cables = len(bonds.previous)

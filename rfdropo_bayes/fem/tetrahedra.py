@@ -10,7 +10,7 @@ functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law. Two
   depends on the order of the element's nodes.
 
 Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they serve fidelity to meshes of other
-simulators, not for accuracy at few unknowns.
+simulators, not accuracy with few unknowns.
 """
 
 from __future__ import annotations

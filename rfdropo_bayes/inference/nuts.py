@@ -19,7 +19,7 @@ from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
 
-CHAINS, SCREEN = 2, 64  # chains, which start at the best of so many prior draws
+CHAINS, SCREEN = 2, 64  # chains, which start at the best of this number of prior draws
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,7 +68,8 @@ def run(problem: Problem, config: NutsConfig, key: PRNGKeyArray, logbook: Logboo
     )
     sampler.run(run_key, init_params=jnp.asarray(u[best]), extra_fields=("num_steps", "diverging"))
     extra = sampler.get_extra_fields()
-    steps, diverging = 2 * int(np.sum(extra["num_steps"])), int(np.sum(extra["diverging"]))  # warming up takes as many
+    # the warm-up takes the same number
+    steps, diverging = 2 * int(np.sum(extra["num_steps"])), int(np.sum(extra["diverging"]))
     ledger.charge(problem, steps, problem.n_rows)
     draws = chains(problem, list(np.asarray(sampler.get_samples(group_by_chain=True))))
     sentence = f"{diverging} transitions diverged: the posterior has a place that steps cannot follow"

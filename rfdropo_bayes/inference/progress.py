@@ -37,9 +37,9 @@ from rfdropo_bayes.interrupts import check_interrupt
 SCHEMA_VERSION = 6
 _META = "meta_json"
 SHOWN = ("horizon", "ess", "acceptance", "loss", "rollouts")
-SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal
-UNFINISHED = 0.99  # what rollouts alone can fill of the bar: stages say when the work is done
-SMALLEST_SHARE = 0.01  # of the work, from whose time that of the rest is guessed
+SECONDS_BETWEEN_LINES = 30.0  # without a terminal
+UNFINISHED = 0.99  # share of the bar that rollouts can fill: stages report the end
+SMALLEST_SHARE = 0.01  # of the work, from which the remaining time is estimated
 
 
 class Progress:
@@ -84,7 +84,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.stop()
-        self._prints = False  # rollouts after the work, such as those of predictions, are no part of it
+        self._prints = False  # rollouts after the work, such as for predictions, are not part of it
 
     def spend(self, rollouts: float) -> None:
         """Report rollouts as they are done, in full-length equivalents."""

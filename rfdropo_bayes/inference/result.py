@@ -21,7 +21,7 @@ from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 SCATTERED = 0.5  # nats
 APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
 STUCK = 0.7  # correlation with their start that last moves may leave unsaid
-PRIOR_DRAWS = 2000  # that tell where a prior is, and whether it is one of logarithms
+PRIOR_DRAWS = 2000  # they show the range of a prior, and whether it is logarithmic
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
 
@@ -171,7 +171,7 @@ def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
     """
     if replicates > 1 and climbs != 1:
         return []
-    alone = "one replicate" if replicates == 1 else "one climb to an optimum"
+    alone = "one replicate" if replicates == 1 else "a single optimisation"
     sentence = (
         f"{alone} cannot show whether other modes of the posterior were lost: allow more rollouts, state "
         "replicates = 4, or compare seeds"

@@ -24,8 +24,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.port_signals import BodySignals, read_late
 
 WHERE = "[[model.laws]]"
-FAR = 1e3  # prior scales to each side of null, where a coefficient's hard bounds are
-SHAPES = 10.0  # times a shape, and its inverse, where the hard bounds of an inferred shape are
+FAR = 1e3  # hard bounds of a coefficient, in prior scales from null
+SHAPES = 10.0  # hard bounds of an inferred shape: times a shape, and its inverse
 WIDE = 0.5  # deviation of a shape's prior, as a share of the shape: audits try shapes that are 2 to 10 times apart
 
 

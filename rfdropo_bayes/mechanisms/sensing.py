@@ -38,7 +38,7 @@ class CameraRotation:
         """Rotate about the base's origin (Rodrigues' formula, written so that it is smooth at zero)."""
         vector = jnp.stack([values[spec.name] for spec in self.parameters])
         square = jnp.sum(vector**2)
-        # sin(a)/a and (1 - cos(a))/a^2 by their series near zero, where the square root has no derivative.
+        # sin(a)/a and (1 - cos(a))/a^2 by their series near zero, at which the square root has no derivative.
         small = square < 1e-8
         angle = jnp.sqrt(jnp.where(small, 1.0, square))
         first = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
@@ -80,46 +80,6 @@ class CameraOffset:
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
         """Shift all positions."""
         return position + jnp.stack([values[spec.name] for spec in self.parameters])
-
-
-class CameraDrift:
-    """The measuring frame moves at a steady velocity from the start of the recording; none at null."""
-
-    name = "camera_drift"
-    stage = "sensing"
-    cause = "cameras or a base that move or warm up during the recording"
-    remedy = "record a marker that is fixed to the base"
-    parameters = tuple(
-        ParameterSpec(
-            f"camera_drift_{axis}",
-            "m/s",
-            -0.1,
-            0.1,
-            0.0,
-            normal(0.0005),
-            f"velocity of measured positions along {axis}",
-        )
-        for axis in "xyz"
-    )
-
-    def sense_over_time(
-        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
-    ) -> Float[Array, "time marker 3"]:
-        """Shift the positions in proportion to time."""
-        return position + self._shift(values, (time - time[0])[:, None, None])
-
-    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[()]:
-        """Nothing to remember."""
-        return ()
-
-    def advance(
-        self, values: Values, memory: tuple[()], given: Float[Array, "marker 3"], now: Float[Array, ""]
-    ) -> tuple[tuple[()], Float[Array, "marker 3"]]:
-        """Shift the positions in proportion to time."""
-        return memory, given + self._shift(values, now)
-
-    def _shift(self, values: Values, elapsed: Float[Array, "..."]) -> Float[Array, "..."]:
-        return elapsed * jnp.stack([values[spec.name] for spec in self.parameters])
 
 
 class MarkerOffset:

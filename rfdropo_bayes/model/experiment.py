@@ -1,6 +1,6 @@
 """The experiment file: one TOML that names robot, data, priors, mechanisms, method, budget and seed.
 
-Names and numbers, as the file has them; `model_spec` says what they mean.
+Names and numbers, as the file has them; `model_spec` gives them meaning.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class WeighedTable(ExperimentTable):
     """[[model.weighed]]: parts that were weighed, or other sums of parameters that were measured."""
 
     parameters: list[str] = Field(
-        min_length=1, description="parameters whose sum was measured; payload_mass@NAME is that of the recording NAME"
+        min_length=1, description="parameters whose sum was measured; payload_mass@NAME belongs to the recording NAME"
     )
     value: float = Field(description="the sum, in their unit")
     sd: float = Field(gt=0.0, description="standard deviation of the measurement")
@@ -46,8 +46,8 @@ class LawTermTable(ExperimentTable):
     commands: list[str] = Field(default_factory=list, description="commands that the feature is made of")
     motion: list[str] = Field(
         default_factory=list,
-        description="in their place, at ports of the body: tip x, tip y, tip z or tip distance, from where the last"
-        " marker begins",
+        description="in their place, at ports of the body: tip x, tip y, tip z or tip distance, from the first "
+        "position of the last marker",
     )
     shape: float | None = Field(
         default=None, gt=0.0, description="time constant [s] of a low pass or lag, or half the width of a play"
@@ -63,16 +63,18 @@ class LawTermTable(ExperimentTable):
 class LawTable(ExperimentTable):
     """[[model.laws]]: an effect that no mechanism of the library has, as a law at a port."""
 
-    port: str = Field(description='where it acts, such as "cable left", "stiffness" or "marker m3 along the body"')
+    port: str = Field(
+        description='port at which it acts, such as "cable left", "stiffness" or "marker m3 along the body"'
+    )
     terms: list[LawTermTable] = Field(min_length=1, description="the signal is their sum")
 
 
 class ModelTable(ExperimentTable):
-    """[model]: what is added to the robot's base simulator, and what is inferred."""
+    """[model]: additions to the robot's base simulator, and inferred parameters."""
 
     mechanisms: list[str] = Field(
         default_factory=list,
-        description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
+        description="effects on top of the base simulator, by name, or file.py:ClassName of your own",
     )
     laws: list[LawTable] = Field(
         default_factory=list,
@@ -80,13 +82,13 @@ class ModelTable(ExperimentTable):
     )
     noise: NoiseModel = Field(
         default="auto",
-        description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed (student-t);"
-        " of all that is measured, what repeats differ by (repeats); what [noise] says (stated);"
-        " see docs/likelihood.md",
+        description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed "
+        "(student-t); of all channels, the spread between repeats (repeats); the values of [noise] "
+        "(stated); see docs/likelihood.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="what is inferred: parameter = prior; {} asks for the default prior",
+        description="inferred parameters: parameter = prior; {} asks for the default prior",
     )
     fixed: dict[str, float] = Field(default_factory=dict, description="values of parameters that are not inferred")
     per_recording: dict[str, str | list[str]] = Field(
@@ -101,13 +103,13 @@ class ModelTable(ExperimentTable):
     )
     drives: list[DriveTravel] = Field(
         default_factory=list,
-        description="what is known of the drives, beside what the robot file says",
+        description="known properties of the drives, in addition to the robot file",
     )
     per_group: dict[str, float] = Field(
         default_factory=dict,
         description="parameters that differ between groups about the value they share: the scale of the half-normal "
-        "prior of their standard deviation between groups, in their unit, which is inferred; a name such as "
-        "initial_displacement stands for those of all cables, with one standard deviation",
+        "prior of their standard deviation between groups, in their unit, which is inferred; a name such "
+        "as initial_displacement stands for all cables' parameters, with one standard deviation",
     )
     only_in: dict[str, str | list[str]] = Field(
         default_factory=dict,
@@ -140,7 +142,7 @@ class ModelTable(ExperimentTable):
 
 
 class SimulatorTable(ExperimentTable):
-    """[simulator]: body, engine and discretisation; what is left out is the robot's own."""
+    """[simulator]: body, engine and discretisation; missing keys are the robot's own."""
 
     body: Literal["rod", "tetrahedra"] = Field(
         default="rod",
@@ -149,20 +151,20 @@ class SimulatorTable(ExperimentTable):
     )
     motion: Literal["dynamic", "quasi-static"] = Field(
         default="dynamic",
-        description='"quasi-static": every row is an equilibrium, found from the one before; it has no damping, and '
+        description='"quasi-static": every row is an equilibrium, found from the row before; it has no damping, and '
         "time acts on drives and cameras alone. It is enough if the robot moves slower than its body answers, which "
         "rfdropo check measures",
     )
     push: bool = Field(default=False, description="put the robot's cube and plate before the trunk")
     drives: Literal["robot", "direct"] = Field(
         default="robot",
-        description='"direct": commands act at once, without the robot\'s ramp and dead time; what drives do is left '
+        description='"direct": commands act at once, without the robot\'s ramp and dead time; drives are modelled '
         "to mechanisms such as command_delay",
     )
     tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
     engine: Literal["auto", "jax", "numba"] = Field(
         default="auto",
-        description='"auto" is the compiled one, or JAX where it has a GPU and the body is a rod',
+        description='"auto" is the compiled engine, or JAX if it has a GPU and the body is a rod',
     )
     precision: Literal["float64", "float32"] = Field(
         default="float64",
@@ -174,7 +176,7 @@ class SimulatorTable(ExperimentTable):
         description='"sdirk2", of second order, takes two solves a step and comes about ten times nearer to the '
         'converged motion than "euler", which takes one, as SOFA does; the robot\'s by default',
     )
-    refine: int = Field(default=1, ge=1, le=16, description="cut every element of the robot's rod into so many")
+    refine: int = Field(default=1, ge=1, le=16, description="cut every element of the robot's rod into this number")
     threads: int | None = Field(default=None, ge=1, description="of the compiled engine; one per processor by default")
 
     @model_validator(mode="after")
@@ -200,6 +202,10 @@ class SimulatorTable(ExperimentTable):
         return self
 
 
+ROLLOUTS = 20000
+"""Budget of an experiment that states none."""
+
+
 class InferenceTable(BaseModel):
     """[inference]: method and budget; the method's own options are checked by the method."""
 
@@ -209,7 +215,21 @@ class InferenceTable(BaseModel):
         default="smc",
         description="see docs/reference/methods.md; options of the method stand beside it",
     )
-    rollouts: int = Field(default=20000, ge=1, description="budget in full-length rollouts")
+    rollouts: int | None = Field(
+        default=None, ge=1, description=f"budget in full-length rollouts; {ROLLOUTS} without minutes"
+    )
+    minutes: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="budget in minutes on the machine that calibrates, predictions and report included; rollouts are "
+        "timed, and their number is limited accordingly",
+    )
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> InferenceTable:
+        if self.rollouts is not None and self.minutes is not None:
+            raise ValueError("rollouts and minutes are both given: leave out one of them")
+        return self
 
     @property
     def options(self) -> dict[str, Any]:
@@ -218,7 +238,7 @@ class InferenceTable(BaseModel):
 
 
 class CommandsTable(ExperimentTable):
-    """[commands]: a random command sequence to simulate, where no recording is replayed."""
+    """[commands]: a random command sequence to simulate, if no recording is replayed."""
 
     duration: float = Field(gt=0.0, description="length of a recording [s]")
     interval: float = Field(
@@ -261,7 +281,7 @@ class AuditTable(ExperimentTable):
     )
     ports: bool = Field(
         default=True,
-        description="look for unknown causes, as laws at ports, where the library leaves something",
+        description="look for unknown causes, as laws at ports, if the library leaves a misfit",
     )
     matters_mm: float | None = Field(
         default=None,
@@ -272,7 +292,7 @@ class AuditTable(ExperimentTable):
     minutes: float = Field(
         default=30.0,
         gt=0.0,
-        description="bound of the whole run: when they are up, it finishes with what it knows",
+        description="bound of the whole run: when they are up, it finishes with its present results",
     )
 
 
@@ -282,7 +302,7 @@ class DesignTable(ExperimentTable):
     minutes: float = Field(
         default=10.0,
         gt=0.0,
-        description="bound of the whole run: when they are up, it proposes the best of what it has looked at",
+        description="bound of the whole run: when they are up, it proposes the best candidate so far",
     )
 
 
@@ -295,23 +315,23 @@ class Experiment(ExperimentTable):
     )
     adapter: dict[str, Any] = Field(
         default_factory=dict,
-        description="what a simulator of another kind is told: markers, channels, parameters and whatever else its "
-        "adapter takes; see docs/your_simulator.md",
+        description="settings of another simulator: markers, channels, parameters and further keys of its adapter; "
+        "see docs/your_simulator.md",
     )
     seed: int = Field(default=0, description="of all that is random")
     title: str = Field(default="", description="heading of the report; the file's name by default")
     data: DataSpec | None = Field(default=None, description="the recordings")
     commands: CommandsTable | None = Field(
         default=None,
-        description="random commands to simulate, where no recording is replayed",
+        description="random commands to simulate, if no recording is replayed",
     )
     noise: NoiseTable | None = Field(
         default=None,
-        description="noise that simulate adds to positions, and what an audit without repeats takes for known",
+        description="noise that simulate adds to positions, and that an audit without repeats assumes",
     )
     model: ModelTable = Field(
         default_factory=ModelTable,
-        description="what is added to the base simulator, and what is inferred",
+        description="additions to the base simulator, and inferred parameters",
     )
     simulator: SimulatorTable = Field(default_factory=SimulatorTable, description="body, engine and discretisation")
     inference: InferenceTable = Field(
@@ -320,7 +340,7 @@ class Experiment(ExperimentTable):
     )
     audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
     design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")
-    training: TrainingTable | None = Field(default=None, description="what rfdropo train learns, and how")
+    training: TrainingTable | None = Field(default=None, description="task and settings of rfdropo train")
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:

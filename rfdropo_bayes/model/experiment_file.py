@@ -19,7 +19,7 @@ from rfdropo_bayes.tables import parse_assignment, plain, read_toml, set_entry
 ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
 FILE_KEYS = ("observations", "commands")
-NO_COMMANDS = "none"  # stands for zero commands where a file of them could be named
+NO_COMMANDS = "none"  # zero commands instead of a file of commands
 WRITTEN_BY_RUNS = ("config.toml", "extended.toml")
 RESULTS_OF_RUNS = ("run.json", "summary.json", "audit.json")
 
@@ -41,7 +41,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     try:
         tables = read_toml(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
+        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="correct the syntax there") from None
     if path.name in WRITTEN_BY_RUNS and any((path.parent / name).is_file() for name in RESULTS_OF_RUNS):
         stated = tables.setdefault("simulator", {})
         if isinstance(stated, dict) and "motion" not in stated:
@@ -136,7 +136,7 @@ def _robot_placed(robot: str, folder: Path, out: Path | None) -> str:
     file = _robot_file(robot, folder)
     if file.suffix == ".toml" and file.is_file():
         return _brought(file, out, ROBOT_COPY)
-    if file.suffix in MODEL_FILES and file.is_file():  # which may name meshes beside it: it stays where it is
+    if file.suffix in MODEL_FILES and file.is_file():  # it may name meshes beside it, and is not moved
         return str(file.resolve())
     return code_placed(robot, folder, out) if ".py:" in robot else robot
 

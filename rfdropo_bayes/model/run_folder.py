@@ -24,7 +24,7 @@ RUN, CONFIG, LOG, CHECKPOINTS, PAGE = "run.json", "config.toml", "log.jsonl", "c
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
 SCHEMA_VERSION = 1
 NAMED_DIFFERENCES = 3
-# What a run computes does not depend on these; they say how it is headed and how far it goes.
+# Results of a run do not depend on these: title and length of the run.
 FREE_TO_CHANGE = (
     "experiment.title",
     "experiment.audit.minutes",
@@ -34,7 +34,7 @@ FREE_TO_CHANGE = (
 
 
 MOVABLE = ("experiment.data.fit", "experiment.data.test")
-# What runs of earlier versions meant where their settings say nothing.
+# Default of settings that a run's file does not state.
 MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
 
 
@@ -102,7 +102,7 @@ def run_folder(
         settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
         check_folder(out, command, resume=resume, overwrite=overwrite)
         if resume and earlier is not None:
-            with TemporaryDirectory() as trial:  # a run that does not go on keeps what it was made of
+            with TemporaryDirectory() as trial:  # a run that does not continue keeps its files
                 _check_settings(out, earlier["settings"], settings | _brought_along(tables, folder, texts, Path(trial)))
         settings |= _brought_along(tables, folder, texts, out)
         if not resume:

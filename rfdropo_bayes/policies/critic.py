@@ -30,8 +30,8 @@ class VariedParameters(NamedTuple):
     """Parameters that differ between episodes, in the order of the randomisation.
 
     Attributes:
-        names: of the parameters.
-        mean, deviation: of `DRAWS` draws [parameter units].
+        names: names of the parameters.
+        mean, deviation: statistics of `DRAWS` draws [parameter units].
     """
 
     names: tuple[str, ...]
@@ -109,8 +109,8 @@ class AsymmetricPolicy(ActorCriticPolicy):
 
     Args:
         given: spaces and learning rate, as `ActorCriticPolicy` takes them.
-        unseen: how many numbers at the end of an observation the actor does not see.
-        options: of `ActorCriticPolicy`.
+        unseen: number of values at the end of an observation that the actor does not see.
+        options: options of `ActorCriticPolicy`.
     """
 
     def __init__(self, *given: Any, unseen: int, **options: Any) -> None:

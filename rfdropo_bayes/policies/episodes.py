@@ -51,7 +51,7 @@ class EpisodeStep(NamedTuple):
     reward: Float[np.ndarray, " lane"]
     terminated: Bool[np.ndarray, " lane"]
     truncated: Bool[np.ndarray, " lane"]
-    distance: Float[np.ndarray, " lane"]  # [m]; that of the last good state where the simulation failed
+    distance: Float[np.ndarray, " lane"]  # [m]; of the last good state if the simulation failed
     diverged: Bool[np.ndarray, " lane"]
     tension: Float[np.ndarray, " lane"]  # largest of any cable at the action's time steps [N]; NaN if none is told
     stopped: Bool[np.ndarray, " lane"]  # by the limit on tension
@@ -84,7 +84,7 @@ class Episodes:
     """Lanes of a task.
 
     Args:
-        simulator: whose parameters are drawn, with mechanisms or without.
+        simulator: simulator whose parameters are drawn, with or without mechanisms.
         task: goal and reward.
         lanes: number of episodes simulated at once.
         randomisation: source of the parameters.

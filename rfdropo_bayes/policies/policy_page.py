@@ -106,7 +106,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
     Args:
         summary: content of summary.json of the training.
         played: episodes of the policy that was kept.
-        title: of the experiment.
+        title: title of the experiment.
         config: the experiment file as it was run.
     """
     rates = [(1e3 * limit, *success(played.episodes, limit)) for limit in THRESHOLDS]

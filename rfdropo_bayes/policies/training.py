@@ -29,7 +29,7 @@ from rfdropo_bayes.policies.training_config import TrainingTable
 
 EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
 CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
-LAST, BEST = "", "best_"  # what files of a checkpoint begin with
+LAST, BEST = "", "best_"  # prefixes of a checkpoint's files
 STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")
 """Keys of a checkpoint's state.json."""
 
@@ -286,7 +286,7 @@ def _failures(steps: int) -> Any:
 
 def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
     distance = np.array([episode.distance for episode in episodes])
-    # Of an infinite neighbour that has no weight in a quantile, NumPy makes NaN.
+    # NumPy returns NaN for a quantile with an infinite neighbour of zero weight.
     found = np.quantile(np.where(np.isfinite(distance), distance, NO_END), [0.05, 0.5, 0.95])
     low, middle, high = np.where(found > 1e-100 * NO_END, np.inf, found)
     pull = peak_tension(episodes)
@@ -359,7 +359,7 @@ def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None
         )
     before = json.loads(json.dumps(state["known"]))
     now = json.loads(json.dumps(known))
-    # A checkpoint of an earlier version lacks keys that came later: it was made with what they are by default.
+    # Keys that a checkpoint lacks have their default.
     before["table"] = TrainingTable().model_dump(mode="json") | before["table"]
     changed = [name for name in now if name != "table" and now[name] != before.get(name)]
     changed += [name for name in now["table"] if name != "steps" and now["table"][name] != before["table"].get(name)]

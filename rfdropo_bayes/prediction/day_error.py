@@ -19,8 +19,8 @@ from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_erro
 
 DAY_ERROR = "day_error"  # among the attributes of a posterior
 
-# The prior of `times`, in force where no day was left out, and worth FREEDOM days where some were. docs/days.md has the
-# days of two robots that it rests on.
+# The prior of `times`, used if no session was left out, and worth FREEDOM sessions otherwise. It rests on the sessions
+# of two robots in docs/days.md.
 TIMES, FREEDOM = 0.8, 3.0
 CONSTANT = 0.6  # share of the variance that lasts for a whole recording: 0.5 to 0.66 in 8 recordings left out
 CORRELATION_TIME = 1.0  # [s] of the rest: bands do not depend on it

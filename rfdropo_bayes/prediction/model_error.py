@@ -14,9 +14,9 @@ from rfdropo_bayes.data.sample_times import ONE_RATE, sample_time
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 
 MODEL_ERROR = "model_error"  # among the attributes of a posterior
-MOST_LAGS = 100  # rows of memory, of noise that lasts: longer recordings forget its constant part over as many
+MOST_LAGS = 100  # rows of memory of correlated noise: longer recordings forget its constant part within this time
 MOST_CONSTANT = 0.95
-FEWEST_ROWS = 4  # that say how long an error lasts
+FEWEST_ROWS = 4  # least rows for an estimate of the correlation time
 ADAPTED_TO = "adapted_to"  # among the attributes of a posterior: the day, of an adaptation
 CONSTANT_ROUNDS = 5  # until share and memory agree
 
@@ -152,6 +152,6 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     found, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
     if found.memory or not fitted or record.attrs.get(ADAPTED_TO):
         return found
-    # An earlier version did not say how long errors last. Of several rates one is taken, not what lies between them.
+    # A record may lack the correlation time. With several rates, one is used rather than an intermediate value.
     step = sample_time(max(fitted, key=lambda p: len(p.time)).time)
     return found._replace(step=step, memory=error_memory(fitted, step))

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 STEP = 0.05  # of a central difference, in prior deviations
-TOLERANCE = 0.01  # nats that a step promises, or delivers: what remains is a seventh of a posterior deviation
-CREDIBLE = 100.0  # tolerances that a step may promise and not deliver: what differences promise has the size of kinks
+TOLERANCE = 0.01  # nats of predicted or actual gain: the remaining distance is a seventh of a posterior deviation
+CREDIBLE = 100.0  # tolerances of predicted gain without actual gain: finite differences see gains of the size of kinks
 MOST_STEPS = 60
-LEAST_GAIN = 0.5  # of what a step promised, below which corrected slopes are not trusted with another
-DAMPINGS = (0.1, 1.0, 10.0, 100.0)  # of a draw's last one: the first that lowers its cost is taken
+LEAST_GAIN = 0.5  # of the predicted gain, below which updated slopes are not trusted with another step
+DAMPINGS = (0.1, 1.0, 10.0, 100.0)  # of a draw's last damping: the first that lowers its cost is taken
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e6
 
 Residuals = Callable[[Float[np.ndarray, "b k"], Int[np.ndarray, " b"]], Float[np.ndarray, "b m"]]
@@ -89,7 +89,7 @@ def fit_own(
             point[going], value[going] = moved, found
             delivered[going] = before - _cost(found, moved, centre[going])
         still = delivered[todo] < TOLERANCE
-        # Six decades of damping that gain nothing: what differences promise there is rounding, or the edge of a cliff.
+        # Six decades of damping without gain: the gain predicted by differences is rounding, or the edge of a cliff.
         lost = todo[still & own[todo] & (promised >= CREDIBLE * TOLERANCE) & (damping[todo] >= MOST_DAMPING)]
         done = todo[still & own[todo] & (promised < CREDIBLE * TOLERANCE)]
         converged[done] = True

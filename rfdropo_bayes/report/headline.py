@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+FEW_DRAWS = 100
+"""Effective draws that central intervals need."""
+
 
 def headline(summary: Mapping[str, Any]) -> list[str]:
     """Fitted data, error, best baseline, parameters at a bound, and number of failed rollouts."""
@@ -31,7 +34,13 @@ def _fitted(summary: Mapping[str, Any]) -> str:
     data = (
         f"{_count(len(recordings), synthetic.strip() + ' recording' if synthetic else 'recording')} ({seconds:.3g} s)"
     )
-    return f"{_count(len(free), 'parameter')} of {summary['robot']} were inferred from {data} with {summary['method']}."
+    effective = summary["effective_draws"]
+    worth = "" if effective is None else f"; its draws are worth {effective:.0f} independent draws"
+    few = "" if effective is None or effective >= FEW_DRAWS else f", fewer than the {FEW_DRAWS} that intervals need"
+    return (
+        f"{_count(len(free), 'parameter')} of {summary['robot']} were inferred from {data} with {summary['method']}"
+        f"{worth}{few}."
+    )
 
 
 def _errors(summary: Mapping[str, Any]) -> str:

@@ -33,7 +33,7 @@ class DrawnMotion(NamedTuple):
     time: Float[np.ndarray, " time"]  # [s]
     centre: Float[np.ndarray, "time point 3"]  # line through the trunk's markers
     radius: Float[np.ndarray, " point"]
-    measured: Float[np.ndarray, "time marker 3"] | None  # recorded markers, not a number where masked
+    measured: Float[np.ndarray, "time marker 3"] | None  # recorded markers, NaN if masked
     cube: Float[np.ndarray, "time 8 3"] | None  # corners
     plate: float | None  # height
 

@@ -10,13 +10,12 @@ import numpy as np
 
 from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.posteriors import PosteriorRecord, contradiction, contradicts
-from rfdropo_bayes.report.headline import best_baseline
+from rfdropo_bayes.report.headline import FEW_DRAWS, best_baseline
 
 BAND = "0.9"
 TIP = "tip"  # a marker of this name needs no other words
 OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
-FEW_DRAWS = 100.0  # effective ones
-CHOSEN = ("rfdropo", "adapt")  # methods whose draws are as many as were asked for, and no chain
+CHOSEN = ("rfdropo", "adapt")  # methods with a requested number of draws, and no chain
 NAMED = 3  # parameters that a sentence names
 UNMIXED = 1.1  # R-hat
 HALF = 0.5  # of a variance: beyond it, most of an error is systematic
@@ -145,7 +144,7 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
     few = [name for name, row in rows.items() if (row.get("ess_bulk") or np.inf) < FEW_DRAWS]
     if few and summary["method"] not in CHOSEN:
         named = ", ".join(few[:NAMED]) + (f" and {len(few) - NAMED} more" if len(few) > NAMED else "")
-        found.append(f"fewer than {FEW_DRAWS:.0f} effective draws of {named}")
+        found.append(f"fewer than {FEW_DRAWS} effective draws of {named}")
     apart = [name for name, row in rows.items() if (row.get("r_hat") or 1.0) > UNMIXED]
     if apart:
         found.append(f"independent runs disagree about {', '.join(apart)}")

@@ -102,7 +102,7 @@ def residual_cautions(checks: Mapping[str, ResidualCheck], noise: str) -> list[C
     """Cautions on residuals that are correlated beyond the noise model, and on outliers.
 
     Args:
-        checks: from `check_residuals`.
+        checks: result of `check_residuals`.
         noise: name of the noise model.
     """
     found = []

@@ -74,7 +74,7 @@ class Panel:
 
     Attributes:
         source: data URI.
-        share: of the figure's width, in percent.
+        share: share of the figure's width, in percent.
         kind: "cell"; "legend"; "whole" if the figure has no parts.
     """
 
@@ -88,10 +88,10 @@ class Picture:
     """A figure inside a page: panels that fill its rows side by side, or stand below each other on a narrow screen.
 
     Attributes:
-        panels: from the upper left to the lower right.
+        panels: panels from the upper left to the lower right.
         alt: text for readers who cannot see it.
-        caption: how to read it.
-        width: in CSS pixels.
+        caption: explanation of the figure.
+        width: width in CSS pixels.
     """
 
     panels: tuple[Panel, ...]
@@ -196,6 +196,7 @@ def thin(rows: int) -> np.ndarray:
 
 
 def label_with_unit(name: str, unit: str) -> str:
+    """Displayed name with its unit in brackets, if it has a unit."""
     return f"{display_name(name)} [{unit}]" if unit else display_name(name)
 
 

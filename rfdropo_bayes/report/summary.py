@@ -35,6 +35,7 @@ class ParameterRow:
 
     Attributes:
         name, unit, description: facts of the parameter.
+        parameter, owner: name without the owner, and the recording or group that has it; see `Scope`.
         mean, sd, q05, median, q95: statistics of the draws.
         at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
         bound: "low", "high" or None.
@@ -63,6 +64,8 @@ class ParameterRow:
     mcse_mean: float
     r_hat: float
     derived: bool
+    parameter: str
+    owner: str
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the name, for summary.json."""
@@ -99,6 +102,8 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
                 diagnostics[info.name]["mcse_mean"],
                 diagnostics[info.name]["r_hat"],
                 info.name not in free,
+                info.parameter,
+                info.scope.owner,
             )
         )
     return rows
@@ -133,6 +138,8 @@ class ParameterSummary(_Open):
     q95: float
     unit: str
     at_bound: bool
+    parameter: str
+    owner: str
 
 
 class Evidence(_Open):
@@ -162,6 +169,19 @@ class Summary(_Open):
     rmse: Errors
 
 
+def effective_draws(record: PosteriorRecord, details: Mapping[str, Any]) -> float | None:
+    """Number of independent draws that a posterior is worth; None for draws that are no posterior.
+
+    At most the number of distinct draws: a sampler without budget repeats a few.
+    """
+    if record.log_likelihood is None:
+        return None
+    drawn = np.stack([record.flat(info.name) for info in record.free], axis=1)
+    distinct = len(np.unique(drawn, axis=0))
+    weighed = details.get("effective_draws")
+    return float(distinct if weighed is None else min(distinct, weighed))
+
+
 def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
     """The content of summary.json, ready for JSON: values that are not finite become null, with the reason under
     ``not_available``.
@@ -176,6 +196,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "rollouts": facts.rollouts,
         "evaluations": facts.evaluations,
         "excluded": dict(facts.excluded),
+        "effective_draws": effective_draws(record, facts.details),
         "parameters": {row.name: row.as_dict() for row in posterior_table(record)},
         "log_evidence": dict(zip(("value", "sd"), facts.log_evidence or (None, None), strict=True)),
         "rmse": {role: dict(errors.over_time) if errors else {} for role, errors in figures.items()},

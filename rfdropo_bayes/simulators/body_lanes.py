@@ -96,7 +96,8 @@ class LanesBeforeCube:
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
         found = self._bodies.reset(rows, given)
-        spread = np.zeros(self._count, int)  # all lanes are computed, so that one program serves any number of rows
+        # all lanes are computed, so that the same program serves any number of rows
+        spread = np.zeros(self._count, int)
         spread[rows] = np.arange(len(rows))
         spheres = found.position[:, self._shown :]
         gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (given.cube, spheres))))[rows]

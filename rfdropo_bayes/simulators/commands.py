@@ -12,7 +12,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cable_drive import animated_commands
 
 FEW_STEPS = 60_000  # ten minutes in steps of 10 ms: simulated however few the rows are, with a gigabyte or two
-MOST_STEPS_PER_ROW = 200.0  # beyond these: two seconds a row in steps of 10 ms, where cameras see ten rows a second
+MOST_STEPS_PER_ROW = 200.0  # beyond these: two seconds a row in steps of 10 ms, whereas cameras see ten rows a second
 UNITS = {
     1e3: '"ms" taken for "s", "us" for "ms" or "ns" for "us"',
     1e6: '"us" taken for "s" or "ns" for "ms"',
@@ -29,7 +29,7 @@ class Commands(NamedTuple):
         step: command reached at the end of each time step [m or rad].
         sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
             comes later if earlier commands are known.
-        sample_fraction: how far into the following step the observation lies, in [0, 1).
+        sample_fraction: position of the observation within the following step, in [0, 1).
         signals: further signals at the ports of the simulator (`ports.PortSignals`); None without signals.
     """
 
@@ -173,7 +173,7 @@ def _ramped(
     """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
     given = np.concatenate([[-np.inf], time])
     held = np.vstack([initial, value])
-    # Commands older than the first one in force count as carried out, so one more or less makes no difference.
+    # Commands before the first command in force count as carried out, so one more or less makes no difference.
     first = np.maximum(np.searchsorted(given, at - ramp, side="right") - 2, 0)
     last = np.searchsorted(given, at, side="right")
     window = np.minimum(first[:, None] + np.arange(np.max(last - first, initial=0) + 1), len(given) - 1)

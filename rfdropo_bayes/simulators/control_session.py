@@ -49,9 +49,10 @@ class _Drives(NamedTuple):
     """State of the drives of a lane between two steps."""
 
     cables: tuple[Any, ...]  # memory of every mechanism between command and cables
-    encoders: tuple[Any, ...]  # and of those that an encoder shows, again: other mechanisms may stand between them
+    encoders: tuple[Any, ...]  # and mechanisms that an encoder shows, again: other mechanisms may lie between them
     wound: Wound
-    signals: tuple[Any, ...]  # memory of what acts on the body or on the markers by what reaches the cables
+    # memory of mechanisms that act on the body or on the markers depending on the commands at the cables
+    signals: tuple[Any, ...]
 
 
 class _Past(NamedTuple):
@@ -206,7 +207,7 @@ class Session:
         """Set lanes to the rows of a state that `save` returned.
 
         Args:
-            state: of a session of the same robot, engine and mechanisms, with one row for each of ``rows``.
+            state: state of a session of the same robot, engine and mechanisms, with one row for each of ``rows``.
             rows: lanes; all by default.
 
         Raises:

@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 Inputs = TypeVar("Inputs")
 Output = TypeVar("Output")
 
-# Relative perturbation of a central difference. Its error is of second order in it, that of rounding (1e-13 m and
+# Relative perturbation of a central difference. Its error is of second order in it; the rounding error (1e-13 m and
 # 1e-5 m of the positions) is divided by it: near the cube root of the precision both are small.
 DIFFERENCE = {"float64": 1e-5, "float32": 1e-2}
-FORWARD = 1e-7  # of a one-sided difference, in double precision: its error is of first order in it
-# Sizes that perturbations are relative to, where a value may be zero: [m] of cable, [kg], [m/s2], [1/s], [s].
+FORWARD = 1e-7  # of a forward difference, in double precision: its error is of first order in it
+# Sizes that perturbations are relative to, if a value may be zero: [m] of cable, [kg], [m/s2], [1/s], [s].
 LENGTH, MASS, ACCELERATION, MASS_DAMPING, STIFFNESS_DAMPING = 0.005, 0.1, 9.81, 1.0, 0.01
 
 
@@ -68,8 +68,8 @@ def with_differences(
 
 LADDER = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 AGREE = 0.5  # share by which slopes over two successive steps of the ladder may differ
-# Slopes of a motion that bends, as where a cable goes slack, differ between steps and stay of one size (on the paper's
-# trunk within a tenth of it); those of a motion that jitters grow as steps shrink.
+# Slopes of a motion with kinks, as with a slack cable, differ between steps but keep their size (within a tenth on the
+# paper's trunk); slopes of a jittering motion grow as steps shrink.
 JITTER = 3.0
 
 

@@ -17,7 +17,7 @@ class BodySignals(NamedTuple):
 
     force: Float[Array, "*batch row place 3"]  # [N]
     stiffness: Float[Array, "*batch row"]  # logarithm of a factor
-    damping: Float[Array, "*batch row"]  # likewise, of both of Rayleigh's coefficients
+    damping: Float[Array, "*batch row"]  # logarithm of a factor on both of Rayleigh's coefficients
     gravity: Float[Array, "*batch row 3"]  # added to gravity [m/s2]
 
 
@@ -54,7 +54,7 @@ def read_late(levels: Float[Array, "row channel"], late: Float[Array, " row"]) -
 
     last = len(levels) - 1
     at = jnp.arange(len(levels)) - late
-    # Rows at whole numbers count as the later end of an interval: without a delay its slope is that of the past.
+    # Whole rows count as the later end of an interval: without a delay its slope is the past interval's.
     after = jnp.clip(jnp.ceil(at), 0, last).astype(int)
     weight = jnp.where((at > 0) & (at <= last), after - at, 0.0)[:, None]
     newer = levels[after]

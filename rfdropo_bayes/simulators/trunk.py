@@ -62,7 +62,7 @@ class TrunkSimulator(RobotSimulator):
     """A rod with mechanisms, behind the `Simulator` protocol.
 
     Attributes:
-        discretisation: how finely the body and time are cut; for the others see `RobotSimulator`.
+        discretisation: resolution of body and time; for the others see `RobotSimulator`.
     """
 
     robot: Robot

@@ -1,4 +1,4 @@
-"""The next command sequence, and what it will decide: ``design``."""
+"""The next command sequence, and the question it will decide: ``design``."""
 
 from __future__ import annotations
 
@@ -76,23 +76,23 @@ def design(
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Design:
-    """Propose the commands that best separate the leading explanations of what a model lacks: candidates of the
-    library, and laws at ports that the recordings do not tell apart.
+    """Propose the commands that best separate the leading explanations of a model's misfit: candidates of the library,
+    and laws at ports that the recordings cannot distinguish.
 
     The proposals stay within the range of commands that the recordings have used, are as long as the first recording
-    and of four kinds: random walks, holds, slow loops and chirps. Where no candidate is significant, the sequence that
-    tells most about the base parameters is proposed. When the time is up, it is the best of the sequences, and the
-    leading one of the explanations, that have been looked at.
+    and of four kinds: random walks, holds, slow loops and chirps. If no candidate is significant, the most informative
+    sequence for the base parameters is proposed. When the time is up, the best sequence so far is proposed for the
+    leading explanation so far.
 
     Args:
-        model: what is simulated and inferred.
-        runs: recordings; those of the model's experiment by default.
+        model: simulator and inferred parameters.
+        runs: recordings; by default from the model's experiment.
         fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
-        seed: of all that is random; that of the model's experiment by default.
-        minutes: bound of the whole run; that of the model's experiment, 10 by default.
-        out: folder that gets design.json and next_commands.csv; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
-        show: whether to say now and then what is done, as in `calibrate`.
+        seed: seed of all random numbers; by default from the model's experiment.
+        minutes: bound of the whole run; by default from the model's experiment, else 10.
+        out: folder for design.json and next_commands.csv; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
+        show: whether to show progress, as in `calibrate`.
 
     Raises:
         InputError: bad input, or a base model that was not fitted in the time.
@@ -185,7 +185,9 @@ def _hypotheses(
 def _rivals(
     problem: AuditProblem, target: FitTarget, base: Fit, clock: Clock, report: Callable[[str], None]
 ) -> list[Refit]:
-    """The law at a port that the library has no name for, and those that the recordings do not tell from it."""
+    """The leading law at a port without a name in the library, and laws that the recordings cannot distinguish from
+    it.
+    """
     if problem.ports is None:
         return []
     simulator: Any = problem.lanes.simulator
@@ -201,8 +203,9 @@ def _rivals(
 def _with_laws(
     problem: AuditProblem, target: FitTarget, base: Fit, hypotheses: Sequence[Hypothesis], rivals: Sequence[Refit]
 ) -> tuple[FitTarget, Fit, list[Hypothesis]]:
-    """Target, base fit and hypotheses with laws before them, all under one noise: that by which the model with the
-    leading law is judged. Under the noise of the measurement a model that is far off would seem sure of anything."""
+    """Target, base fit and hypotheses with laws before them, all under the same noise, which is fitted to the model
+    with the leading law. A misspecified model would be overconfident under the measurement noise.
+    """
     simulator: Any = problem.lanes.simulator
     names, judge = tuple(simulator.channel_names), rivals[0].target.on(target.forward)
     laws = [
@@ -244,7 +247,7 @@ def _outlooks(
 def command_table(
     data: DataSpec | None, first: Trajectory, time: np.ndarray, value: np.ndarray, seconds: float
 ) -> pd.DataFrame:
-    """The proposal, of so many seconds, in the columns of the experiment's recordings."""
+    """The proposal, of length ``seconds``, in the columns of the experiment's recordings."""
     if data is not None and data.format == ASL:
         return pd.DataFrame(asl_csv.command_columns(time, value, seconds))
     if data is not None and data.columns is not None:
@@ -254,7 +257,7 @@ def command_table(
 
 
 def units_said(data: DataSpec | None) -> str:
-    """What the columns of `command_table` are in, where their names do not say it."""
+    """Sentence on the units of `command_table`, if its column names do not state them."""
     if data is not None and data.format == ASL:
         return " Columns u1 to u6 are in degrees, a row every 10 ms, as that format has them."
     return ""
@@ -331,7 +334,8 @@ def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], floa
     pair = min(outlook.pairs, key=lambda p: outlook.pairs[p])
     words = " and ".join(name.replace("_", " ") for name in pair)
     return (
-        f"Record the {kind} in {COMMANDS}: it raises the expected log likelihood ratio of the pair that is hardest to "
-        f"tell apart, {words}, from {0.5 * now[pair]:.1f} to {0.5 * outlook.pairs[pair]:.1f} nats, and names the right "
-        f"one with probability {outlook.right:.2f}."
+        f"Record the {kind} in {COMMANDS}: it raises the expected log likelihood ratio of the pair that "
+        f"is hardest to distinguish, {words}, from {0.5 * now[pair]:.1f} to "
+        f"{0.5 * outlook.pairs[pair]:.1f} nats, and identifies the right explanation with probability "
+        f"{outlook.right:.2f}."
     )

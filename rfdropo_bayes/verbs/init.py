@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
@@ -20,17 +23,10 @@ from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_te
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
+from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, rows_to_fit
 from rfdropo_bayes.verbs.placement import frame_lines
 from rfdropo_bayes.verbs.slow_motion import slow_motion
 from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
-
-PRIORS = (
-    ("young_modulus", "how stiff"),
-    ("trunk_mass", "how heavy: weigh it, and state it under [[model.weighed]]"),
-    ("rayleigh_stiffness", "how damped"),
-    ("spool_radius", "cable wound up per angle"),
-)
-
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
@@ -83,7 +79,7 @@ def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]
 
 
 def with_given(guess: Guess, **given: Any) -> Guess:
-    """A guess in which what is given takes the place of what was guessed: units, and the time from row to row [s]."""
+    """A guess with given values in place of guessed values: units, and the time from row to row [s]."""
     given = {key: value for key, value in given.items() if value is not None}
     evidence = {key: words for key, words in guess.evidence.items() if key not in given}
     of_others = {"command_unit": guess.commands, "position_unit": names_of(guess.positions)}
@@ -110,8 +106,7 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
-    """A guess with what the robot says of it: units of positions and commands, and no tensions of motors that move two
-    cables."""
+    """A guess refined by the robot: units of positions and commands, and no tensions of motors with two cables."""
     if outline.pairs and guess.tensions:
         guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
     if "markers" in outline.assumed:
@@ -141,9 +136,10 @@ def write_first_files(
     Args:
         folder: to write to; it is made.
         outline: the robot.
-        recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset.
-        commands: the file of commands of each, where they have any.
-        guess: what their columns are, see `of_robot`; None without recordings, when random commands are simulated.
+        recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
+            third of the rows of a single recording.
+        commands: the file of commands of each, if they have any.
+        guess: guess of their columns, see `of_robot`; None without recordings, when random commands are simulated.
 
     Raises:
         InputError: files of these names are there already, or the folder cannot be written to.
@@ -156,8 +152,9 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
 
-    def write(data: list[str], slow: str | None = None) -> Experiment:
-        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(outline, guess, rests=slow is not None)]
+    def write(data: list[str], slow: str | None = None, first: Trajectory | None = None) -> Experiment:
+        rests = slow is not None
+        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(made, guess, first, rests=rests)]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
@@ -176,9 +173,13 @@ def write_first_files(
     )
     plain = write(tables())
     first = _first_recording(plain, folder)
-    frame, slow = _frame(plain, made, guess), None if first is None else slow_motion(made, first)
-    if frame or slow:
-        write(tables(frame=frame), slow)
+    if first is not None:
+        usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
+        if usual > 0.0:
+            robot.write_text(robot_text(replace(outline, usual_command=usual)), encoding="utf-8")
+            made = Robot.load(robot)
+        slow, rows = slow_motion(made, first), rows_to_fit(first) if len(recordings) == 1 else None
+        write(tables(frame=_frame(plain, made, guess), rows=rows), slow, first)
     return robot, experiment
 
 
@@ -193,9 +194,9 @@ def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
-    """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
+    """Lines of [data.columns] that bring the first row to the robot; empty if it is there already, or if no frame fits.
 
-    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
+    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is searched.
     """
     if experiment.data is None or experiment.data.columns is None:
         return []
@@ -215,21 +216,29 @@ def _head(name: str) -> list[str]:
     ]
 
 
-def _entries(folder: Path, recordings: list[Path], commands: list[Path], guess: Guess) -> list[str]:
-    """The recordings as entries of fit and test."""
-    names = [quoted(os.path.relpath(path, folder)) for path in recordings]
+def _entries(
+    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, rows: tuple[list[int], list[int]] | None
+) -> list[str]:
+    """The recordings as entries of fit and test; one that stands alone twice if its rows are divided."""
+    entries: list[dict[str, Any]] = [{"observations": os.path.relpath(path, folder)} for path in recordings]
     if commands:
-        sent = [quoted(os.path.relpath(path, folder)) for path in commands]
-        return [f"{{observations = {name}, commands = {file}}}" for name, file in zip(names, sent, strict=True)]
-    if guess.format == lerobot.FORMAT and len(names) == 1:
+        sent = [os.path.relpath(path, folder) for path in commands]
+        entries = [{**entry, "commands": file} for entry, file in zip(entries, sent, strict=True)]
+    elif guess.format == lerobot.FORMAT and len(entries) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
         parts = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
-        return [f"{{observations = {names[0]}, episodes = {part}}}" for part in parts]
-    return names
+        entries = [{**entries[0], "episodes": part} for part in parts]
+    if rows is not None and len(entries) == 1:
+        entries = [{**entries[0], "rows": part} for part in rows]
+    tables = [", ".join(f"{key} = {quoted(value)}" for key, value in entry.items()) for entry in entries]
+    return [
+        quoted(entry["observations"]) if len(entry) == 1 else f"{{{text}}}"
+        for entry, text in zip(entries, tables, strict=True)
+    ]
 
 
 def assumed_of_columns(guess: Guess) -> list[str]:
-    """What the tables of `data_tables` assume or leave out, and a recording does not tell; a sentence each."""
+    """Assumptions and omissions of `data_tables` that no recording can settle; a sentence each."""
     said = [f'{key} = "{getattr(guess, key)}": {words}' for key, words in guess.evidence.items()]
     if guess.time is None and guess.sample_time is None:
         said.append(f'time = "{ROWS}": {NO_TIMES}')
@@ -249,13 +258,14 @@ def data_tables(
     gravity: str = "",
     frame: Sequence[str] = (),
     cables: Sequence[str] = (),
+    rows: tuple[list[int], list[int]] | None = None,
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
-    ``frame`` are the lines of axes and origin, where the first row tells them; ``cables`` the robot's, one for each
-    command, if tensions of them were measured.
+    ``frame`` are the lines of axes and origin, if the first row determines them; ``cables`` the robot's, one for each
+    command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single recording.
     """
-    entries = _entries(folder, recordings, commands, guess)
+    entries = _entries(folder, recordings, commands, guess, rows)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
     lost = lost_positions(recordings, guess)
     counted = f" ({', '.join(f'{name}: {count} empty cells' for name, count in lost.items())})" if lost else ""
@@ -275,7 +285,7 @@ def data_tables(
         "[data]",
         f'format = "{guess.format}"',
         f"fit = [{', '.join(fit)}]",
-        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they say how good the fit is",
+        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they score the fit",
         *masked,
         "",
         "# Guessed from the names and sizes of the columns: look them over.",
@@ -321,7 +331,7 @@ def _clock(guess: Guess) -> list[str]:
     if guess.time is None:
         return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:
-        return ['time = "header"  # stamps where messages have them; "log": the times at which they were received']
+        return ['time = "header"  # stamps if messages have them; "log": the times at which they were received']
     return [f"time = {quoted(guess.time)}", _unit_line(guess, "time_unit")]
 
 
@@ -332,7 +342,8 @@ def _command_clock(guess: Guess) -> list[str]:
     return [
         f"command_time = {quoted(guess.command_time)}",
         _unit_line(guess, "command_time_unit"),
-        "# ASSUMED: both clocks begin together. Else: what the observations' clock shows [s] when this one shows zero.",
+        "# ASSUMED: both clocks begin together. Else: reading of the observations' clock [s] when the "
+        "commands' clock shows zero.",
         "command_offset = 0.0",
     ]
 
@@ -366,25 +377,33 @@ def _simulator(slow: str | None) -> list[str]:
     ]
 
 
-def _model(outline: RobotOutline, guess: Guess | None, *, rests: bool) -> list[str]:
-    absent = {"spool_radius"} if outline.command_unit != "rad" else set()
-    absent |= {"rayleigh_stiffness"} if rests else set()
-    wanted = [(name, why) for name, why in PRIORS if name not in absent]
-    uses = []
-    if guess is not None and guess.tensions:
-        uses.append("tension = true          # forces are data: they fix the scale of stiffness and mass")
-    if guess is not None and guess.motor_angles and outline.command_unit == "rad":
+def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests: bool) -> list[str]:
+    """The tables [model] and [inference]."""
+    mechanisms, tensions = installed_mechanisms(robot), guess is not None and bool(guess.tensions)
+    wanted = ["young_modulus = {}  # over the body's weight: how stiff it is"]
+    if tensions:
+        wanted.append("trunk_mass = {}  # weigh it, and state it under [[model.weighed]]")
+    if robot.command_unit == "rad":
+        wanted.append("spool_radius = {}  # cable wound up per angle")
+    if not rests:
+        wanted.append("rayleigh_stiffness = {}  # damping")
+    uses = ["tension = true          # forces are data: they fix the scale of stiffness and mass"] if tensions else []
+    if guess is not None and guess.motor_angles and robot.command_unit == "rad":
         uses.append("motor_angle = true      # so are measured motor angles")
     return [
         "[model]",
-        "mechanisms = []         # effects on top of the base simulator: rfdropo mechanisms lists them",
+        "# The measuring frame and the drives as they are installed; rfdropo mechanisms lists further effects.",
+        f"mechanisms = {quoted(mechanisms)}",
+        'noise = "white"         # laplace finds how many rows an error lasts, and counts rows by it',
         *uses,
         "",
-        "[model.priors]          # what to infer; {} asks for the robot file's prior",
-        *(f"{name} = {{}}  # {why}" for name, why in wanted),
+        "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
+        *wanted,
+        *installed_priors(robot, first),
         "",
         "[inference]",
-        'method = "smc"          # rfdropo methods lists them',
-        "rollouts = 20000        # the budget",
+        'method = "laplace"      # rfdropo methods lists them',
+        *(["blocks = 1              # rows at rest do not depend on the rows before them"] if rests else []),
+        "minutes = 3             # time limit of calibrate on its machine, report included",
         "",
     ]

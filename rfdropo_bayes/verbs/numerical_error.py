@@ -38,7 +38,7 @@ class RestError(NamedTuple):
 
     distance: float  # root mean square, of the markers [mm]
     way: float  # of the markers about their mean [mm]
-    cheaper: float  # solves of the dynamic motion over those of the quasi-static one
+    cheaper: float  # ratio of solves of the dynamic and the quasi-static motion
 
     @property
     def enough(self) -> bool:

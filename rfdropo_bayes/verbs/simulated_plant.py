@@ -49,7 +49,7 @@ def trunk(
     """
     simulator, values = true_simulator(robot, experiment, changes)
     command = simulator.robot.command
-    # Drums turn steadily from one state to the next. What ramps and delays commands stands before the plant.
+    # Drums turn steadily from one state to the next. Ramps and delays of commands act before the plant.
     period = simulator.time_step * max(1, round(PERIOD / simulator.time_step))
     timing = CommandTiming(unit=command.unit, ramp_s=period, dead_time_s=0.0)
     base = simulator.robot.with_changes(command=timing)
@@ -71,8 +71,11 @@ def true_simulator(
     """The simulator behind `trunk` and the values of its parameters, with the commands' own timing.
 
     Args:
-        robot, experiment, changes: as for `trunk`.
+        robot, experiment, changes: see `trunk`.
         base: instead of the experiment's robot.
+
+    Raises:
+        InputError: channels, markers or the unit of commands differ from the robot's.
     """
     overrides = [f"{name}={tomli_w.dumps({'x': value})[4:].strip()}" for name, value in changes.items()]
     if experiment:
@@ -169,7 +172,8 @@ class SimulatedTrunk:
         self._found = found
 
     def _seen(self) -> PlantState:
-        # By virtual work: a drum holds what its cables pull, each times its way per command, at the drum's radius.
+        # By virtual work: a drum holds its cables' tensions, each times its displacement per command, at the drum's
+        # radius.
         tension = self._matrix.T @ np.asarray(self._found.tension, dtype=float)[0] / self._scale
         position = np.asarray(self._found.position, dtype=float)[0]
         position = position + self._noise * self._random.standard_normal(position.shape)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.fem.cables import ROUND
 from rfdropo_bayes.fem.rod import SHEAR, inertia_per_density
 
 SOFTNESS = 1e-9
@@ -109,16 +110,70 @@ def guides_of(system: Any, shape: Shape, cable: int) -> tuple[np.ndarray, np.nda
     return np.array(points), np.array(rows)
 
 
+def way_law(distance: float, near: float) -> tuple[float, float, float]:
+    """How long a way counts, and its first and second derivative by the distance: guides have a size."""
+    if distance > near:
+        return distance, 1.0, 0.0
+    x = distance / near
+    return near * (3.0 + 6.0 * x**2 - x**4) / 8.0, (3.0 * x - x**3) / 2.0, 1.5 * (1.0 - x**2) / near
+
+
+def ways_of(system: Any, shape: Shape, cable: int) -> list[tuple[np.ndarray, np.ndarray, tuple[float, float, float]]]:
+    """Ways of a cable from point to point: direction, its derivative (3, stations, 6), and its law."""
+    (points, rows), (rest, _) = guides_of(system, shape, cable), guides_of(system, Shape(system.body), cable)
+    near = ROUND * np.linalg.norm(np.diff(rest, axis=0), axis=1)
+    result = []
+    for way, change, close in zip(np.diff(points, axis=0), np.diff(rows, axis=0), near, strict=True):
+        distance = float(np.linalg.norm(way))
+        result.append((way / distance, change, way_law(distance, close)))
+    return result
+
+
 def cable_rows(system: Any, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Lengths of all cables, and their derivatives (cables, stations * 6)."""
     lengths, rows = [], []
     for cable in range(len(system.cables.anchor)):
-        points, derivative = guides_of(system, shape, cable)
-        ways = np.diff(points, axis=0)
-        sizes = np.linalg.norm(ways, axis=1)
-        lengths.append(sizes.sum())
-        rows.append(np.einsum("gi,gisk->sk", ways / sizes[:, None], np.diff(derivative, axis=0)).ravel())
+        ways = ways_of(system, shape, cable)
+        lengths.append(sum(law[0] for _, _, law in ways))
+        parts = (law[1] * np.einsum("i,isk->sk", way, change).ravel() for way, change, law in ways)
+        rows.append(sum(parts, np.zeros(6 * len(system.body.station))))
     return np.array(lengths), np.reshape(rows, (len(lengths), 6 * len(system.body.station)))
+
+
+def held(system: Any, shape: Shape, tension: np.ndarray) -> np.ndarray:
+    """Stiffness (stations * 6, stations * 6) of the second derivatives of all ways by the strains of the elements that
+    they run beside: a straight way that holds several elements is taken to hold each."""
+    station, length = system.body.station, np.diff(system.body.station)
+    total = np.zeros((6 * len(station), 6 * len(station)))
+    for cable, pull in enumerate(tension):
+        rest, _ = guides_of(system, Shape(system.body), cable)
+        points, _ = guides_of(system, shape, cable)
+        guides = np.flatnonzero(system.cables.used[cable])
+        arms = [_arm(system, shape, cable, guide) for guide in guides]
+        for g, (way, _, law) in enumerate(ways_of(system, shape, cable)):
+            distance = float(np.linalg.norm(points[g + 1] - points[g]))
+            second = pull * (law[1] / distance * (np.eye(3) - np.outer(way, way)) + law[2] * np.outer(way, way))
+            low, high = sorted([rest[g, 2], rest[g + 1, 2]])
+            for e, h in enumerate(length):
+                first, last = max(low, station[e]), min(high, station[e + 1])
+                if last <= first:
+                    continue
+                along = (0.5 * (first + last) - rest[g, 2]) / (rest[g + 1, 2] - rest[g, 2])
+                arm = along * arms[g] + (1.0 - along) * arms[max(g - 1, 0)]
+                a, b = shape.turn[e], shape.turn[e + 1] * np.sign(shape.turn[e] @ shape.turn[e + 1])
+                middle = matrix((a + b) / np.linalg.norm(a + b))
+                rows = h * np.kron(np.eye(2), middle) @ strains(shape, length, e)[1]
+                change = rows[:3] - hat(arm) @ rows[3:]
+                share = (last - first) * np.linalg.norm(rest[g + 1] - rest[g]) / h**2
+                both = slice(6 * e, 6 * e + 12)
+                total[both, both] += share * change.T @ second @ change
+    return total
+
+
+def _arm(system: Any, shape: Shape, cable: int, guide: int) -> np.ndarray:
+    """Offset of a guide from the axis, in space."""
+    stations, arms = system.cables.station[cable, guide], system.cables.arm[cable, guide]
+    return sum((matrix(shape.turn[k]) @ arm for k, arm in zip(stations, arms, strict=True)), np.zeros(3))
 
 
 def pulls(compliance: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -197,6 +252,10 @@ class Motion:
             right[e : e + 2] -= p * force.reshape(2, 6)
             both = slice(6 * e, 6 * e + 12)
             matrix_[both, both] += p * (p + beta) * h * (rows.T * stiff) @ rows
+        taut = p * p * held(system, shape, self.tension)
+        matrix_ += taut
+        if euler:
+            right -= (taut @ velocity.ravel()).reshape(right.shape)
         lengths, pull = cable_rows(system, shape)
         free = slice(6 * system.clamped_stations, size)
         solved = np.linalg.solve(matrix_[free, free], np.column_stack([right.ravel()[free], pull[:, free].T]))

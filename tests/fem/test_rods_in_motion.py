@@ -9,8 +9,9 @@ import pytest
 import scipy.linalg
 
 from rfdropo_bayes import fem
+from rfdropo_bayes.fem.cables import threads
 from rfdropo_bayes.fem.dynamics import displaced, momentum, stage_body, twist_of
-from rfdropo_bayes.fem.stage_solve import inertia_times, linearised, matrix_times
+from rfdropo_bayes.fem.stage_solve import Way, inertia_times, linearised, matrix_times
 
 YOUNG, DENSITY, HALF = 4e5, 1000.0, 0.01
 CABLES = 3
@@ -43,7 +44,8 @@ def stiff_and_heavy(system: fem.System, material: fem.Material) -> tuple[np.ndar
     """Stiffness and mass of a straight rod over its free stations, from a stage's own equations."""
     prepared = fem.prepare(system, material)
     body = stage_body(system, prepared, fem.state_at_rest(system), 1.0)
-    line, shape = linearised(body), body.twist.shape
+    way, slack = Way(system.clamped_stations, True, system.cables), jnp.zeros(len(system.cables.anchor))
+    line, shape = linearised(way, body, threads(system.cables), slack), body.twist.shape
     each = jnp.eye(shape[0] * shape[1]).reshape(-1, *shape)
     mass = jax.vmap(lambda d: inertia_times(body, line.frame, d).ravel())(each)
     whole = jax.vmap(lambda d: matrix_times(body, line, d).ravel())(each)

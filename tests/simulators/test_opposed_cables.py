@@ -15,15 +15,7 @@ from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
-FOLDED = pytest.mark.xfail(
-    strict=False,
-    reason="steps of the rod leave out geometric terms: necks that opposed cables squeeze to a third of their length "
-    "fold and diverge",
-)
-"""What the layered body withstood and the rod does not yet."""
 
-
-@FOLDED
 def test_a_notched_trunk_between_opposed_cables_stays_whole():
     """Eight random walks of up to 40 mm, each cable on its own, on light and heavy, soft and stiff trunks."""
     robot, discretisation = Robot.load("trunk_sofa"), Discretisation(0.01)
@@ -70,7 +62,6 @@ def moved_by_changes(tip: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(np.sum((tip[:, 1:] - tip[:, :1]) ** 2, axis=-1), axis=0)) / CHANGE[1:]
 
 
-@FOLDED
 def test_a_squeezed_trunk_moves_smoothly_with_its_modulus_and_comes_to_rest():
     """Opposed cables squeeze necks to a third of their length and fold them. Changes of the modulus by a part in 100,
     1000 and 10 million then move the tip in the same proportion, within 5 %, and a trunk that is held stops moving."""
@@ -80,22 +71,18 @@ def test_a_squeezed_trunk_moves_smoothly_with_its_modulus_and_comes_to_rest():
     assert np.abs(np.diff(shown[-20:], axis=0)).max() < 1e-6
 
 
-@FOLDED
 @pytest.mark.slow
-def test_under_sdirk2_it_does_until_its_necks_fold():
-    """Then the same change of the modulus by a part in 10 million moves the tip by up to a tenth of a millimetre, at
-    any time step, and the trunk comes to rest all the same."""
+def test_under_sdirk2_it_does_the_same():
     shown = squeezed(5e6 * (1.0 + CHANGE), 100, 100, "sdirk2")[:, :, -1]
-    moved = moved_by_changes(shown[:60])
+    moved = moved_by_changes(shown[:100])
     np.testing.assert_allclose(moved[1:], moved[0], rtol=0.05)
-    assert np.linalg.norm(shown[:, 3] - shown[:, 0], axis=-1).max() < 2e-4
     assert np.abs(np.diff(shown[-20:], axis=0)).max() < 1e-6
 
 
-@FOLDED
 def test_tensions_of_a_squeezed_trunk_come_to_rest_under_sdirk2():
-    """Opposed cables bring guides as near as 60 um to each other. Held for two seconds, tensions of over 100 N change
-    from step to step by less than 20 N, where springs that lack half of the cables' stiffness leave 400 N."""
+    """Opposed cables bring guides as near as a seventh of a neck to each other. Held for two seconds, tensions of over
+    100 N change from step to step by less than 0.1 N; steps that know nothing of what taut cables hold lose the trunk.
+    """
     robot, discretisation = Robot.load("trunk_sofa"), Discretisation(0.01)
     assembly = assemble(robot, discretisation)
     engine = Engine(assembly, 0.01, Backend(threads=1), integrator="sdirk2")
@@ -108,7 +95,7 @@ def test_tensions_of_a_squeezed_trunk_come_to_rest_under_sdirk2():
     tension = np.asarray(seen.tension)
     assert int(seen.status) == Result.OK
     assert tension[-100:].max() > 100.0
-    assert np.abs(np.diff(tension[-100:], 2, axis=0)).max() < 20.0
+    assert np.abs(np.diff(tension[-100:], 2, axis=0)).max() < 0.1
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import xarray as xr
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, first_row_only
 from rfdropo_bayes.model.model import Model
@@ -53,14 +53,14 @@ def test_the_cube_starts_where_it_was_measured_less_the_offset_and_on_the_plate(
     trajectory = recording(simulator)
     specs = simulator.parameters + noise_specs("white")
     offsets = [f"offset_{axis}" for axis in "xyz"]
-    space = build_space(specs, {name: {} for name in (*offsets, "cube_x", "observation_noise")}, {}, ["pushed"])
+    space = build_scopes(specs, {name: {} for name in (*offsets, "cube_x", "observation_noise")}, {}, ["pushed"])
     recordings = gather_recordings(simulator, [trajectory])
-    model = TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, "white"),))
+    model = TrajectoryModel(simulator, space, recordings, (Markers.gather(recordings, "white"),))
     values = {"cube_x": np.array([0.5, 0.5]), "observation_noise": np.full(2, 1e-3)}
     values |= {name: np.array([0.0, shift]) for name, shift in zip(offsets, SHIFT, strict=True)}
     placed, found = with_measured_starts(model, [first_row_only(trajectory)], values)
-    assert "cube_x" not in placed.space.names
-    own = placed.space.for_recording(found, "pushed")
+    assert "cube_x" not in placed.scopes.names
+    own = placed.scopes.values_in("pushed", found)
     np.testing.assert_allclose(own["cube_x"], [0.012, 0.012 - SHIFT[0]])
     np.testing.assert_allclose(own["cube_z"], [0.1, 0.1 - SHIFT[2]])
     table = push_table(simulator.robot)

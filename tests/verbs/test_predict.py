@@ -15,8 +15,8 @@ import pytest
 import tomli_w
 import xarray as xr
 
-from rfdropo_bayes.bayes.pooling import Pooled
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
@@ -26,10 +26,10 @@ from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction, Scope
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
-from rfdropo_bayes.prediction.predictive import NOISE, _for_new_recordings
+from rfdropo_bayes.prediction.predictive import NOISE, draw_extended
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.predict import run_prediction
@@ -54,9 +54,9 @@ def posterior(tmp_path_factory) -> Path:
         draws[name] = rng.uniform(low, high, (1, 40))
     for axis in "xyz":
         for recording in ("demo_1", "demo_2"):
-            name = f"offset_{axis}@{recording}"
-            infos.append(ParameterInfo(name, "m", -0.05, 0.05, {"distribution": "Normal", "loc": 0.0, "scale": 0.005}))
-            draws[name] = rng.normal(0.0, 0.003, (1, 40))
+            normal, scope = {"distribution": "Normal", "loc": 0.0, "scale": 0.005}, Scope(recording)
+            infos.append(ParameterInfo(f"offset_{axis}", "m", -0.05, 0.05, normal, scope=scope))
+            draws[infos[-1].name] = rng.normal(0.0, 0.003, (1, 40))
     PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(folder / "posterior.nc")
     return folder
 
@@ -120,9 +120,9 @@ def test_another_noise_than_the_fitted_one_is_refused(posterior, tmp_path):
 def test_a_piece_of_a_fitted_recording_keeps_its_frame(posterior, tmp_path):
     """What its first row says about the frame has been used already, with all the other rows."""
     record = PosteriorRecord.load(posterior / "posterior.nc")
-    renamed = [i.name.replace("@demo_1", "@demo_3[0:9]").replace("@demo_2", "@other") for i in record.parameters]
-    infos = tuple(replace(info, name=name) for info, name in zip(record.parameters, renamed, strict=True))
-    draws = {name: record.posterior[info.name] for name, info in zip(renamed, record.parameters, strict=True)}
+    owners = {"": "", "demo_1": "demo_3[0:9]", "demo_2": "other"}
+    infos = tuple(replace(info, scope=Scope(owners[info.scope.owner])) for info in record.parameters)
+    draws = {new.name: record.posterior[info.name] for new, info in zip(infos, record.parameters, strict=True)}
     (tmp_path / "same").mkdir()
     PosteriorRecord(infos, draws, attrs=FITTED_WITH).save(tmp_path / "same" / "posterior.nc")
     whole = Trajectory.load(EXPERIMENTS / COMMANDS)
@@ -143,16 +143,16 @@ def test_what_one_recording_alone_had_free_is_not_carried_to_a_new_one():
         )
     }
     specs["payload"] = ParameterSpec("payload", "kg", 0.0, 1.0, 0.0, {"distribution": "HalfNormal", "scale": 1.0}, "")
-    space = build_space(
+    space = build_scopes(
         tuple(specs.values()),
         {"offset_x": {}, "payload": {}},
         {"offset_x": ["a", "b[0:9]"], "payload": ["b[0:9]"]},
         ["a", "b[0:9]"],
     )
     values = {name: np.full(3, 0.1 * k) for k, name in enumerate(names)}
-    found, drawn = _for_new_recordings(
-        space, values, ["new", "b[20:30]", "a[3:4]"], ["a", "b[0:9]"], jax.random.key(0), {}
-    )
+    names = ["new", "b[20:30]", "a[3:4]"]
+    extension = space.extended(names, ["a", "b[0:9]"], {})
+    found, drawn = extension.scopes, draw_extended(extension, values, names, jax.random.key(0))
     assert set(drawn) == {"offset_x@new", "offset_x@b[20:30]", "payload@b[20:30]", "offset_x@a[3:4]"}
     assert set(found.names) == set(drawn)
     np.testing.assert_array_equal(drawn["offset_x@b[20:30]"], 0.1)
@@ -223,15 +223,16 @@ def deviating(recordings, groups):
     """A space of one parameter that deviates between groups with a spread of 2, and draws of it."""
     spec = ParameterSpec("level", "m", -9.0, 9.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0}, "")
     pooled = {"level": Pooled(2.0, gather_groups(recordings, groups))}
-    space = build_space([spec], {"level": {}}, {}, recordings, pooled=pooled)
+    space = build_scopes([spec], {"level": {}}, {}, recordings, pooled=pooled)
     return space, {name: np.asarray(v) for name, v in space.sample(jax.random.key(1), 4000).items()}
 
 
 def test_a_new_recording_of_a_known_day_has_that_day_s_values_and_one_of_a_new_day_their_spread():
     days = {"january": "jan*", "april": "apr*"}
     space, values = deviating(["jan_1", "jan_2"], days)
-    found, drawn = _for_new_recordings(space, values, ["jan_3", "apr_1"], ["jan_1", "jan_2"], jax.random.key(0), days)
-    january, april = (found.for_recording(drawn, name)["level"] for name in ("jan_3", "apr_1"))
+    extension = space.extended(["jan_3", "apr_1"], ["jan_1", "jan_2"], days)
+    found, drawn = extension.scopes, draw_extended(extension, values, ["jan_3", "apr_1"], jax.random.key(0))
+    january, april = (found.values_in(name, drawn)["level"] for name in ("jan_3", "apr_1"))
     np.testing.assert_array_equal(january, values["level"] + values["level_deviation@january"])
     new = april - values["level"]
     assert np.std(new) == pytest.approx(2.0, rel=0.06)  # 5 standard errors
@@ -256,9 +257,9 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
         return moved.reshape(len(moved), horizon, 6), np.zeros(len(moved))
 
     problem = SimpleNamespace(
-        model=SimpleNamespace(space=space, recordings=recordings), n_recordings=1, rollouts=rollouts
+        model=SimpleNamespace(scopes=space, recordings=recordings), n_recordings=1, rollouts=rollouts
     )
-    drawn = [p for p in space.parameters if p.added_to]
+    drawn = [p for p in space.parameters if p.scope.added_to]
     matched, unmatched = match_first_row(problem, values, ["new"], drawn, left, jax.random.key(2))
     found = matched["level_deviation@new"]
     assert unmatched == 0
@@ -357,7 +358,8 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     offset = {f"offset_{axis}@old": np.random.default_rng(i).normal(0.0, 0.01, (1, 4)) for i, axis in enumerate("xyz")}
     priors = {"observation_noise": prior_of(1e-3)} | {s.name: dict(s.prior) for s in specs}
     infos = [ParameterInfo(n, "-", -np.inf, np.inf, priors[n]) for n in fixed]
-    infos += [ParameterInfo(n, "m", -0.5, 0.5, {"distribution": "Normal", "loc": 0.0, "scale": 0.01}) for n in offset]
+    normal = {"distribution": "Normal", "loc": 0.0, "scale": 0.01}
+    infos += [ParameterInfo(f"offset_{axis}", "m", -0.5, 0.5, normal, scope=Scope("old")) for axis in "xyz"]
     draws = {n: np.full((1, 4), v) for n, v in fixed.items()} | offset
     PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(tmp_path / "posterior.nc")
     run_prediction(Model.read(tmp_path / "own.toml"), tmp_path, "trajectory.nc", tmp_path / "out")

@@ -48,7 +48,7 @@ class Orientation(WhiteSeries):
     name: ClassVar[str] = "orientation"
     linear: ClassVar[bool] = False
     size: ClassVar[ParameterSpec] = ORIENTATION_NOISE
-    sections: tuple[int, ...] = ()  # of the simulator, those that were measured
+    sections: tuple[int, ...] = ()  # indices of the measured sections in the simulator
 
     @classmethod
     def gather(

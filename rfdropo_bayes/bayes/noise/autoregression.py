@@ -2,7 +2,7 @@
 
 Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
 predicted from the min(k, p) rows before it (Levinson-Durbin). Noise shared by columns, such as from a shaking mount,
-has the same memory as the rest (a separable covariance); across a gap in some of the columns alone its whitening is
+has the memory of the other columns (a separable covariance); across a gap in some of the columns alone its whitening is
 approximate.
 
 Memory is defined in seconds, not in rows: in recordings of another rate each row is predicted under the autocorrelation
@@ -27,7 +27,8 @@ from rfdropo_bayes.data.sample_times import ONE_RATE
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
-MISFIT = "misfit"  # white, of the size of what a model that is far off leaves
+INNOVATIONS = "innovations"  # white: the size of slow residuals that the rows before do not predict
+MISFIT = "misfit"  # white, of the size of a misspecified model's residuals
 SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
 LEAST_ROWS = 3  # for each column, to estimate correlations at all
@@ -65,7 +66,14 @@ class Autoregression:
     @property
     def doubtful(self) -> bool:
         """Whether it was taken from residuals of a model that change more slowly than the noise of a measurement."""
-        return self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
+        slow = self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
+        return slow or self.source == INNOVATIONS
+
+    @property
+    def unpredicted(self) -> Autoregression:
+        """White noise with the size of the innovations."""
+        scale = self.scale * float(self.predictors[1][-1])
+        return replace(self, scale=scale, autocorrelation=np.ones(1), source=INNOVATIONS, correlation=None)
 
     def of_columns(self, columns: Sequence[int]) -> Autoregression:
         """The noise of some columns."""
@@ -109,7 +117,7 @@ class Autoregression:
             given["source"],
             np.inf if freedom is None else freedom,
             None if across is None else np.array(across),
-            given.get("step"),  # earlier versions do not say
+            given.get("step"),  # missing in earlier versions
         )
 
     @cached_property
@@ -331,7 +339,7 @@ def estimate_noise(
     across = shrunk_correlation(alone.innovations(series, valid)[whole], freedom_share, shared=shared)
     if across is None:
         return alone
-    # The mean of correlated squares is known as well as that of fewer independent ones.
+    # The mean of correlated squares is as accurate as the mean of fewer independent squares.
     return replace(alone, correlation=across, freedom=alone.freedom * len(across) / float(np.sum(across**2)))
 
 
@@ -373,7 +381,7 @@ def shrunk_correlation(
         return None
     scale = np.sqrt(np.maximum(np.mean(rows**2, axis=0), 1e-300))
     sample = (rows / scale).T @ (rows / scale) / len(rows)
-    np.fill_diagonal(sample, 1.0)  # of a column that never differs, too
+    np.fill_diagonal(sample, 1.0)  # also of a constant column
     pairs = columns * (columns - 1) / 2
     if shared is None:
         likelihood = -(count - 1.0 - (2.0 * columns + 5.0) / 6.0) * np.linalg.slogdet(sample)[1]

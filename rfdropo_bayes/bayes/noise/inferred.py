@@ -187,7 +187,7 @@ def _student(
 ) -> tuple[Float[Array, "time marker 3"], Float[Array, ""]]:
     scale = _student_scale(sigma, degrees)
     square = (residual / scale) ** 2 / degrees
-    # log1p(x) / x is 1 at zero, where neither a quotient nor the derivative of a root exists.
+    # log1p(x) / x is 1 at zero, at which neither the quotient nor the derivative of a root exists.
     small = square < 1e-8
     ratio = jnp.where(small, 1.0 - 0.5 * square, jnp.log1p(square) / jnp.where(small, 1.0, square))
     white = residual / scale * jnp.sqrt((degrees + 1.0) / degrees * ratio)

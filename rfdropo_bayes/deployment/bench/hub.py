@@ -22,7 +22,7 @@ from rfdropo_bayes.errors import InputError
 
 FRAME = struct.Struct("<IB3x8s")
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
-_SEND_TIMEOUT = struct.pack("ll", 0, 50_000)  # 50 ms: a control loop must not hang where a hub does
+_SEND_TIMEOUT = struct.pack("ll", 0, 50_000)  # 50 ms: a control loop must not hang with its hub
 _QUEUE = 1 << 20  # [bytes]: sixty thousand frames, a quarter of an hour of nothing read
 
 
@@ -68,7 +68,7 @@ class HubBus(can.BusABC):
 
     Args:
         channel: "HOST:PORT", or the path of a Unix socket.
-        patience: how long to wait for the hub to appear [s].
+        patience: longest wait for the hub to appear [s].
     """
 
     def __init__(self, channel: str, patience: float = 5.0, **settings: Any) -> None:

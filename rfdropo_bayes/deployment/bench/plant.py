@@ -20,7 +20,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 START = 300.0  # [s]: a plant may compile itself first
-_END = 5.0  # [s]: for the step that it is at, and for what its libraries tidy up
+_END = 5.0  # [s]: for the present step, and for the clean-up of its libraries
 
 
 class PlantState(NamedTuple):
@@ -103,7 +103,7 @@ class PlantHere:
     """A plant in this process.
 
     Args:
-        plant: that is asked.
+        plant: plant to query.
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -126,7 +126,7 @@ class PlantProcess:
     A plant slower than real time lags behind; ``late`` says by how much.
 
     Args:
-        name, robot, settings: as for `build_plant`; called in the new process.
+        name, robot, settings: see `build_plant`; called in the new process.
     """
 
     def __init__(self, name: str, robot: Robot, settings: Mapping[str, Any] | None = None) -> None:

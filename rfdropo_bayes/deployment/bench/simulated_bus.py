@@ -33,7 +33,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 TICK = 0.002  # [s]: drives check their guards and move between frames
-PLANT_PERIOD = 0.01  # [s]: how often plant and markers are brought up to date where no SYNC comes
+PLANT_PERIOD = 0.01  # [s]: time between updates of plant and markers without SYNC
 DATAGRAM = struct.Struct("<4sId")
 MAGIC = b"RFMK"
 
@@ -44,7 +44,7 @@ class SimulationTable(NamedTuple):
     Attributes:
         robot: name or path of a robot with motors.
         bus: the bus that the drives are on.
-        plant, settings: as for `build_plant`.
+        plant, settings: see `build_plant`.
         own_process: whether the plant runs in a process of its own.
         markers: "HOST:PORT" that markers are sent to; empty for none.
         encoder_offset: counts that every encoder shows at length zero, less the motor's own offset.

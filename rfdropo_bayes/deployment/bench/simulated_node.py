@@ -88,7 +88,8 @@ class SimulatedNode:
     def _power_on(self, now: float) -> None:
         self.local = StrictNode(self.number, data_sheet(self._eds, self.number, len(self.drives)))
         self.local.sdo.network = _Sender(self._send)  # type: ignore[assignment]
-        self.local._write_callbacks.clear()  # LocalNode's own heartbeat runs in a thread that one send error ends
+        # LocalNode's own heartbeat runs in a thread that ends at the first send error
+        self.local._write_callbacks.clear()
         self.local.add_write_callback(self._check_write)
         self.local.add_read_callback(self._read)
         for (index, subindex), value in self._values.items():
@@ -101,11 +102,11 @@ class SimulatedNode:
         self.fault = SimulatedFault.NONE
         self._settings: dict[tuple[int, int], int] = {}
         self._pending: dict[int, bytes] = {}
-        self._heard: float | None = None  # consumer heartbeat: guarded from the first one on
-        self._last_sync = math.inf  # guarded from the first one on
+        self._heard: float | None = None  # consumer heartbeat: guarded from the first
+        self._last_sync = math.inf  # guarded from the first
         self._next_heartbeat = now
         self._last_status: dict[int, bytes] = {}  # of each TPDO, as sent
-        self._sent: dict[int, tuple[float, bytes]] = {}  # of each TPDO: when, and what
+        self._sent: dict[int, tuple[float, bytes]] = {}  # of each TPDO: time and content
         self._beats = 0
         for drive in self.drives:
             drive.power_on(now)

@@ -49,7 +49,7 @@ def _linked_module(library: CPUCodeLibrary) -> Any:
     """The module of a deferred library for one that Numba compiles its own way, which links its direct callees only."""
     if library._linking_libraries:
         _link_all(library)
-        library._shared_module = None  # of what was there before
+        library._shared_module = None  # of earlier libraries
     return CPUCodeLibrary._get_module_for_linking(library)
 
 

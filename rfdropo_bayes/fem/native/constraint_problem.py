@@ -60,7 +60,7 @@ class ConstraintProblem(NamedTuple):
 
     matrix: Float[np.ndarray, "rows2 lanes"]  # condensed compliance W, row-major [1/kg]
     free: Float[np.ndarray, "rows lanes"]  # velocities without impulses [m/s]
-    impulse: Float[np.ndarray, "rows lanes"]  # [N s]; where the iterations start, and what they find
+    impulse: Float[np.ndarray, "rows lanes"]  # [N s]; start of the iterations, and their result
     before: Float[np.ndarray, "rows lanes"]  # impulses before a correction
     velocity: Float[np.ndarray, "rows lanes"]
     aim: Float[np.ndarray, "rows lanes"]  # change that the constraints ask of the impulses, in the columns L
@@ -200,7 +200,7 @@ def _linearise_contact(p, c, lines, token):
     x = where_greater(sticks, zero, y, push) - load(p.impulse, i, token)
     y = where_greater(sticks, zero, a, slide * f) - load(p.impulse, i + 1, token)
     z = where_greater(sticks, zero, b, slide * g) - load(p.impulse, i + 2, token)
-    # The columns are orthogonal: what they reach of the change, and what is left.
+    # The columns are orthogonal: their part of the change, and the rest.
     square = fma(l00, l00, fma(l10, l10, l20 * l20))
     r0 = fma(l00, x, fma(l10, y, l20 * z)) / where_greater(square, zero, square, one)
     square = fma(l11, l11, l21 * l21)

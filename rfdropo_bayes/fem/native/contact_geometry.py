@@ -335,7 +335,7 @@ def choose_closing(touch, gravity, drag, stage, wide, narrow, going, token):
         if stage.predicted:  # the velocity of the start has closed the gap already
             store(touch.gap, slot, fnma(u * wide, time_step, load(touch.gap, slot, token)))
         closing = where_greater(_closing(touch, slot, u, v, w, time_step, narrow, token), -EAGER * one, one, zero)
-        # What touched before may hold on by its friction.
+        # A former contact may hold on by its friction.
         x, y, z = load3(touch.memory, 3 * touch.pair[slot], token)
         closing = where_greater(_dot(x, y, z, x, y, z), zero, one, closing)
         store(touch.chosen, slot, _near(touch, slot, closing, token))

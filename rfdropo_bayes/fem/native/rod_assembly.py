@@ -22,13 +22,34 @@ from rfdropo_bayes.fem.native.rod_effects import (
     BRANCH,
     LOADED,
     add_branch,
-    add_law_tangent,
     find_slopes,
     place_law_stress,
 )
-from rfdropo_bayes.fem.native.rod_records import BOW, CHORD, DIRECTOR, GRADIENT, RATE, SLOPE, STRAIN, STRESS, TILTED
+from rfdropo_bayes.fem.native.rod_records import (
+    BOW,
+    CHORD,
+    DIRECTOR,
+    GRADIENT,
+    HELD,
+    RATE,
+    SLOPE,
+    STRAIN,
+    STRESS,
+    TILTED,
+)
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store, where_greater
+from rfdropo_bayes.fem.native.simd import (
+    any_greater,
+    fill,
+    fma,
+    fnma,
+    inlined,
+    kernel,
+    load,
+    load3,
+    store,
+    where_greater,
+)
 from rfdropo_bayes.fem.native.vectors import (
     add_to,
     added,
@@ -99,7 +120,7 @@ def _measure_rates(element, work, token):
 
 
 @kernel
-def _add_forces(element, rows, field, token):
+def add_forces(element, rows, field, token):
     """Add the forces and moments of the stresses in ``rows`` to the field of both stations."""
     a = SIZE * element
     b, half = a + SIZE, fill(0.5, field, token)
@@ -121,9 +142,8 @@ def _entry(i):
 
 
 @kernel
-def add_element_force(tables, samples, factors, element, work, token):
-    """Add the elastic and viscous force of an element that was measured to ``field``; its section's tangent is left in
-    ``SLOPE``."""
+def place_stress(tables, samples, factors, element, work, token):
+    """Elastic and viscous stresses of an element that was measured; its section's tangent is left in ``SLOPE``."""
     rows, section = work.element, SECTION * element
     force, rate = load(factors.strain, 0, token), load(factors.strain_rate, 0, token)
     _measure_rates(element, work, token)
@@ -139,18 +159,17 @@ def add_element_force(tables, samples, factors, element, work, token):
         place_law_stress(tables, samples, element, force, rate, work, token)
     if samples.present[BRANCH]:
         add_branch(samples, factors, element, work, token)
-    _add_forces(element, rows, work.field, token)
 
 
-@kernel
+@inlined
 def _symmetric(a, scale):
     """scale * a a', its lower half by columns."""
     x, y, z = a[0] * scale, a[1] * scale, a[2] * scale
     return x * a[0], x * a[1], x * a[2], y * a[1], y * a[2], z * a[2]
 
 
-@kernel
-def _mixed(a, b):
+@inlined
+def _both(a, b):
     """a b' + b a', its lower half by columns."""
     two = a[0] * b[0], a[1] * b[1], a[2] * b[2]
     return (
@@ -163,22 +182,58 @@ def _mixed(a, b):
     )
 
 
-@kernel
+@inlined
 def _sum(a, b):
     """Sum of two lower halves."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
 
 
-@kernel
-def _difference(a, b):
-    """Difference of two lower halves."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3], a[4] - b[4], a[5] - b[5]
+@inlined
+def _load_lower(rows, first, token):
+    """A lower half in six rows."""
+    return load3(rows, first, token) + load3(rows, first + 3, token)
 
 
-@kernel
-def _times(a, scale):
-    """A lower half times a scale."""
-    return a[0] * scale, a[1] * scale, a[2] * scale, a[3] * scale, a[4] * scale, a[5] * scale
+@inlined
+def _columns(a):
+    """Columns of a symmetric matrix, given its lower half."""
+    return (a[0], a[1], a[2]), (a[1], a[3], a[4]), (a[2], a[4], a[5])
+
+
+@inlined
+def _lower(a):
+    """Lower half of a matrix of columns."""
+    return a[0][0], a[0][1], a[0][2], a[1][1], a[1][2], a[2][2]
+
+
+@inlined
+def _less_dyad(matrix, a, b):
+    """A matrix of columns, less a b'."""
+    return added(a, -b[0], matrix[0]), added(a, -b[1], matrix[1]), added(a, -b[2], matrix[2])
+
+
+@inlined
+def _applied(matrix, a):
+    """A matrix of columns times a vector."""
+    return added(matrix[2], a[2], added(matrix[1], a[1], scaled(matrix[0], a[0])))
+
+
+@inlined
+def _back(matrix, a):
+    """The transpose of a matrix of columns times a vector."""
+    return dot(matrix[0], a), dot(matrix[1], a), dot(matrix[2], a)
+
+
+@inlined
+def _product(a, b):
+    """Product of two matrices of columns."""
+    return _applied(a, b[0]), _applied(a, b[1]), _applied(a, b[2])
+
+
+@inlined
+def _back_product(a, b):
+    """The transpose of a matrix of columns times another."""
+    return _back(a, b[0]), _back(a, b[1]), _back(a, b[2])
 
 
 @kernel
@@ -198,111 +253,172 @@ def _put_lower(target, t, a, add, token):
 
 
 @kernel
-def _put_negative(target, t, a):
-    """Write the symmetric tile -a, given its lower half."""
-    store(target, t, -a[0], -a[1], -a[2], -a[1], -a[3], -a[4], -a[2], -a[4], -a[5])
-
-
-@kernel
-def _bending_tile(rows, elasticity, token):
-    """W R D R' W / h times a factor, its lower half."""
-    x, y, z = load3(rows, TILTED, token), load3(rows, TILTED + 3, token), load3(rows, TILTED + 6, token)
-    tile = _symmetric(x, elasticity * load(rows, SLOPE + 2, token))
-    tile = _sum(tile, _symmetric(y, elasticity * load(rows, SLOPE + 5, token)))
-    tile = _sum(tile, _symmetric(z, elasticity * load(rows, SLOPE + 7, token)))
-    return tile
-
-
-@kernel
-def _lever_tiles(upper, whole, soft, stiff, axis, parts, work, token):
-    """Tiles of moments by displacements: S' c of both stations, column by column.
-
-    Of a straight chord S' c = ``soft`` S' + ``stiff`` s t' with s = S' t, t the ``axis``; S and s are the sum and the
-    difference of parts that are even and odd in g. Of an arc follows ``bow``, b times the stiffness along the axis.
-    """
-    rows, lower, half, (even, odd, bow) = work.element, upper - BLOCK, 0.5 * soft, parts
-    g = load3(rows, GRADIENT, token)
-    chord = scaled(load3(rows, CHORD, token), half)
-    shift, zero = -dot(chord, g), fill(0.0, work.element, token)
-    hats = (zero, -chord[2], chord[1]), (chord[2], zero, -chord[0]), (-chord[1], chord[0], zero)
-    units = (shift, zero, zero), (zero, shift, zero), (zero, zero, shift)
+def _put_tile(target, t, a):
+    """Write a matrix of columns."""
     for c in range(3):
-        along = stiff * axis[c]
-        p, q = added(even, along, hats[c]), added(odd, along, added(chord, g[c], units[c]))
-        q = added(bow, -axis[c], q)
-        a, b = plus(p, q), minus(p, q)
-        add_to(work.pivot, upper + PANEL + 3 * c, b, token)
-        if whole:
-            put(work.pivot, lower + PANEL + 3 * c, (-a[0], -a[1], -a[2]))
-            put(work.coupling, upper + PANEL + 3 * c, a)
-            for r in range(3):
-                store(work.coupling, upper + 9 + 3 * r + c, -b[r])
+        put(target, t + 3 * c, a[c])
+
+
+@inlined
+def _negative(a):
+    """Minus a matrix of columns."""
+    return scaled(a[0], -1.0), scaled(a[1], -1.0), scaled(a[2], -1.0)
+
+
+@inlined
+def _plus(a, b):
+    """Sum of two matrices of columns."""
+    return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2])
+
+
+@inlined
+def _minus(a, b):
+    """Difference of two matrices of columns."""
+    return minus(a[0], b[0]), minus(a[1], b[1]), minus(a[2], b[2])
+
+
+@inlined
+def _across(a):
+    """Transpose of a matrix of columns."""
+    return (a[0][0], a[1][0], a[2][0]), (a[0][1], a[1][1], a[2][1]), (a[0][2], a[1][2], a[2][2])
 
 
 @kernel
-def _put_full(target, t, a, skew):
-    """Write the tile of a lower half, plus [skew]x."""
-    x, y, z = skew
-    store(target, t, a[0], a[1] + z, a[2] - y, a[1] - z, a[3], a[4] + x, a[2] + y, a[4] - x, a[5])
+def _measure_held(tables, factors, element, work, token):
+    """How taut cables hold an element, times the factor in the matrix; see `cables.held`. Returns whether any does."""
+    rows, zero, taut_any = work.element, fill(0.0, work.element, token), False
+    force = moment = zero, zero, zero, zero, zero, zero
+    one, two, three = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
+    for k in range(tables.beside_first[element], tables.beside_first[element + 1]):
+        taut = load(work.tension, tables.beside_cable[k], token) * load(factors.held, 0, token)
+        if any_greater(taut, zero):
+            taut_any, g, along = True, tables.beside_guide[k], tables.beside_along[k]
+            taut = taut * tables.beside_share[k]
+            arm = scaled(load3(work.offset, 3 * tables.beside_start[k], token), fill(1.0 - along, rows, token))
+            arm = added(load3(work.offset, 3 * g, token), fill(along, rows, token), arm)
+            a, b = taut * load(work.inverse, g, token), taut * load(work.sharp, g, token)
+            way = load3(work.direction, 3 * g, token)
+            turn, (x, y, z), ball = cross(way, arm), scaled(arm, a), a * dot(arm, arm)
+            force = _sum(_sum(force, _symmetric(way, -b)), (a, zero, zero, a, zero, a))
+            moment = _sum(_sum(moment, _symmetric(turn, -b)), _symmetric(arm, -a))
+            moment = _sum(moment, (ball, zero, zero, ball, zero, ball))
+            way = scaled(way, b)
+            one = added(way, turn[0], plus(one, (zero, -z, y)))
+            two = added(way, turn[1], plus(two, (z, zero, -x)))
+            three = added(way, turn[2], plus(three, (-y, x, zero)))
+    for i in range(6):
+        store(rows, HELD + i, force[i])
+        store(rows, HELD + 15 + i, moment[i])
+    _put_tile(rows, HELD + 6, (one, two, three))
+    return taut_any
 
 
 @kernel
-def _moment_tiles(upper, whole, soft, stiff, parts, bending, work, token):
-    """Tiles of moments by rotations: S' c S of both stations and of the pair, and ``bending``; see `_lever_tiles`."""
-    rows, quarter, diagonal, (even, odd, bow) = work.element, 0.25 * soft, upper + PANEL + 9, parts
-    chord, g, one = load3(rows, CHORD, token), load3(rows, GRADIENT, token), fill(1.0, work.element, token)
-    square, lean = dot(chord, chord), dot(chord, g)
-    steep, bent, zero, half = dot(g, g), lean * lean, one - one, 0.5 * one
-    own, both = _symmetric(chord, quarter), _mixed(chord, scaled(g, quarter * lean))
-    first, second = _symmetric(even, stiff), _symmetric(odd, stiff)
-    mixed = _mixed(even, scaled(odd, stiff))
-    swing = _mixed(chord, scaled(cross(chord, g), quarter))
-    mixed = _difference(_difference(mixed, swing), _mixed(bow, even))
-    arc = _mixed(bow, added(load3(rows, BOW, token), half, scaled(odd, -one)))
-    ball = quarter * (square + bent)
-    same = _sum(_sum(_sum(first, second), bending), arc)
-    same = _sum(_difference(same, both), _times(own, steep - one))
-    same = _sum(same, (ball, zero, zero, ball, zero, ball))
-    _put_lower(work.pivot, diagonal, _difference(same, mixed), True, token)
-    if whole:
-        _put_lower(work.pivot, diagonal - BLOCK, _sum(same, mixed), False, token)
-        ball = quarter * (square - bent)
-        pair = _difference(_difference(_difference(first, second), bending), arc)
-        pair = _difference(_sum(pair, both), _times(own, steep + one))
-        pair = _sum(pair, (ball, zero, zero, ball, zero, ball))
-        skew = added(cross(odd, even), stiff, scaled(added(chord, lean, scaled(g, square)), quarter))
-        _put_full(work.coupling, diagonal, pair, minus(cross(bow, even), skew))
+def _mixed(rows, token):
+    """Columns of the force of cables that hold an element by its bending and twist."""
+    return load3(rows, HELD + 6, token), load3(rows, HELD + 9, token), load3(rows, HELD + 12, token)
 
 
 @kernel
-def add_element_tangent(factors, element, work, whole, token):
+def _hold_rates(rows, token):
+    """Add to the stresses what the cables that hold an element do against the rates of its strains."""
+    stretching = combined(rows, DIRECTOR, load3(rows, RATE, token), token)
+    bending = combined(rows, DIRECTOR, load3(rows, RATE + 3, token), token)
+    mixed = _mixed(rows, token)
+    force = plus(_applied(_columns(_load_lower(rows, HELD, token)), stretching), _applied(mixed, bending))
+    moment = plus(_back(mixed, stretching), _applied(_columns(_load_lower(rows, HELD + 15, token)), bending))
+    add_to(rows, STRESS, components(rows, DIRECTOR, force, token), token)
+    add_to(rows, STRESS + 3, components(rows, DIRECTOR, moment, token), token)
+
+
+@kernel
+def _levers(rows, token):
+    """S of both stations, as columns."""
+    d, g, half = load3(rows, CHORD, token), load3(rows, GRADIENT, token), fill(0.5, rows, token)
+    x, y, z = scaled(d, half)
+    zero, e, b = half - half, load3(rows, DIRECTOR + 6, token), load3(rows, BOW, token)
+    ball, lean = -dot((x, y, z), g), scaled(g, half)
+    fold = (ball, zero, zero), (zero, ball, zero), (zero, zero, ball)
+    fold = added(lean, d[0], fold[0]), added(lean, d[1], fold[1]), added(lean, d[2], fold[2])
+    fold, turn = _less_dyad(fold, e, b), ((zero, z, -y), (-z, zero, x), (y, -x, zero))
+    first = plus(turn[0], fold[0]), plus(turn[1], fold[1]), plus(turn[2], fold[2])
+    second = minus(turn[0], fold[0]), minus(turn[1], fold[1]), minus(turn[2], fold[2])
+    return first, second
+
+
+@kernel
+def _section_force(rows, elasticity, token):
+    """Lower half of the force by stretch and shear, in space."""
+    soft, stiff = elasticity * load(rows, SLOPE, token), elasticity * load(rows, SLOPE + 1, token)
+    zero, axis = soft - soft, load3(rows, DIRECTOR + 6, token)
+    return _sum(_symmetric(axis, stiff - soft), (soft, zero, zero, soft, zero, soft))
+
+
+@kernel
+def _section_moment(rows, elasticity, lawful, token):
+    """Lower half of the moment by bending and twist in space, between W and W."""
+    x, y, z = load3(rows, TILTED, token), load3(rows, TILTED + 3, token), load3(rows, TILTED + 6, token)
+    moment = _symmetric(x, elasticity * load(rows, SLOPE + 2, token))
+    moment = _sum(moment, _symmetric(y, elasticity * load(rows, SLOPE + 5, token)))
+    moment = _sum(moment, _symmetric(z, elasticity * load(rows, SLOPE + 7, token)))
+    if lawful:
+        moment = _sum(moment, _both(x, scaled(y, elasticity * load(rows, SLOPE + 3, token))))
+        moment = _sum(moment, _both(x, scaled(z, elasticity * load(rows, SLOPE + 4, token))))
+        moment = _sum(moment, _both(y, scaled(z, elasticity * load(rows, SLOPE + 6, token))))
+    return moment
+
+
+@kernel
+def _less_turn(rows, matrix, token):
+    """A matrix of columns times W."""
+    g, one = load3(rows, GRADIENT, token), fill(1.0, rows, token)
+    return _less_dyad(matrix, _applied(matrix, scaled(g, (one + one) / (one + dot(g, g)))), g)
+
+
+@kernel
+def add_element_tangent(factors, element, work, whole, held, lawful, token):
     """Add the tangent of an element to the pivot of its upper station; ``whole``: set the coupling, and start the pivot
-    of the lower one."""
+    of the lower one; ``held`` by cables; ``lawful``: with a bending law."""
     rows, upper, elasticity = work.element, (element + 1) * BLOCK, load(factors.elasticity, 0, token)
-    soft = elasticity * load(rows, SLOPE, token)
-    stiff = fma(elasticity, load(rows, SLOPE + 1, token), -soft)
-    axis, chord, g = load3(rows, DIRECTOR + 6, token), load3(rows, CHORD, token), load3(rows, GRADIENT, token)
-    half, zero = fill(0.5, work.element, token), fill(0.0, work.element, token)
-    tile = _sum(_symmetric(axis, stiff), (soft, zero, zero, soft, zero, soft))
-    _put_lower(work.pivot, upper, tile, True, token)
+    lower, tile, (first, second) = upper - BLOCK, upper + PANEL, _levers(rows, token)
+    force, bent = _section_force(rows, elasticity, token), _columns(_section_moment(rows, elasticity, lawful, token))
+    if held:
+        force = _sum(force, _load_lower(rows, HELD, token))
+        moment = _less_turn(rows, _columns(_load_lower(rows, HELD + 15, token)), token)
+        bent = _plus(bent, _less_turn(rows, _across(moment), token))
+    stiff = _columns(force)
+    a, b, turned, across = _product(stiff, first), _product(stiff, second), bent, _negative(bent)
+    if held:
+        mixed = _less_turn(rows, _mixed(rows, token), token)
+        a, b, back = _minus(a, mixed), _plus(b, mixed), _back_product(mixed, second)
+        turned, across = _plus(bent, back), _minus(across, back)
+        bent = _minus(bent, _back_product(mixed, first))
+    _put_lower(work.pivot, upper, force, True, token)
+    back = _across(b)
+    for c in range(3):
+        add_to(work.pivot, tile + 3 * c, back[c], token)
+    _put_lower(work.pivot, tile + 9, _lower(_plus(_back_product(second, b), turned)), True, token)
     if whole:
-        _put_lower(work.pivot, upper - BLOCK, tile, False, token)
-        _put_negative(work.coupling, upper, tile)
-    even = scaled(cross(axis, chord), half)
-    odd = scaled(added(chord, dot(g, axis), scaled(axis, -dot(chord, g))), half)
-    parts = even, odd, scaled(load3(rows, BOW, token), soft + stiff)
-    _lever_tiles(upper, whole, soft, stiff, axis, parts, work, token)
-    _moment_tiles(upper, whole, soft, stiff, parts, _bending_tile(rows, elasticity, token), work, token)
+        back = _across(a)
+        _put_lower(work.pivot, lower, force, False, token)
+        _put_tile(work.pivot, lower + PANEL, _negative(back))
+        _put_lower(work.pivot, lower + PANEL + 9, _lower(_plus(_back_product(first, a), bent)), False, token)
+        _put_tile(work.coupling, upper, _negative(stiff))
+        _put_tile(work.coupling, upper + 9, _negative(b))
+        _put_tile(work.coupling, tile, back)
+        _put_tile(work.coupling, tile + 9, _plus(_back_product(first, b), across))
 
 
 @kernel
-def assemble_element(tables, samples, factors, element, work, whole, token):
+def assemble_element(tables, samples, factors, element, work, whole, predicted, token):
     """Force of an element and its part of the matrix; see `add_element_tangent` for ``whole``."""
     measure_element(tables, element, work, token)
-    add_element_force(tables, samples, factors, element, work, token)
-    add_element_tangent(factors, element, work, whole, token)
-    if samples.present[BENDING]:
-        add_law_tangent(factors, element, work, whole, token)
+    held = _measure_held(tables, factors, element, work, token)
+    place_stress(tables, samples, factors, element, work, token)
+    if held and not predicted:
+        _hold_rates(work.element, token)
+    add_forces(element, work.element, work.field, token)
+    add_element_tangent(factors, element, work, whole, held, samples.present[BENDING], token)
 
 
 @kernel

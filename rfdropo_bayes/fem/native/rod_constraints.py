@@ -57,7 +57,7 @@ class Rows(NamedTuple):
 
     border: Float[np.ndarray, "values lanes"]
     own: Float[np.ndarray, "tiles lanes"]  # minus their condensed products
-    across: Float[np.ndarray, "tiles lanes"]  # and those with the engine's border
+    across: Float[np.ndarray, "tiles lanes"]  # and products with the engine's border
 
 
 def row_storage(station_values: int, panels: int, others: int, lanes: int, dtype: type) -> Rows:

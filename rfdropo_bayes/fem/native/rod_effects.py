@@ -1,20 +1,13 @@
 """Effects of the body in SIMD lanes: laws of the section, Prony branch, softening, fluid, wall and stretching cables.
 
-The physics is that of ``fem.bending_law``, ``fem.surroundings`` and ``fem.dynamics``. What a batch does not have is
-skipped by flags that are the same for all lanes; cables and softening are a few operations a step, and always there.
+The physics follows ``fem.bending_law``, ``fem.surroundings`` and ``fem.dynamics``. Absent effects are skipped by flags
+that are the same for all lanes; cables and softening cost little and are always computed.
 """
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL
-from rfdropo_bayes.fem.native.rod_records import (
-    FIRM,
-    RATE,
-    SLOPE,
-    STRAIN,
-    STRESS,
-    TILTED,
-)
+from rfdropo_bayes.fem.native.chain_cholesky import BLOCK
+from rfdropo_bayes.fem.native.rod_records import FIRM, RATE, SLOPE, STRAIN, STRESS
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.vectors import add_to, added, dot, minus, put, scaled
@@ -22,14 +15,14 @@ from rfdropo_bayes.fem.sections import LEAST_TANGENT
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
-"""Flags in ``samples.present``; the last one is Coulomb's friction, that of the capstan follows it."""
+"""Flags in ``samples.present``; the last is Coulomb's friction, followed by the capstan's."""
 LOADED = FRICTION + 2
-"""Flag of what acts on the body from step to step, see ``fem.section_loads``."""
+"""Flag of loads that change from step to step, see ``fem.section_loads``."""
 FLAGS = LOADED + 1
 (
     GAIN, SHARE, DECAY, LATER_DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN, FIBRE,
 ) = range(13)  # fmt: skip
-"""Rows of ``samples.effects``; gain and share are those of a stage, decay that of the moduli in each stage."""
+"""Rows of ``samples.effects``; gain and share belong to a stage, decay to the moduli in each stage."""
 EFFECTS = FIBRE + 1
 LAW = 6
 """Rows of ``samples.law`` for each element, added to its stiffness in bending and twist: 00, 01, 02, 11, 12, 22."""
@@ -54,7 +47,7 @@ def find_slopes(tables, samples, element, work, token):
 
 @kernel
 def _left(tables, samples, element, work, token):
-    """What the stretch leaves of the bending stiffness, by the law of fibres."""
+    """Remaining share of the bending stiffness under stretch, by the law of fibres."""
     steep = load(samples.effects, FIBRE, token) * (3.0 / tables.length[element])
     return fnma(steep, load(work.element, STRAIN + 2, token), fill(1.0, work.element, token))
 
@@ -86,7 +79,7 @@ def place_law_stress(tables, samples, element, force, rate, work, token):
 
 @kernel
 def add_branch(samples, factors, element, work, token):
-    """Add to the stresses what the Prony branch of an element makes of its strain."""
+    """Add the stress of an element's Prony branch."""
     rows, section, b, gain = work.element, SECTION * element, SIZE * element, load(factors.branch, 0, token)
     for i in range(3):
         stiffness = gain * load(samples.section, section + (0 if i < 2 else 1), token)
@@ -112,37 +105,10 @@ def follow_branch(factors, element, work, token):
 
 
 @kernel
-def _add_dyads(tile, t, a, b, token):
-    """Add a b' to a tile."""
-    for c in range(3):
-        add_to(tile, t + 3 * c, scaled(a, b[c]), token)
-
-
-@kernel
-def add_law_tangent(factors, element, work, whole, token):
-    """Add to the tangent of an element what its bending law has beside the diagonal; ``whole`` as in
-    ``rod_assembly.add_element_tangent``."""
-    rows, upper, elasticity = work.element, (element + 1) * BLOCK, load(factors.elasticity, 0, token)
-    diagonal = upper + PANEL + 9
-    for k in range(3):
-        i, j, entry = (0 if k < 2 else 1), (1 if k < 1 else 2), SLOPE + 3 + (k if k < 2 else 3)
-        scale = elasticity * load(rows, entry, token)
-        a, b = scaled(load3(rows, TILTED + 3 * i, token), scale), load3(rows, TILTED + 3 * j, token)
-        _add_dyads(work.pivot, diagonal, a, b, token)
-        _add_dyads(work.pivot, diagonal, b, a, token)
-        if whole:
-            _add_dyads(work.pivot, diagonal - BLOCK, a, b, token)
-            _add_dyads(work.pivot, diagonal - BLOCK, b, a, token)
-            back = -a[0], -a[1], -a[2]
-            _add_dyads(work.coupling, diagonal, back, b, token)
-            _add_dyads(work.coupling, diagonal, b, back, token)
-
-
-@kernel
 def add_surroundings(tables, samples, factors, station, predicted, work, token):
     """Add the wall and the fluid of a station to ``field`` and to its pivot.
 
-    ``predicted``: the wall is met where the position is, and the fluid with the derivative of the speed.
+    ``predicted``: the wall acts at the position itself, and the fluid with the derivative of the speed.
     """
     zero, row = fill(0.0, work.field, token), SIZE * station
     x, y, _ = load3(work.frame, FRAME * station, token)

@@ -55,15 +55,15 @@ from rfdropo_bayes.runtime import available_processors
 Precision = Literal["float64", "float32"]
 AT_REST = {"float64": (1e-9, 1e-6), "float32": (1e-5, 1e-5)}
 """Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest: at the start,
-and in a row of a quasi-static motion. What is left is a tenth of it at most: iterations converge faster and faster."""
+and in a row of a quasi-static motion. The remaining error is at most a tenth of it, as convergence is superlinear.
+"""
 
-# When a step's impulses are found, what counts as a missed contact, and when a body is at rest, as far as the precision
-# resolves them.
+# Limits of convergence, of a missed contact, and of rest, by precision.
 _NUMERICS = {name: (SETTLED[name], SOFTNESS[name], MISSED[name], *AT_REST[name]) for name in ("float64", "float32")}
 
 
 class Run(NamedTuple):
-    """Rollouts of a batch: what they are computed from, how they run, and what they record."""
+    """Rollouts of a batch: inputs, settings and recorded outputs."""
 
     batch: Batch
     cubes: Cubes | None
@@ -73,7 +73,7 @@ class Run(NamedTuple):
 
     @property
     def motion(self) -> Motion:
-        """What has been recorded."""
+        """The recorded motion."""
         output = self.output
         assert output is not None
         pose = None if self.poses is None else self.poses.pose
@@ -93,7 +93,7 @@ class Run(NamedTuple):
 
 
 class Records(NamedTuple):
-    """What a lane block works on; None where cables do not rub, and where there is no cube."""
+    """Data of a lane block; None for cables without friction, and without a cube."""
 
     samples: RodSamples
     factors: Factors
@@ -114,14 +114,14 @@ class NativeRod:
     """Rollouts of one rod with its cables.
 
     Args:
-        system: body, cables, and how many stations are held.
+        system: body, cables, and number of held stations.
         points: the points whose positions are recorded.
-        time_step: of one step [s].
-        precision: of all arithmetic; parameters, commands and results are float64 in any case.
+        time_step: length of a step [s].
+        precision: precision of all arithmetic; parameters, commands and results are float64 in any case.
         threads: lane blocks computed at the same time; None for all processors this process may use.
-        lanes: samples side by side; None for as many as a vector register holds.
-        scene: what the body pushes a cube on; None for a body that touches nothing.
-        integrator: how a step is taken; with "quasi-static" every step is a row at rest, and the time step is not
+        lanes: samples side by side; None for the width of a vector register.
+        scene: geometry on which the body pushes a cube; None for a body that touches nothing.
+        integrator: scheme of a step; with "quasi-static" every step is a row at rest, and the time step is not
             used.
 
     Raises:
@@ -178,12 +178,12 @@ class NativeRod:
             start: cable displacements [m] whose static equilibrium is the initial state, as in
                 ``fem.static_equilibrium``; None starts undeformed.
             before: cable displacements [m] before the first step of a body that starts undeformed; zero by default.
-                Stages within the step take theirs from the way to its end.
-            steps: compute only so many steps.
-            stride: record every so many steps.
-            cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
+                Stages within the step interpolate to its end.
+            steps: number of steps to compute; all by default.
+            stride: number of steps between recorded states.
+            cube: for an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
                 at the start; mass [kg], side [m], radius of gyration [m] and coefficient of friction.
-            loads: what acts on the body from step to step; None for nothing.
+            loads: loads that change from step to step; None for none.
 
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
@@ -196,7 +196,7 @@ class NativeRod:
         return run.motion
 
     def records(self, rubs: bool) -> Records:
-        """What a block works on in the calling thread; ``rubs``: with friction of the cables."""
+        """Data of a block in the calling thread; ``rubs``: with friction of the cables."""
         kept = self._local.__dict__.setdefault("records", {})
         if rubs not in kept:
             tables, made = self.tables, (self.lanes, self.dtype.type)
@@ -229,7 +229,7 @@ class NativeRod:
         cube: tuple[np.ndarray, np.ndarray] | None,
         loads: SectionLoads | None = None,
     ) -> Run:
-        """What the kernels read and write; arguments as `rollout`."""
+        """Inputs and outputs of the kernels; arguments as `rollout`."""
         displacement = np.asarray(displacement, dtype=float)
         cables = self.tables.cables
         if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
@@ -257,7 +257,7 @@ class NativeRod:
         return self.with_output(Run(batch, cubes, schedule))
 
     def with_output(self, run: Run) -> Run:
-        """The same run with room for what it records."""
+        """The same run with allocated output."""
         count, records = run.batch.count, 1 + run.schedule.steps // run.schedule.stride
         output = RodOutput(
             np.zeros((count, records, self.points, 3)),
@@ -292,7 +292,7 @@ class NativeRod:
         modulus = rows["young_modulus"]
         shear = modulus / (2.0 * (1.0 + rows["poisson_ratio"]))
         arrays = {
-            "moduli": np.stack([modulus, shear], axis=1),
+            "moduli": np.stack([modulus, shear, rows["axial_scale"] * modulus], axis=1),
             "density": rows["density"][:, None],
             "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
             "gravity": rows["gravity"],

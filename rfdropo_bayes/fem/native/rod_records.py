@@ -14,17 +14,30 @@ from rfdropo_bayes.fem.native.simd import aligned_zeros
 
 KINDS = 2
 """Coulomb's friction and the capstan's."""
-DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM = 0, 9, 18, 21, 24, 27, 33, 39, 45, 53
+DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM, HELD = (
+    0,
+    9,
+    18,
+    21,
+    24,
+    27,
+    33,
+    39,
+    45,
+    53,
+    59,
+)
 """First rows of an element's scratch: directors in its middle, these times W, chord, g, b, strains, their rates and the
 stresses; the section's tangent, of shear, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six
-without the law of fibres."""
-ELEMENT = FIRM + 6
+without the law of fibres; and how taut cables hold it in space: its force by stretch and shear (lower half, by
+columns), that by bending and twist (columns), and the moment by these (lower half)."""
+ELEMENT = HELD + 21
 
 
 class RodSamples(NamedTuple):
     """Rollout parameters of one lane block; the last axis is the lane."""
 
-    moduli: Float[np.ndarray, "2 lanes"]  # of Young and of shear [Pa]
+    moduli: Float[np.ndarray, "3 lanes"]  # of Young, of shear, and of Young in tension [Pa]
     density: Float[np.ndarray, "1 lanes"]
     scale: Float[np.ndarray, "elements lanes"]  # of the stiffness
     point_mass: Float[np.ndarray, "stations lanes"]
@@ -40,6 +53,7 @@ class Factors(NamedTuple):
     """What makes a solve a time step or a static iteration; (1, lanes) each."""
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
+    held: Float[np.ndarray, "1 lanes"]  # of the stiffness of taut cables
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
@@ -48,7 +62,7 @@ class Factors(NamedTuple):
     branch: Float[np.ndarray, "1 lanes"]  # of the elastic force of the Prony branch
     share: Float[np.ndarray, "1 lanes"]  # of its strain that its dashpot follows
     give: Float[np.ndarray, "1 lanes"]  # of a cable's length per impulse, over the time step
-    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in units of the other stage's
     narrow: Float[np.ndarray, "1 lanes"]  # its inverse
     going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
 
@@ -69,13 +83,16 @@ class RodWork(NamedTuple):
     weight: Float[np.ndarray, "rows lanes"]
     element: Float[np.ndarray, "rows lanes"]  # scratch of an element
     lever: Float[np.ndarray, "guide_entries3 lanes"]  # arms of the guides in space [m]
-    direction: Float[np.ndarray, "guides3 lanes"]  # from the point before to a guide
-    course: Float[np.ndarray, "guides lanes"]  # and how far [m]
+    offset: Float[np.ndarray, "guides3 lanes"]  # sums of these
+    direction: Float[np.ndarray, "guides3 lanes"]  # derivative of the way to a guide by its place
+    course: Float[np.ndarray, "guides lanes"]  # length of the way [m]
+    inverse: Float[np.ndarray, "guides lanes"]  # its second derivative is inverse - sharp * direction direction' [1/m]
+    sharp: Float[np.ndarray, "guides lanes"]
     slack: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
-    unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the impulses of the last step were not found
-    accepted: Float[np.ndarray, "1 lanes"]  # 1 where the last step was taken
+    unsolved: Float[np.ndarray, "1 lanes"]  # 1 if the impulses of the last step were not found
+    accepted: Float[np.ndarray, "1 lanes"]  # 1 if the last step was accepted
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses, or an equilibrium, were not found
     points: Float[np.ndarray, "point_values lanes"]
@@ -89,7 +106,7 @@ class RodWork(NamedTuple):
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]
-    softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
+    softness: Float[np.ndarray, "1 lanes"]  # remaining share of the moduli after the time
     firmness: Float[np.ndarray, "1 lanes"]  # factor on the stiffness in a step, and on the damping
     loss: Float[np.ndarray, "1 lanes"]
     pushed: Float[np.ndarray, "stations3 lanes"]  # forces on the sections in a step [N]

@@ -72,7 +72,7 @@ class RodSession:
     """Lanes of one rod, each with its own parameters and its own time.
 
     Args:
-        engine: that computes rollouts of the body.
+        engine: engine of the body's rollouts.
         count: lanes.
 
     Attributes:
@@ -110,9 +110,9 @@ class RodSession:
             material: fields with one entry per row.
             start: cable displacements [m] whose static equilibrium is the initial state; None starts undeformed. An
                 equilibrium that was found before is not computed again.
-            before: as in `NativeRod.rollout`.
-            cube: of an engine with a scene, as in `NativeRod.rollout`.
-            loads: that act on the initial state, in one row. Lanes are always given some, or never.
+            before: see `NativeRod.rollout`.
+            cube: for an engine with a scene, see `NativeRod.rollout`.
+            loads: loads on the initial state, in one row. Lanes are always given loads, or never.
 
         Returns:
             The initial state, as a rollout of one row.
@@ -258,7 +258,7 @@ class RodSession:
             own: dict[str, dict[str, np.ndarray]] = {place.record: {} for place in self._places}
             for place in self._places:
                 own[place.record][place.name] = self.memory[block, place.first : place.last]
-            # What is present is the same for all blocks, and no lane's own.
+            # Flags of present effects are the same for all blocks and lanes.
             own["samples"]["present"] = self._run.batch.present
             parts = {name: getattr(records, name)._replace(**fields) for name, fields in own.items()}
             self._local.records[block] = records._replace(**parts)

@@ -11,7 +11,7 @@ from rfdropo_bayes.fem.equilibrium import LONGEST_STEP
 from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import PANEL
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.rod_assembly import add_element_force, add_station_loads, measure_element
+from rfdropo_bayes.fem.native.rod_assembly import add_forces, add_station_loads, measure_element, place_stress
 from rfdropo_bayes.fem.native.rod_constraints import hold
 from rfdropo_bayes.fem.native.rod_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.rod_step import condense_increment, gather_cables, move_stations, near, place_directors
@@ -187,6 +187,7 @@ def _start_settling(tables, samples, factors, work, token):
     """Make the solves those of a static iteration."""
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
     store(factors.elasticity, 0, load(work.firmness, 0, token))
+    store(factors.held, 0, one)
     store(factors.inertia, 0, zero)
     store(factors.force, 0, one)
     store(factors.strain, 0, load(work.firmness, 0, token))
@@ -236,7 +237,8 @@ def measure_imbalance(tables, samples, factors, work, token):
             add_surroundings(tables, samples, factors, station, False, work, token)
     for element in range(tables.stations - 1):
         measure_element(tables, element, work, token)
-        add_element_force(tables, samples, factors, element, work, token)
+        place_stress(tables, samples, factors, element, work, token)
+        add_forces(element, work.element, work.field, token)
     _add_cable_forces(tables, work, token)
     for station in range(tables.held, tables.stations):
         for i in range(SIZE):

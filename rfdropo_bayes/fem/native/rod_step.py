@@ -74,6 +74,7 @@ def set_factors(samples, factors, work, stage, wide, token):
     lookahead = length * (one + gain) + damping
     behind = damping if stage.predicted else lookahead
     store(factors.elasticity, 0, length * lookahead * softness)
+    store(factors.held, 0, length * length)
     store(factors.inertia, 0, fma(length, drag, one))
     store(factors.force, 0, length)
     store(factors.strain, 0, length * softness)
@@ -89,9 +90,9 @@ def set_factors(samples, factors, work, stage, wide, token):
 
 @kernel
 def _guide_point(tables, g, work, token):
-    """Place of a guide; keeps the arms of its entries in space."""
+    """Place of a guide; keeps the arms of its entries in space, and their sum."""
     zero = fill(0.0, work.frame, token)
-    point = zero, zero, zero
+    point = offset = zero, zero, zero
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
         frame = FRAME * tables.guide_station[k]
         lever = zero, zero, zero
@@ -100,7 +101,9 @@ def _guide_point(tables, g, work, token):
             if arm != 0.0:
                 lever = added(load3(work.frame, frame + 3 + 3 * i, token), arm, lever)
         put(work.lever, 3 * k, lever)
+        offset = plus(offset, lever)
         point = plus(point, added(load3(work.frame, frame, token), tables.guide_weight[k], lever))
+    put(work.offset, 3 * g, offset)
     return point
 
 
@@ -121,9 +124,26 @@ def pull_guide(tables, g, border, row, panels, pull, work, token):
 
 
 @kernel
+def _measure_way(near, g, distance, work, token):
+    """Length of the way to a guide at a distance from the point before, and its derivative over the distance."""
+    one, limit = fill(1.0, work.frame, token), fill(near, work.frame, token)
+    share = distance * (1.0 / near)
+    square, far = share * share, one / distance
+    length = fma(square, fma(square, -0.125 * one, 0.75 * one), 0.375 * one) * near
+    inverse = fma(square, -0.5 * one, 1.5 * one) * (1.0 / near)
+    sharp = one / (inverse * inverse * (near * near * near))
+    length = where_greater(distance, limit, distance, length)
+    inverse = where_greater(distance, limit, far, inverse)
+    store(work.course, g, length)
+    store(work.inverse, g, inverse)
+    store(work.sharp, g, where_greater(distance, limit, far, sharp))
+    return length, inverse
+
+
+@kernel
 def _gather_cable(tables, c, work, token):
     """Border row dl/dx of a cable; returns how much shorter than at rest it is, and dl/dt."""
-    x, one, zero = work.frame, fill(1.0, work.frame, token), fill(0.0, work.frame, token)
+    x, zero = work.frame, fill(0.0, work.frame, token)
     point = fill(tables.anchor[3 * c], x, token), fill(tables.anchor[3 * c + 1], x, token), zero
     point = point[0], point[1], fill(tables.anchor[3 * c + 2], x, token)
     shorter, growth, before, row = fill(tables.rest_length[c], x, token), zero, (zero, zero, zero), tables.row[c]
@@ -131,11 +151,10 @@ def _gather_cable(tables, c, work, token):
     for g in range(first, last):
         here = _guide_point(tables, g, work, token)
         way = minus(here, point)
-        segment = square_root(dot(way, way))
-        shorter = shorter - segment
-        way = scaled(way, one / segment)
+        length, inverse = _measure_way(tables.near[g], g, square_root(dot(way, way)), work, token)
+        shorter = shorter - length
+        way = scaled(way, inverse)
         put(work.direction, 3 * g, way)
-        store(work.course, g, segment)
         if g > first:
             pull = minus(before, way)
             growth = growth + pull_guide(tables, g - 1, work.border, row, tables.panels, pull, work, token)
@@ -211,7 +230,7 @@ def condense_increment(tables, samples, factors, work, stage, token):
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
-            assemble_element(tables, samples, factors, station - 1, work, not last, token)
+            assemble_element(tables, samples, factors, station - 1, work, not last, predicted, token)
         add_station_mass(tables, samples, factors, station, work, token)
         add_station_loads(tables, samples, factors, station, work, token)
         if stage.carried > 0.0:

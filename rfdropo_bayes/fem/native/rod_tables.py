@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from rfdropo_bayes.fem.cables import ROUND
 from rfdropo_bayes.fem.dynamics import LOST
 from rfdropo_bayes.fem.rod import SHEAR, Rod, drag_areas, inertia_per_density, tributary_lengths
 
@@ -40,7 +41,14 @@ class RodTables(NamedTuple):
     guide_arm: Float[np.ndarray, "entries 3"]  # [m]
     anchor: Float[np.ndarray, "cables 3"]
     rest_length: Float[np.ndarray, " cables"]
-    row: Int[np.ndarray, " cables"]  # of the border that a cable has: those that reach farthest first
+    near: Float[np.ndarray, " guides"]  # a shorter way to a guide counts as longer, see `cables.ROUND` [m]
+    beside_first: Int[np.ndarray, " elements_1"]  # pieces of the ways beside every element
+    beside_cable: Int[np.ndarray, " pieces"]
+    beside_guide: Int[np.ndarray, " pieces"]
+    beside_start: Int[np.ndarray, " pieces"]  # guide that the way begins at; of the first way of a cable its end
+    beside_share: Float[np.ndarray, " pieces"]  # see `cables.CableLayout`
+    beside_along: Float[np.ndarray, " pieces"]
+    row: Int[np.ndarray, " cables"]  # of a cable's border: cables with the longest reach first
     active: Int[np.ndarray, " stations"]  # panels of the border that are not zero at a station
     section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
     section_area: Float[np.ndarray, " stations"]  # that times the body's width [m2]
@@ -119,8 +127,26 @@ def _cables(layout: Any, body: Rod) -> dict[str, np.ndarray]:
         "guide_arm": arm,
         "anchor": anchor,
         "rest_length": length,
+        "near": ROUND * layout.way[used],
+        **_beside(layout, body.elements),
         "row": row,
         "active": np.array(active, dtype=np.int64),
+    }
+
+
+def _beside(layout: Any, elements: int) -> dict[str, np.ndarray]:
+    """Pieces of the ways to guides, sorted by the elements that they run beside."""
+    number = np.cumsum(layout.used.ravel()).reshape(layout.used.shape) - 1
+    cable, guide, piece = np.nonzero(layout.share)
+    order = np.argsort(layout.element[cable, guide, piece], kind="stable")
+    cable, guide, piece = cable[order], guide[order], piece[order]
+    return {
+        "beside_first": np.searchsorted(layout.element[cable, guide, piece], np.arange(elements + 1)),
+        "beside_cable": cable,
+        "beside_guide": number[cable, guide],
+        "beside_start": number[cable, np.maximum(guide - 1, 0)],
+        "beside_share": layout.share[cable, guide, piece],
+        "beside_along": layout.along[cable, guide, piece],
     }
 
 

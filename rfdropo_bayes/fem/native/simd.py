@@ -47,8 +47,8 @@ inlined = partial(kernel, forceinline=True)
 whole = partial(COMPILERS.whole, nogil=True, cache=True, error_model="numpy")
 """Decorator of the kernel at the top, which Python calls."""
 
-# Numba's own way, each function optimised by itself, for meshes (see `compilation`): parts of a kernel, those that it
-# takes in before and after its types are known, and kernels that are kept between processes.
+# Numba's own way, each function optimised by itself, for meshes (see `compilation`): parts of a kernel, included before
+# and after its types are known, and cached kernels.
 mesh_part = numba.njit(nogil=True, error_model="numpy")
 mesh_pasted = numba.njit(inline="always")
 mesh_inlined = numba.njit(forceinline=True, error_model="numpy")
@@ -331,5 +331,5 @@ def any_greater(typing_context, left, right):
     return types.boolean(left, right), generate
 
 
-# What Numba loads before it calls its first kernel (0.4 s), with the other imports rather than in the first rollout.
+# Numba loads this before its first kernel (0.4 s): with the other imports rather than in the first rollout.
 cpu_target.target_context.refresh()

@@ -76,7 +76,7 @@ class TetrahedralWork(NamedTuple):
     accepted: Float[np.ndarray, "1 lanes"]
     lost: Float[np.ndarray, "1 lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]
-    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in units of the other stage's
     narrow: Float[np.ndarray, "1 lanes"]  # its inverse
     going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
     axes: Float[np.ndarray, "9 lanes"]

@@ -47,9 +47,9 @@ class Cables(NamedTuple):
     node: Int[np.ndarray, "points weights"]
     weight: Float[np.ndarray, "points weights"]
     anchor: Float[np.ndarray, "cables 3"]
-    rest_segment: Float[np.ndarray, " points"]  # from the point before to this one, at rest [m]; 0 for the first
+    rest_segment: Float[np.ndarray, " points"]  # from the previous point to this point, at rest [m]; 0 for the first
     limit: Float[np.ndarray, " cables"]  # largest displacement [m]
-    rate: float  # largest change of the displacement in a step, against the one measured a step before [m]
+    rate: float  # largest change of the displacement in a step, against the displacement measured a step before [m]
 
 
 class TetrahedralSchedule(NamedTuple):

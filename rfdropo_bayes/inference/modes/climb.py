@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
+NOISE_GRID = 13  # values of a noise coordinate tried at the start of an optimisation
 AXIS, LONGEST = 0.5, 0.05  # step along an axis of a posterior, in its deviations, and at most in any coordinate
 NOISE_STEP = 1e-2  # of a noise coordinate, along which residuals only change their scale
 ROUNDS = 3  # of differences along axes that get better
@@ -147,8 +147,8 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     best = int(np.argmax(densities))
     gain = float(densities[best] - state.log_density)
     position, density = (tried[best], float(densities[best])) if gain > 0.0 else state[:2]
-    # An engine in single precision promises for ever what it does not deliver. Where six decades of damping gain
-    # nothing, the differences left are those of rounding, or the model is useless here: smaller steps, if any.
+    # The predicted gain of an engine in single precision may never be realised. If six decades of damping gain nothing,
+    # the remaining differences are rounding, or the model is useless here: smaller steps, if any.
     if gain < tolerance:
         stuck = bool(dampings[-1] > 1e8 or promised < 100.0 * tolerance)
         moved = LevenbergState(position, density, state.damping * 1e5, stuck)

@@ -21,7 +21,7 @@ from rfdropo_bayes.inference.modes.climb import Laplace
 
 MIXTURES = ("equal", "evidence", "best")
 CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
-STRONG = 3.0  # nats by which it must be worse, too: less is no strong evidence under any noise (Kass & Raftery 1995)
+STRONG = 3.0  # nats by which it must also be worse: less is no strong evidence under any noise (Kass & Raftery 1995)
 
 
 def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:

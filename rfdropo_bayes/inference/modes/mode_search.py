@@ -61,12 +61,12 @@ from rfdropo_bayes.inference.smc.moves import BlockProblem, StraightProblem, squ
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
 JACOBIANS = ("auto", "forward", "central")
-SAME = 0.02  # largest difference of any coordinate between two climbs that ended at one point
+SAME = 0.02  # largest difference of any coordinate between two optimisations with the same result
 RIVAL = 30.0  # nats below the best optimum, beyond which another matters to no posterior: exp(-30) is 1e-13
-SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take, and of their progress
-SURVEYS = 2  # of the last prefixes, whose particles climbs start from; as many horizons of climbs come after
-SURVEY_MOVES = 8  # of a stage, at most: climbs need a place in the right basins, not a fair sample of them
-FEWEST_STEPS = 4.0  # of a climb that is worth its start
+SURVEY_OF_CLIMBS = 0.6  # share of the budget of optimisations that a pilot run may take, and of their progress
+SURVEYS = 2  # number of last prefixes whose particles start optimisations; the same number of horizons follows
+SURVEY_MOVES = 8  # of a stage, at most: optimisations need a start in the right basins, not a fair sample of them
+FEWEST_STEPS = 4.0  # of an optimisation that is worth its start
 
 
 @dataclass(frozen=True, repr=False)
@@ -318,7 +318,7 @@ def survey(
     """
     straight_key, run_key = jax.random.split(key)
     blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
-    # The sampler takes blocks for rows of equal cost, which is more than short ones cost.
+    # The sampler assumes rows of equal cost in a block, which overestimates short prefixes.
     whole = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts * problem.n_rows / horizons[-1]
     sampling = sampler.SmcConfig(
         rollouts=whole,
@@ -409,7 +409,7 @@ def _go_on(climbs: Climbs, horizon: int) -> Climbs:
     positions, density = climbs.positions, climbs.log_density
     if not np.isfinite(density).any():
         raise NoLikelihoodError(
-            f"no climb has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
+            f"no optimisation has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
             where="[inference]",
             remedy="look at the simulator's reports there, or allow more starts",
         )
@@ -498,7 +498,7 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     share = now * waiting / (now * waiting + later)
     grid, step = climb_cost(d, noise)
     rows = max(config.rollouts - climbs.ledger.rollouts, 0.0) * n_rows / now * share
-    # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
+    # More optima than expected may have reached the last horizon: continue with the best, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
@@ -520,7 +520,9 @@ def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start
 
 def _unfinished(converged: bool) -> list[Caution]:
     """A caution if the best optimisation has not converged."""
-    sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+    sentence = (
+        "the best optimisation had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+    )
     return [] if converged else [Caution(Code.CLIMB_UNFINISHED, sentence, grave=True)]
 
 

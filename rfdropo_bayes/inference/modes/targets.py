@@ -28,7 +28,7 @@ from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate
 from rfdropo_bayes.inference.modes.climb import positive_part
 
 FLATTEST = 1e-10  # curvature that a step takes a direction to have at least, as a share of the steepest
-DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
+DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order 1
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 
 UNBOUNDED = (-np.inf, np.inf)
@@ -88,7 +88,7 @@ class Target(NamedTuple):
         if self.noise.any():
             slope = _slope(self.likelihood, u, self.noise)
             gradient[self.noise] = np.where(np.isfinite(slope), slope, 0.0)
-            # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
+            # Twice, exact in expectation for a scale: J'J has m, the information is 2 m.
             curvature[np.ix_(self.noise, self.noise)] *= 2.0
         return gradient + self.prior_gradient(u), curvature + positive_part(-self.prior_hessian(u))
 

@@ -108,7 +108,7 @@ def step_log_likelihood(
         alive: rollouts that ended well; at least two.
         observed: the trajectory, in the units of the features.
         mask: observed entries that count.
-        variance_floor: in squared units of the features; a scalar, or one value per feature.
+        variance_floor: floor of the variance in squared units of the features; a scalar, or one value per feature.
     """
     good = features[alive]
     mean = good.mean(axis=0)

@@ -47,7 +47,7 @@ from rfdropo_bayes.inference.smc.moves import StraightProblem, host_generator, s
 
 INFLATION = 1.5  # of the Student-t's scale over the Laplace standard deviation
 DEGREES = 5.0  # of freedom of the Student-t's
-PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for what no climb has found
+PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for modes that no optimisation found
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
@@ -167,8 +167,8 @@ def sample_from_modes(
     sampled = sampler.run(bridged, sampling, run_key, logbook)
     _, draws = bridged.carried_back(sampled.draws, problem.names)
     spent = ledger + sampled.spent
-    # Several optima are what the mixture is for: no caution here, unlike in Laplace alone.
-    # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
+    # Several optima are normal for the mixture: no caution here, unlike in Laplace alone. The sampler's cautions about
+    # coordinates and its share of rollouts are restated below for parameters and the total.
     kept = stage_cautions(sampled.trace, sampling.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     first = found.climbs.trace[0]["horizon"]
@@ -232,8 +232,8 @@ class ModeMixture:
         if from_prior.any():
             values = self.problem.sample_prior(key, int(from_prior.sum()))
             draws[from_prior] = np.asarray(self.problem.to_unconstrained(values), dtype=float)
-        # Halves of the particles move by what the other half looks like, which leaves the target alone only if a
-        # particle's half says nothing of where it is: no order by component.
+        # Halves of the particles move by the statistics of the other half, which preserves the target only if a
+        # particle's half is independent of its position: no order by component.
         return draws[generator.permutation(n)]
 
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
@@ -313,6 +313,6 @@ def _with_prior_moments(
     root = _root(prior)
     of_prior = np.linalg.solve(root.T, np.linalg.solve(root, mean - mode.mean))
     centre = mode.mean + covariance @ (mode.slope + of_prior)
-    # Of the two neither is known to be the better: they get equal shares.
+    # Neither of the two is known to be better: they get equal shares.
     wide = Laplace(centre, covariance, 0.0)
     return wide._replace(log_density=mode.log_evidence - wide.log_evidence)

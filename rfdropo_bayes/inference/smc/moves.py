@@ -21,7 +21,7 @@ from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.problem import ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.inference.modes.climb import Laplace
 
-POSITIVE_DRAWS = 1000  # from the prior, which tell which parameters are positive
+POSITIVE_DRAWS = 1000  # from the prior, which show the positive parameters
 
 
 class Reference(NamedTuple):
@@ -48,7 +48,7 @@ def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
     covariance = (weights[:, None] * centred).T @ centred
     shrinkage = max(0.0, 1.0 - distinct_size(position, weights) / (2.0 * (d + 1)))
     diagonal = np.diag(covariance)
-    # Of each coordinate: units may differ by powers of ten. Copies of one particle spread by what is rounded off.
+    # Per coordinate: units may differ by powers of ten. Copies of one particle spread by rounding.
     rounding = np.finfo(float).eps * np.max(np.abs(position), axis=0)
     floor = np.maximum(1e-12 * diagonal, np.maximum(rounding**2, 1e-200))
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)
@@ -160,7 +160,7 @@ class StraightProblem:
         v = jnp.asarray(v)
         rest = self.problem.from_unconstrained(jnp.where(self.logarithmic, 0.0, v))
         positive = {name: jnp.exp(v[:, j]) for j, name in enumerate(self.names) if self.logarithmic[j]}
-        # What is a deviation in units of a standard deviation has to know that one's own coordinate.
+        # A deviation in units of a standard deviation depends on that deviation's own coordinate.
         u = jnp.asarray(self.problem.to_unconstrained({**rest, **positive}))
         return {**self.problem.from_unconstrained(jnp.where(self.logarithmic, u, v)), **positive}
 

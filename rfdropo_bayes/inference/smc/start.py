@@ -41,23 +41,23 @@ from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATE
 from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
 
 FROM_OPTIMA = "smc_from_optima"
-CLIMBING = 0.25  # share of the budget that climbs to optima may take
+CLIMBING = 0.25  # share of the budget for optimisations
 SURVEY_OF_ALL = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
-# With fewer, more than half of the surveys of a rugged ridge missed the summit.
+# With fewer, more than half of the pilot runs on a rugged ridge missed the optimum.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
-SURVEYED_STEPS = 7.0  # of the length of the whole recording that a climb after a survey takes, typically
-CLOSE = 1e-2  # nats below its optimum that a climb may end: the sampler starts from a wider distribution
-STEPS = 12.0  # that a climb takes at each horizon, typically
-CLIMBED = 0.6  # share of the work that is done when climbs have ended, for a progress bar
+SURVEYED_STEPS = 7.0  # typical cost of an optimisation after a pilot run, in rollouts of the whole recording
+CLOSE = 1e-2  # nats below its optimum at which an optimisation may end: the sampler starts from a wider distribution
+STEPS = 12.0  # typical steps of an optimisation at each horizon
+CLIMBED = 0.6  # share of the work that is done after the optimisations, for a progress bar
 SCORING = 0.1  # share of the budget for the evidence of the blocks
 SCREEN = 64  # prior draws, the best of which tells the likelihood's information
-MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
+MARGIN = 3.0  # cost of real posteriors over the estimate, which assumes normality and even data
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
-MOVES = 4.0  # of a stage: about 3 where the posterior is normal, more where it is not
-FARTHEST = 5.0  # prior deviations that a value is taken to be away; farther ones are a prior at odds with the data
+MOVES = 4.0  # of a stage: about 3 if the posterior is normal, otherwise more
+FARTHEST = 5.0  # prior deviations of a value at most; farther values mean a conflict of prior and data
 INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # a short prefix says little: its posterior is near the prior
-MOST_STEPS = 12  # of the climb from the optimum of all rows to that of a prefix
+MOST_STEPS = 12  # of the optimisation from the optimum of all rows to the optimum of a prefix
 MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
@@ -93,7 +93,7 @@ def run(
     except NoLikelihoodError:
         if config.start == "optimum":
             raise
-        # No draw to climb from had a likelihood: whether the prior excludes the data is for more particles to say.
+        # No draw had a likelihood for an optimisation: more particles must show whether the prior excludes the data.
         left = replace(config, rollouts=_left(config, spent))
         return _with_cost(sampler.run(problem, left, key, logbook), spent)
     if found is not None:
@@ -233,8 +233,8 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
     About log scales of noise, m residuals hold the information 2 m.
 
     Args:
-        problem: to be sampled.
-        config: of the sampler.
+        problem: problem to sample.
+        config: settings of the sampler.
         key: random key.
         ledger: is charged.
 
@@ -336,7 +336,7 @@ def _affordable_scores(
     """Steps of each optimisation, and draws for each prefix."""
     if budget is None or not horizons:
         return MOST_STEPS, MOST_DRAWS
-    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, climb and draws each
+    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, for optimisation and draws each
     d, k = len(noise), int(noise.sum())
     step = 4.0 * d + 7.0  # a Jacobian by differences, noise coordinates, six dampings
     around = 3.0 * step + 8.0 * k**2  # the normal approximation at the end, twice: the second along its own axes

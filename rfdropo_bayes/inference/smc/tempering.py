@@ -32,7 +32,7 @@ from rfdropo_bayes.inference.smc.moves import (
 
 DEGREES = 8.0  # of freedom of the Student-t behind proposals
 ACCEPTANCE = 0.3  # that step sizes are adapted to
-CORRELATION = 0.3  # moves go on until no direction is more correlated than this with where the stage began
+CORRELATION = 0.3  # moves continue until no direction has a larger correlation with the start of the stage
 
 Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -120,7 +120,7 @@ def advance(
     """
     start = population.progress
     first = int(start)
-    # Columns: density at whole rows from the one at or before the start, relative to it.
+    # Columns: density at whole rows from the row at or before the start, relative to it.
     whole = np.cumsum(population.rows[:, first : int(np.ceil(stop))], axis=1)
     whole = np.concatenate([np.zeros((len(whole), 1)), whole], axis=1)
 
@@ -274,7 +274,7 @@ def refresh(
     resample_key, move_key = jax.random.split(key)
     references = cross_references(population)
     population, index = resample(resample_key, population)
-    # Each particle moves by what the OTHER half looks like: see cross_references.
+    # Each particle moves by the statistics of the OTHER half: see cross_references.
     halves = index >= len(index) // 2
     if moves == 0:
         return population, info

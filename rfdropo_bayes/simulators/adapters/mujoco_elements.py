@@ -372,7 +372,7 @@ def searched(
                     given = {"low": 1.0 / RANGE, "high": RANGE, "prior": dict(_FACTOR)}
                 family = "gravity" if kind == "option" else f"{kind}_{attribute}" + "_scale" * (edit.form == "factor")
                 if kind == "joint" and edit.form == "value" and motion_of(model, number) == SLIDING:
-                    family += "_sliding"  # in another unit than that of joints that turn
+                    family += "_sliding"  # in another unit than for rotational joints
                 own = attribute.removeprefix("gravity_") if kind == "option" else plain_name(name)
                 yield f"{family}_{own}", family, edit, parameter_of(edit, known, unit, words, given)
 

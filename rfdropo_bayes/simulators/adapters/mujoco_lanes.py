@@ -82,7 +82,7 @@ class MuJoCoLanes:
             self._state[rows] = states[:, -2]
         late = states[:, -1, 0] - begun - (steps + 1) * clock
         self._failed[rows] |= ~((np.abs(late) < 0.5 * clock) & np.isfinite(states[:, -1]).all(axis=1))
-        position, tension = self.rollouts.shown(seen)  # the first row: what a new command exerts before it has moved
+        position, tension = self.rollouts.shown(seen)  # the first row: tensions of a new command before any motion
         diverged: Bool[np.ndarray, " row"] = self._failed[rows].copy()
         sound = ~diverged[:, None]
         return Motion(

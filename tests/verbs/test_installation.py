@@ -1,0 +1,82 @@
+"""The robot as it is installed: sizes of its priors follow the robot and its recording."""
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.budget import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS, budget_within
+from rfdropo_bayes.verbs.installation import (
+    ORIGIN,
+    ZERO,
+    installed_mechanisms,
+    installed_priors,
+    largest_pull,
+    rows_to_fit,
+)
+
+
+def arm(scale: float = 1.0, unit: str = "rad") -> Robot:
+    return Robot.outline(
+        name="arm", length=0.2 * scale, radius=0.02 * scale, markers={"tip": 0.2 * scale}, command_unit=unit
+    )
+
+
+def run(unit: str, size: float, rows: int = 90) -> Trajectory:
+    time = 0.1 * np.arange(rows)
+    command = np.zeros((rows, 4))
+    command[:, 1] = -size * np.linspace(0.0, 1.0, rows)
+    return Trajectory.from_arrays(
+        time=time,
+        time_unit="s",
+        position=0.1 * np.sin(time)[:, None, None] * np.ones(3),
+        position_unit="m",
+        markers=("tip",),
+        channels=tuple(f"c{k}" for k in range(4)),
+        command=command,
+        command_unit=unit,
+        initial_command="zero",
+        name="run",
+    )
+
+
+def priors_of(lines: list[str]) -> dict[str, float]:
+    return {line.split(" = ")[0]: float(line.split("scale = ")[1].split(" ")[0]) for line in lines if "scale" in line}
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1, 7.0])
+def test_sizes_follow_the_robot_and_its_commands(scale):
+    size = 0.012 * scale / 0.01
+    sent = run("rad", size)
+    robot = arm(scale)
+    assert largest_pull(robot, sent) == pytest.approx(0.01 * size)
+    found = priors_of(installed_priors(robot, sent))
+    assert found["initial_displacement"] == pytest.approx(ZERO * 0.01 * size, rel=0.05)
+    assert found["offset"] == pytest.approx(ORIGIN * 0.2 * scale, rel=0.05)
+    assert "command_gain_error" not in found
+
+
+def test_cables_in_metres_have_a_gain_and_angles_their_spool():
+    assert "command_gain" in installed_mechanisms(arm(unit="m"))
+    assert "command_gain" not in installed_mechanisms(arm())
+    assert "command_gain_error" in priors_of(installed_priors(arm(unit="m"), None))
+
+
+def test_commands_that_never_move_leave_zeros_fixed():
+    assert "initial_displacement" not in priors_of(installed_priors(arm(), run("rad", 0.0)))
+
+
+def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
+    assert rows_to_fit(run("rad", 1.0, rows=90)) == ([0, 59], [60, 89])
+    assert rows_to_fit(run("rad", 1.0, rows=40)) is None
+    assert rows_to_fit(None) is None
+
+
+def test_a_budget_in_minutes_follows_the_time_of_a_rollout():
+    slow, fast = budget_within(3.0, 1.0, 1.5), budget_within(3.0, 0.01, 1.5)
+    assert slow.rollouts == pytest.approx(90)
+    assert fast.rollouts == pytest.approx(9000)
+    assert slow.draws == pytest.approx(24)
+    assert fast.draws == MOST_DRAWS
+    starved = budget_within(0.01, 10.0, 1.0)
+    assert starved == (FEWEST_ROLLOUTS, FEWEST_DRAWS)
