@@ -61,7 +61,7 @@ def _largest(tables, first, field, token):
 
 @kernel
 def _choose_way(tables, work, moving, token):
-    """Limit ``solution``, and take less of it if increments do not shrink; returns what the increments after it may add up to.
+    """Limit ``solution``, and take less of it if increments do not shrink; returns what those after it may add up to.
 
     All that are left are no more than a geometric series that goes on as the last two did: Newton's method converges
     faster.
