@@ -40,9 +40,9 @@ from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import load_data
-from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.posteriors import RecordingPrediction, by_owner
 from rfdropo_bayes.prediction.day_error import DAY_ERROR, left_out_sentence
-from rfdropo_bayes.prediction.predictive import HELD, predict_fitted, thin
+from rfdropo_bayes.prediction.predictive import predict_fitted, thin
 from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import write_summary
@@ -108,10 +108,10 @@ def store(folder: Path) -> str:
         raise InputError(f"was not fitted to {unknown[0]} as it is now", where=str(folder), remedy="calibrate again")
     key = jax.random.key(model.settings.seed)
     draws = {info.name: record.posterior[info.name] for info in record.free}
-    problem = model.problem(runs).holding(record.attrs[HELD])
+    problem = model.problem(runs).holding({info.name: value for info, value in record.held})
     predictions = predict_fitted(problem, thin(draws, DRAWS), key)
     optimum = fit.content["optimum"]
-    start = {name: np.full(2, optimum[name]) for name in draws}
+    start = by_owner(record.free, {name: np.full(2, optimum[name]) for name in draws})
     error = error_of_unseen_days(Days(model, runs, start, predictions, model_error_of(record)), key)
     if error is None:
         raise InputError("nothing of the model differs between days", where=str(folder), remedy="name [model.groups]")

@@ -27,6 +27,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, run_ended
 from rfdropo_bayes.policies import training
 from rfdropo_bayes.policies.evaluation import EVALUATION_SEED, draw_cases, play
+from rfdropo_bayes.policies.training_config import TrainingOptions
 from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.evaluate import CSV, evaluate
 from rfdropo_bayes.verbs.make_vec import make_vec
@@ -95,7 +96,9 @@ def cell(work: Path, truth: Path, known: Path, variant: str, seed: int, steps: i
         with patch.object(training, "LEAST_SPREAD", FLOORS.get(variant, training.LEAST_SPREAD)):
             train(model, out, seed=seed, resume=(out / CHECKPOINTS).exists(), page=False)
     played = work / "evaluations" / name
-    evaluate(Model.read(truth), [out], played, task=TASK, episodes=EPISODES, film=False, overwrite=True)
+    evaluate(
+        Model.read(truth), [out], played, TrainingOptions(task=TASK), episodes=EPISODES, film=False, overwrite=True
+    )
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     distance = pd.read_csv(played / CSV)["distance"].to_numpy(dtype=float)
     home = {key: 1e3 * summary["evaluation"][f"distance_{key}"] for key in ("median", "q95")}

@@ -61,8 +61,9 @@ def one(case: Case, folder: Path, workshop: Workshop) -> dict[str, Any]:
         return line | forced_search(model, seed, workshop)
     unseen = rb.read(str(hidden.experiment.parent / "test_*.nc"), format="netcdf")
     began, used = time.monotonic(), time.process_time()
-    options = {"library": library == ALL, "minutes": float("inf")}  # how busy the machine is must not change a line
-    found = rb.audit(model, test=unseen, seed=seed, workshop=workshop, **options)
+    # How busy the machine is must not change a line.
+    options = rb.AuditOptions(library=library == ALL, minutes=float("inf"))
+    found = rb.audit(model, options=options, test=unseen, seed=seed, workshop=workshop)
     line |= {"size": hidden.size, "verdict": found.verdict, "sentence": found.sentence}
     line |= {"law": found.content["law"], "findings": [row["mechanism"] for row in found.content["findings"]]}
     line |= {"seconds": round(time.monotonic() - began, 1), "cpu_seconds": round(time.process_time() - used, 1)}

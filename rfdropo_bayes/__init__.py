@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.smc.bridge import BridgeConfig as Bridge
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SMC
     from rfdropo_bayes.model.model import Model as Model
+    from rfdropo_bayes.policies.training_config import TrainingOptions as TrainingOptions
     from rfdropo_bayes.results.audited import Audit as Audit
     from rfdropo_bayes.results.calibrated import Calibration as Calibration
     from rfdropo_bayes.results.designed import Design as Design
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.simulators.black_box import BlackBox as BlackBox
     from rfdropo_bayes.simulators.parameters import ParameterSpec as ParameterSpec
     from rfdropo_bayes.verbs.adapt import adapt as adapt
+    from rfdropo_bayes.verbs.audit import AuditOptions as AuditOptions
     from rfdropo_bayes.verbs.audit import audit as audit
     from rfdropo_bayes.verbs.calibrate import calibrate as calibrate
     from rfdropo_bayes.verbs.check import check as check
@@ -66,6 +68,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Audit": "results.audited",
+    "AuditOptions": "verbs.audit",
     "BlackBox": "simulators.black_box",
     "Bridge": "inference.smc.bridge:BridgeConfig",
     "Calibration": "results.calibrated",
@@ -104,6 +107,7 @@ _HOMES = {
     "read": "verbs.read",
     "section_profile": "robots.sections",
     "simulate": "verbs.simulate",
+    "TrainingOptions": "policies.training_config",
     "train": "verbs.train",
 }
 """Definition of each name: ``module`` under the same name, or ``module:name``."""
@@ -116,6 +120,7 @@ __all__ = [
     "RFDROPO",
     "SMC",
     "Audit",
+    "AuditOptions",
     "BlackBox",
     "Bridge",
     "Calibration",
@@ -134,6 +139,7 @@ __all__ = [
     "ParameterSpec",
     "Prediction",
     "Robot",
+    "TrainingOptions",
     "Trajectory",
     "Tube",
     "__version__",

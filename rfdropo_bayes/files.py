@@ -150,7 +150,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def output_folder(path: Path) -> Path:
-    """Make a folder, or say why it cannot be written to."""
+    """Make a folder; InputError if it cannot be made or written to."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)

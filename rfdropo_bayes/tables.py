@@ -75,7 +75,7 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
         # A whole table or list would fill the screen; its name says enough.
         given = f" = {first['input']!r}" if isinstance(first["input"], str | int | float | bool) else ""
         # An error of the whole file has no key, and its message has the remedy.
-        what, remedy = (f"{'.'.join(path)}{given}: {message}", "mend the value") if path else (message, "")
+        what, remedy = (f"{'.'.join(path)}{given}: {message}", "correct the value") if path else (message, "")
         raise InputError(what, where=where, remedy=remedy) from None
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,49 +14,103 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
-from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
+from rfdropo_bayes.bayes.channels import Channel, Series
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
+from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
 
 
+@dataclass(frozen=True, eq=False)
 class CalibrationProblem:
     """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a few sizes.
 
-    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is
-    cut into chunks of at most ``chunk`` parameter sets, the last one padded to one of `chunk_sizes`, so that a few
-    compilations serve every batch size, and the number of simulated steps is a run-time argument, so that they serve
-    every horizon.
+    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is cut
+    into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
+    compilations serve every batch size. The number of simulated steps is a run-time argument, so that they also serve
+    every horizon. Problems of one model share its compiled programs.
 
-    Args:
+    Attributes:
         model: priors, simulator and data.
         chunk: most parameter sets in one compiled call.
-        earlier: draws of the posterior of another model of the same robot, by parameter name, from which climbs may
-            start; parameters that it lacks start from their priors.
+        earlier: draws of the posterior of another model of the same robot, from which optimisations may start; missing
+            parameters start from their priors.
+        other: measured data in place of the model's data; None for the model's.
+        counted: factors of the log likelihood of some channels; the other factors are 1.
+        jacobian: method of Jacobians, see `ResidualProblem`.
+        told: called with the number of rollouts, in full-length equivalents, after each chunk.
     """
 
-    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: Batch | None = None) -> None:
-        self.model = model
-        self.earlier = {} if earlier is None else {name: np.asarray(draws) for name, draws in earlier.items()}
-        self.measured = model.measured
-        self.shares = dict.fromkeys(self.measured, 1.0)  # what each channel counts
-        self.jacobian = "auto"
-        self._told: Callable[[float], None] | None = None
-        self.chunk = chunk
-        self.names = model.space.names
-        self.units = {p.name: p.spec.unit for p in model.space.parameters}
-        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.space.parameters}
-        self.prior_ends = {p.name: p.ends for p in model.space.parameters}
-        self.n_rows = model.recordings.time.shape[1]
-        self.n_recordings = len(model.recordings.names)
-        self.status_names = {int(result): result.name.lower() for result in Result}
-        self.compared = [channel for channel in model.channels if isinstance(channel, FeatureChannel)]
-        physical = {spec.name for spec in model.simulator.parameters}
-        self.scales, self.typical_scales = model.space.scales, model.space.typical_scales
-        self.physical_names = tuple(
-            p.name for p in model.space.parameters if p.physical in physical or p.name in self.scales
-        )
+    model: TrajectoryModel
+    chunk: int = 32
+    earlier: DrawsByOwner = field(default_factory=dict)
+    other: Measured | None = None
+    counted: Mapping[str, float] = field(default_factory=dict)
+    jacobian: str = "auto"
+    told: Callable[[float], None] = lambda rollouts: None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels of the inferred parameters, in sampling order."""
+        return self.model.scopes.names
+
+    @property
+    def measured(self) -> Measured:
+        """The data, by channel."""
+        return self.model.measured if self.other is None else self.other
+
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """Factor of the log likelihood of each channel."""
+        return {**dict.fromkeys(self.measured, 1.0), **self.counted}
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {p.name: p.spec.unit for p in self.model.scopes.parameters}
+
+    @cached_property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Hard bounds of each parameter."""
+        return {p.name: (p.spec.low, p.spec.high) for p in self.model.scopes.parameters}
+
+    @cached_property
+    def prior_ends(self) -> dict[str, tuple[float, float]]:
+        """Ends of each parameter's prior."""
+        return {p.name: p.ends for p in self.model.scopes.parameters}
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the longest recording."""
+        return self.model.recordings.time.shape[1]
+
+    @property
+    def n_recordings(self) -> int:
+        """Number of recordings."""
+        return len(self.model.recordings.names)
+
+    @property
+    def status_names(self) -> dict[int, str]:
+        """Words for the codes of rollouts."""
+        return {int(result): result.name.lower() for result in Result}
+
+    @property
+    def scales(self) -> Mapping[str, tuple[str, ...]]:
+        """See `Hierarchy`."""
+        return self.model.scopes.scales
+
+    @property
+    def typical_scales(self) -> dict[str, float]:
+        """See `Hierarchy`."""
+        return self.model.scopes.typical_scales
+
+    @cached_property
+    def physical_names(self) -> tuple[str, ...]:
+        """Parameters that the simulation depends on, and standard deviations of such."""
+        physical = {spec.name for spec in self.model.simulator.parameters}
+        every = self.model.scopes.parameters
+        return tuple(p.name for p in every if p.physical in physical or p.name in self.scales)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -67,92 +120,77 @@ class CalibrationProblem:
         data = self.measured.values()
         for array in (*data, recordings.time, *jax.tree.leaves((recordings.line, recordings.commands))):
             digest.update(np.ascontiguousarray(array).tobytes())
-        priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
+        priors = [(p.name, sorted(p.table.items())) for p in self.model.scopes.parameters]
         rest = (
             priors,
-            sorted(self.model.fixed.items()),
+            sorted(self.model.scopes.fixed.items()),
             [(channel.name, _plain(channel)) for channel in self.model.channels],
             self.model.noise,
             sorted(self.model.simulator.description.items()),
             sorted(self.shares.items()),
-            *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
+            *(
+                (name, owner, np.asarray(draws).tobytes())
+                for name, own in sorted(self.earlier.items())
+                for owner, draws in sorted(own.items())
+            ),
         )
         digest.update(repr(rest).encode())
         return digest.hexdigest()
 
     def holding(self, values: Mapping[str, float]) -> CalibrationProblem:
-        """The same problem with some parameters known, and no longer inferred; itself where none is."""
+        """The same problem with some parameters fixed; itself if ``values`` is empty."""
         if not values:
             return self
-        model = replace(self.model, space=self.model.space.holding(values), fixed={**self.model.fixed, **values})
-        other = CalibrationProblem(model, chunk=self.chunk, earlier=self.earlier)
-        other.measured, other.shares = self.measured, self.shares
-        other.jacobian, other._told = self.jacobian, self._told
-        return other
+        return replace(self, model=replace(self.model, scopes=self.model.scopes.holding(values)))
 
     def telling(self, spent: Callable[[float], None]) -> CalibrationProblem:
-        """The same problem, which tells of rollouts, in full-length ones, as they are done."""
-        other = self._copied()
-        other._told = spent
-        return other
+        """The same problem, which reports rollouts in full-length equivalents to ``spent``."""
+        return replace(self, told=spent)
+
+    def with_measured(self, measured: Measured) -> CalibrationProblem:
+        """The same problem with other data.
+
+        Its Jacobians are central differences of compiled rollouts, because a derivative would be compiled anew.
+        """
+        return replace(self, other=measured, jacobian="central")
+
+    def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
+        """The same problem with the log likelihood of some channels times a share."""
+        return replace(self, counted={**self.counted, **shares})
 
     def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
         """Log density of the prior of the standard deviations, in the order of ``scales``."""
-        priors = [self.model.space[name].prior for name in self.scales]
+        priors = [self.model.scopes[name].prior for name in self.scales]
         return np.sum([np.asarray(p.log_prob(column)) for p, column in zip(priors, values.T, strict=True)], axis=0)
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""
-        return self.model.space.sample(key, n)
+        return self.model.scopes.sample(key, n)
 
     def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
-        """Where climbs may start: the prior, with what an earlier posterior knows in its place."""
-        return self.model.space.sample_around(self.earlier, key, n)
+        """Starts of optimisations: the prior, with draws of an earlier posterior for its parameters."""
+        return self.model.scopes.sample_around(self.earlier, key, n)
 
     def to_unconstrained(self, values: Batch) -> Float[Any, "n d"]:
         """Values as points of the unconstrained space, columns in the order of ``names``."""
         columns = {name: values[name] for name in self.names}
-        space = self.model.space
-        return padded(self._unconstrained, columns) if is_batch(columns, 1) else space.to_unconstrained(columns)
+        scopes = self.model.scopes
+        compiled = self.model.programs.unconstrained
+        return padded(compiled, columns) if is_batch(columns, 1) else scopes.to_unconstrained(columns)
 
     def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`."""
-        return padded(self._constrained, u) if is_batch(u, 2) else self.model.space.from_unconstrained(u)
+        return padded(self.model.programs.constrained, u) if is_batch(u, 2) else self.model.scopes.from_unconstrained(u)
 
     def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log prior density in the unconstrained space."""
-        space = self.model.space
-        return padded(self._log_prior, u) if is_batch(u, 2) else space.log_prior_unconstrained(u)
+        scopes = self.model.scopes
+        return padded(self.model.programs.log_prior, u) if is_batch(u, 2) else scopes.log_prior_unconstrained(u)
 
-    @cached_property
-    def _unconstrained(self) -> Callable:
-        return jax.jit(self.model.space.to_unconstrained)
-
-    @cached_property
-    def _constrained(self) -> Callable:
-        return jax.jit(self.model.space.from_unconstrained)
-
-    @cached_property
-    def _log_prior(self) -> Callable:
-        return jax.jit(self.model.space.log_prior_unconstrained)
-
-    @cached_property
+    @property
     def prior_derivatives(self) -> tuple[Callable, Callable]:
         """Gradient and Hessian of the log prior at one unconstrained point."""
-
-        def single(u: Array) -> Array:
-            return self.log_prior(u[None])[0]
-
-        gradient = jax.jit(jax.vmap(jax.grad(single)))
-
-        def hessian(u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-            # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
-            steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
-            above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
-            found = (above - below) / (2.0 * np.diag(steps)[:, None])
-            return 0.5 * (found + found.T)
-
-        return lambda u: gradient(u[None])[0], hessian
+        return self.model.programs.prior_derivatives
 
     def steps_for(self, horizon: int) -> int:
         """Time steps to simulate so that the first ``horizon`` rows of every recording are there."""
@@ -165,21 +203,21 @@ class CalibrationProblem:
     def row_log_likelihood(
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon"], Int[np.ndarray, " n"]]:
-        """Log density of each of the first ``horizon`` rows given those before it, summed over recordings.
+        """Log density of each of the first ``horizon`` rows given the earlier rows, summed over recordings.
 
         Returns:
-            rows, minus infinity throughout where the rollout did not end well, and the `Result` code of each set.
+            rows, minus infinity throughout after a failed rollout, and the `Result` code of each set.
         """
-        rows, status = self._chunked(self._rows, values, horizon, self.measured, self.shares)
+        rows, status = self._chunked(self.model.programs.rows, values, horizon, self.measured, self.shares)
         rows = rows[:, :horizon]
         finite = np.isfinite(rows).all(axis=1)
         status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
         return np.where((status == Result.OK)[:, None], rows, -np.inf), status
 
     def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
-        """Log likelihood of all rows at one unconstrained point; minus infinity where the rollout does not end well.
+        """Log likelihood of all rows at one unconstrained point; minus infinity after a failed rollout.
 
-        Traceable; differentiable backwards where the engine is.
+        Traceable; differentiable in reverse mode if the engine is.
         """
         values = {name: value[0] for name, value in self.from_unconstrained(u[None]).items()}
         rows, status = self.model.row_log_likelihood(values, None, self.measured, self.shares)
@@ -189,7 +227,7 @@ class CalibrationProblem:
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
         """Simulated features [m] of all recordings side by side, without observation noise; see `FeatureChannel`."""
-        features, status = self._chunked(self._features, values, horizon)
+        features, status = self._chunked(self.model.programs.features, values, horizon)
         return self._side_by_side(features)[:, :horizon], status
 
     def noisy_rollouts(
@@ -199,15 +237,15 @@ class CalibrationProblem:
         clean, status = self.rollouts(values, self.n_rows)
         noise = [
             self._realised(channel.draw_features, jax.random.fold_in(key, index) if index else key, values)
-            for index, channel in enumerate(self.compared)
+            for index, channel in enumerate(self.model.compared)
         ]
         return clean + self._side_by_side(np.concatenate(noise, axis=-1)), status
 
     def noise_deviation(self, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
         values."""
-        known = {**self.model.fixed, **values}
-        return np.tile(np.concatenate([c.feature_deviation(known) for c in self.compared]), self.n_recordings)
+        known = {**self.model.scopes.fixed, **values}
+        return np.tile(np.concatenate([c.feature_deviation(known) for c in self.model.compared]), self.n_recordings)
 
     @cached_property
     def actions(self) -> Float[np.ndarray, "n_rows channel"]:
@@ -221,59 +259,36 @@ class CalibrationProblem:
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
         """Measured features [m], laid out like `rollouts`."""
-        features = [np.asarray(channel.features(self.measured[channel.name])) for channel in self.compared]
+        features = [np.asarray(channel.features(self.measured[channel.name])) for channel in self.model.compared]
         return self._side_by_side(np.concatenate(features, axis=-1)[None])[0]
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
-        """True where ``observed`` may be used."""
-        return self._side_by_side(np.concatenate([c.feature_valid for c in self.compared], axis=-1)[None])[0]
+        """True for usable entries of ``observed``."""
+        return self._side_by_side(np.concatenate([c.feature_valid for c in self.model.compared], axis=-1)[None])[0]
 
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
-        """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
+        """Whitened residuals of the first ``horizon`` rows (zero if masked); traceable, for one set of values."""
         white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured, self.shares)
         return self._flat({name: part[None] for name, part in white.items()}, horizon)[0]
 
     def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
         """`residuals` of many sets of values at once, in compiled chunks."""
-        white = self._chunked(self._white, values, horizon, self.measured, self.shares)
+        white = self._chunked(self.model.programs.white, values, horizon, self.measured, self.shares)
         return np.asarray(self._flat(white, horizon))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
-        """Whitened residuals of the markers at one set of values, NaN where masked."""
+        """Whitened residuals of the markers at one set of values, NaN if masked."""
         single = {name: np.array([values[name]]) for name in self.names}
-        white = self._chunked(self._white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0))
+        white = self._chunked(
+            self.model.programs.white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0)
+        )
         positions = white[self.model.markers.name][0]
         valid = self.model.recordings.line.valid[..., None]
         return np.where(valid, positions.reshape(*valid.shape[:3], 3), np.nan)
-
-    def with_measured(self, measured: Measured) -> CalibrationProblem:
-        """The same problem with other data, which shares all that has been compiled.
-
-        Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
-        """
-        other = self._copied()
-        other.__dict__.pop("observed", None)
-        other.measured, other.jacobian = measured, "central"
-        return other
-
-    def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
-        """The same problem with the log likelihood of some channels times a share."""
-        other = self._copied()
-        other.shares = {**self.shares, **shares}
-        return other
-
-    def _copied(self) -> CalibrationProblem:
-        """The same problem, which shares all that has been compiled."""
-        # Made before the copy, so that all copies have the same compiled functions.
-        _ = self._rows, self._white, self._positions, self._features, self._observations, self.actions
-        _ = self._unconstrained, self._constrained, self._log_prior, self.prior_derivatives
-        other = copy.copy(self)
-        other.__dict__.pop("fingerprint", None)
-        return other
 
     @property
     def row_steps(self) -> Float[np.ndarray, " recording"]:
@@ -308,76 +323,44 @@ class CalibrationProblem:
     def predict_scene(self, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Int[np.ndarray, " n"]]:
         """As `predict`, with the poses of the object (n, recording, time, 7) in the robot's frame: position [m] and
         unit quaternion (x, y, z, w); None if the scene has none."""
-        return self._chunked(self._positions, values, self.n_rows)
+        return self._chunked(self.model.programs.positions, values, self.n_rows)
 
     def observe(self, values: Batch) -> Observation:
-        """What every recording would show, without observation noise: fields (n, recording, time, ...), status (n,)."""
-        return Observation(*self._chunked(self._observations, values, self.n_rows))
+        """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),
+        status (n,).
+        """
+        return Observation(*self._chunked(self.model.programs.observations, values, self.n_rows))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
         return self._realised(self.model.markers.draw_noise, key, values)
 
     def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:
-        """What ``draw`` makes of a key, the times of a recording and a set of values, for all of both."""
+        """Results of ``draw`` for a key, the times of a recording and a set of values, for all recordings and sets."""
 
         def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             keys = jax.random.split(key, self.n_recordings)
-            known = {**self.model.fixed, **values}
+            known = {**self.model.scopes.fixed, **values}
             return jax.vmap(lambda k, t: draw(k, t, known))(keys, jnp.asarray(self.model.recordings.time))
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}
         count = len(next(iter(inferred.values())))
         return np.asarray(jax.vmap(of_all)(jax.random.split(key, count), inferred))
 
-    @cached_property
-    def _rows(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None, None, None)))
-
-    @cached_property
-    def _white(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.residuals, in_axes=(0, None, None, None)))
-
-    @cached_property
-    def _positions(self) -> Callable:
-        def positions(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array | None, Array]:
-            observation = self.model.simulate(values, steps)
-            return observation.position, observation.object_pose, jnp.max(observation.status)
-
-        return jax.jit(jax.vmap(positions, in_axes=(0, None)))
-
-    @cached_property
-    def _features(self) -> Callable:
-        def features(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array]:
-            seen = self.model.seen(self.model.simulate(values, steps), values)
-            found = [c.features(c.expected(seen)) for c in self.compared]
-            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
-
-        return jax.jit(jax.vmap(features, in_axes=(0, None)))
-
-    @cached_property
-    def _observations(self) -> Callable:
-        def observations(values: Mapping[str, Array], steps: Int[Array, ""]) -> Observation:
-            observation = self.model.simulate(values, steps)
-            return observation._replace(status=jnp.max(observation.status))
-
-        return jax.jit(jax.vmap(observations, in_axes=(0, None)))
-
     def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> Any:
         """Evaluate a batch chunk by chunk, see `in_chunks`."""
         steps = jnp.asarray(self.steps_for(horizon))
         columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
 
-        def told(count: int) -> None:
-            if self._told is not None:
-                self._told(count * horizon / self.n_rows)
+        def after(count: int) -> None:
+            self.told(count * horizon / self.n_rows)
 
-        return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=told)
+        return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=after)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
-        """Residuals by rollout, cut to the horizon where they have a time axis, and flattened.
+        """Residuals by rollout, cut to the horizon if they have a time axis, and flattened.
 
-        Channels come in the order of the model; a dictionary that JAX returns has another.
+        Channels come in the order of the model; a dictionary that JAX returns has another order.
         """
         cut = []
         for channel in self.model.channels:
@@ -387,7 +370,7 @@ class CalibrationProblem:
 
 
 def _plain(channel: Channel) -> str:
-    """What beside its readings tells a channel from another one."""
+    """Digest of a channel's settings, without its readings."""
     if isinstance(channel, Series):
         known = channel.known
         return repr(None if known is None else (known.scale, known.autocorrelation, known.correlation))

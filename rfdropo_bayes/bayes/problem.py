@@ -1,16 +1,16 @@
-"""What an inference method sees: a posterior given data, in named parameters. Simulators stay hidden behind it.
+"""Interface of a posterior for inference methods: a posterior given data, in named parameters. Simulators stay hidden
+behind it.
 
 | a protocol | for |
 |---|---|
 | `Problem` | every method |
-| `ResidualProblem`, `BatchedResiduals` | climbs by Gauss-Newton |
+| `ResidualProblem`, `BatchedResiduals` | Gauss-Newton optimisation |
 | `TraceableProblem` | NUTS, nested sampling |
-| `WarmStart` | climbs that need not start at the prior |
-| `Hierarchy` | climbs of a posterior some of whose parameters are standard deviations of others |
+| `WarmStart` | optimisations from an earlier posterior |
+| `Hierarchy` | optimisations with standard deviations among the parameters |
 | `RolloutProblem` | RF-DROPO, and methods that learn from simulations |
 
-All members of a protocol are required. `ProblemDefaults` and `RolloutDefaults` hold those that a problem may leave as
-they usually are.
+All members of a protocol are required. `ProblemDefaults` and `RolloutDefaults` have the members with usual defaults.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import DrawsByOwner
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
@@ -43,10 +44,10 @@ class Problem(Protocol):
     Attributes:
         names: scalar parameters, in sampling order.
         units: unit of each parameter, SI.
-        bounds: hard bounds of each parameter; infinite where there is none.
-        prior_ends: where each parameter's prior ends: on its hard bounds or between them.
+        bounds: hard bounds of each parameter; infinite without a bound.
+        prior_ends: ends of each parameter's prior, at its hard bounds or inside them.
         n_rows: rows of data; horizons run from 1 to ``n_rows``.
-        fingerprint: a digest of its data and model; checkpoints of a problem with another one are refused.
+        fingerprint: a digest of its data and model; checkpoints with another fingerprint are refused.
         status_names: words for its status codes, used when excluded rollouts are counted.
     """
 
@@ -88,11 +89,11 @@ class Problem(Protocol):
         ...
 
     def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
-        """Log density of each of the first ``horizon`` rows given those before it, for a batch of values.
+        """Log density of each of the first ``horizon`` rows given the earlier rows, for a batch of values.
 
         Returns:
-            rows: minus infinity where the likelihood is zero, never NaN.
-            status: 0, or the code of a rollout that did not end well. Such a rollout never gets weight; it is counted.
+            rows: minus infinity for a zero likelihood, never NaN. status: 0, or the code of a failed rollout. Such a
+            rollout never gets weight; it is counted.
         """
         ...
 
@@ -103,13 +104,13 @@ Derivatives = tuple[Callable[[Any], Any], Callable[[Any], Any]]
 
 @runtime_checkable
 class ResidualProblem(Problem, Protocol):
-    """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it.
+    """A problem whose log likelihood is a sum of squares, for Gauss-Newton.
 
     Attributes:
-        physical_names: parameters that the simulation depends on; the others are noise. All of ``names`` where that is
-            not known: it is then found out.
-        jacobian: how Jacobians are to be taken: "forward", "central", or "auto".
-        prior_derivatives: of the log prior.
+        physical_names: parameters that the simulation depends on; the others are noise. All of ``names`` if unknown:
+            they are then identified numerically.
+        jacobian: method of Jacobians: "forward", "central", or "auto".
+        prior_derivatives: derivatives of the log prior.
     """
 
     @property
@@ -124,8 +125,8 @@ class ResidualProblem(Problem, Protocol):
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Any, " m"]:
         """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
 
-        ``-0.5 * sum(r**2) + c`` is the log likelihood, where ``c`` depends on noise parameters only. Traceable by JAX
-        where the simulator is; otherwise Jacobians are taken by central differences.
+        ``-0.5 * sum(r**2) + c`` is the log likelihood, with ``c`` a function of noise parameters only. Traceable by JAX
+        if the simulator is; otherwise Jacobians are taken by central differences.
         """
         ...
 
@@ -150,27 +151,27 @@ class TraceableProblem(Problem, Protocol):
 
 @runtime_checkable
 class WarmStart(Problem, Protocol):
-    """A problem that knows places to start from beside its prior.
+    """A problem with starting points beside its prior.
 
     Attributes:
-        earlier: draws of an earlier posterior, by parameter name; empty without one.
+        earlier: draws of an earlier posterior, by parameter and owner; empty without one.
     """
 
     @property
-    def earlier(self) -> Mapping[str, Float[Any, " n"]]: ...
+    def earlier(self) -> DrawsByOwner: ...
 
     def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
-        """Where climbs may start."""
+        """Starts of optimisations."""
         ...
 
 
 @runtime_checkable
 class Hierarchy(Problem, Protocol):
-    """A problem some of whose parameters are standard deviations of others, whose mean is zero.
+    """A problem with standard deviations of other, zero-mean parameters among its parameters.
 
     Attributes:
-        scales: names of the standard deviations, with those of the parameters that each is of; may be empty.
-        typical_scales: a value of each from the middle of its prior.
+        scales: names of the standard deviations, each with the names of its parameters; may be empty.
+        typical_scales: a central value of each under its prior.
     """
 
     @property
@@ -180,8 +181,9 @@ class Hierarchy(Problem, Protocol):
     def typical_scales(self) -> Mapping[str, float]: ...
 
     def holding(self, values: Mapping[str, float]) -> ResidualProblem:
-        """The same problem with some parameters known; what a known standard deviation is of has itself for its
-        unconstrained coordinate."""
+        """The same problem with some parameters fixed. A parameter whose standard deviation is fixed is its own
+        unconstrained coordinate.
+        """
         ...
 
     def scale_log_prior(self, values: Float[Any, "n scale"]) -> Float[Any, " n"]:
@@ -191,14 +193,14 @@ class Hierarchy(Problem, Protocol):
 
 @runtime_checkable
 class RolloutProblem(Problem, Protocol):
-    """A problem that can be simulated without a noise model, as RF-DROPO wants it.
+    """A problem that can be simulated without a noise model, for RF-DROPO.
 
     Attributes:
         physical_names: parameters that a rollout depends on; the others, such as the noise scale, are passed at their
             prior median.
         observed: measured features, laid out like `rollouts`.
-        observed_mask: True where ``observed`` may be used.
-        actions: commands at the rows; (n_rows, 0) where there are none.
+        observed_mask: True for usable entries of ``observed``.
+        actions: commands at the rows; (n_rows, 0) without commands.
     """
 
     @property
@@ -229,7 +231,7 @@ class RolloutProblem(Problem, Protocol):
 
 
 class ProblemDefaults:
-    """What a problem has that says nothing else: a prior that ends on the bounds, and no fingerprint.
+    """Default members of a problem: a prior that ends at the bounds, and no fingerprint.
 
     Its derivatives of the prior are JAX's.
     """
@@ -317,15 +319,15 @@ CAPABILITIES: dict[str, type] = {
     "scales": Hierarchy,
     "rollouts": RolloutProblem,
 }
-"""What a problem can do beside what each can, by the member that says so."""
+"""Optional protocols of a problem, by the member that marks each."""
 
 
 def check_problem(problem: object) -> None:
-    """Look through a problem before a method runs.
+    """Check the members of a problem before a method runs.
 
     Raises:
-        InputError: it lacks a member of `Problem`, or of a protocol that another of its members belongs to. A method
-            would take the problem for one that cannot do what it can.
+        InputError: it lacks a member of `Problem`, or of a protocol that it implements in part, which methods would
+            then not recognise.
     """
     there = {*dir(problem)}
     wanted = [("", Problem), *((member, kind) for member, kind in CAPABILITIES.items() if member in there)]
@@ -336,11 +338,11 @@ def check_problem(problem: object) -> None:
             raise InputError(
                 f"{type(problem).__name__} {having} {', '.join(missing)}",
                 where="problem",
-                remedy=f"define what {kind.__name__} asks for; {ProblemDefaults.__name__} and "
-                f"{RolloutDefaults.__name__}, to derive from, have what a problem may leave as it usually is",
+                remedy=f"define the members of {kind.__name__}; derive from {ProblemDefaults.__name__} or "
+                f"{RolloutDefaults.__name__} for the usual defaults",
             )
 
 
 def _members(kind: type) -> set[str]:
-    """Public members of a protocol and of those that it extends."""
+    """Public members of a protocol and of its base protocols."""
     return {name for each in kind.__mro__[:-1] for name in vars(each) if not name.startswith("_")}

@@ -119,7 +119,11 @@ def commands_after(
     time: Float[np.ndarray, " command"],
     value: Float[np.ndarray, "command channel"],
 ) -> Commands:
-    """Other commands [m or rad] from the state that a recording begins with, as `commands_of` has its own."""
+    """Simulator inputs of other commands [m or rad] from the initial state of a recording, see `commands_of`.
+
+    Raises:
+        InputError: commands that the simulator refuses.
+    """
     initial = trajectory.initial_command
     if isinstance(simulator, ExtendedSimulator):
         value = simulator.taken(trajectory.name, initial, value)

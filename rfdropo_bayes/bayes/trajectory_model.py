@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.bayes.channels import Channel, Markers, ObjectPose, Seen
+from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Markers, ObjectPose, Seen
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.channels.object_pose import Placing, offset_of
-from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
+from rfdropo_bayes.bayes.scopes import Scopes
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.protocol import Observation, Simulator
 
 Values = Mapping[str, Float[Array, "..."]]
 Measured = Mapping[str, Float[Any, "..."]]
-"""What was measured, by channel, apart from when and where: another set of numbers is another data set."""
+"""Measured arrays by channel, without times and places: other numbers are another data set."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +35,41 @@ class TrajectoryModel:
 
     Attributes:
         simulator: anything that satisfies `Simulator`, mechanisms included.
-        space: inferred parameters, those of the channels among them.
-        fixed: values of parameters that are not inferred and differ from their nominal value; of all recordings, or of
-            one (``name@recording``).
-        recordings: what was commanded, and when it was observed.
-        channels: what was measured, `Markers` first.
+        scopes: inferred and fixed parameters, including the channels'.
+        recordings: commands and times of observation.
+        channels: measurement channels, `Markers` first.
     """
 
     simulator: Simulator
-    space: ParameterSpace
-    fixed: Mapping[str, float]
+    scopes: Scopes
     recordings: RecordingSet
     channels: tuple[Channel, ...]
+
+    @classmethod
+    def of_positions(
+        cls,
+        simulator: Simulator,
+        scopes: Scopes,
+        trajectories: Sequence[Trajectory],
+        noise: str,
+        known: Autoregression | None = None,
+        markers: Sequence[str] = (),
+    ) -> TrajectoryModel:
+        """The model of marker positions alone.
+
+        Args:
+            simulator: see above; scopes: of its parameters.
+            trajectories: the recordings.
+            noise: name of the noise of the positions.
+            known: the noise of ``markers``, unless it is inferred.
+
+        Raises:
+            InputError: a marker whose noise is not known, or see `gather_recordings`.
+        """
+        recordings = gather_recordings(simulator, trajectories)
+        if known is not None:
+            known = noise_of_markers(known, markers, recordings).at(recordings.steps)
+        return cls(simulator, scopes, recordings, (Markers.gather(recordings, noise, known),))
 
     @property
     def markers(self) -> Markers:
@@ -56,12 +84,12 @@ class TrajectoryModel:
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """What was measured."""
+        """Names of the measurement channels."""
         return tuple(channel.name for channel in self.channels)
 
     @cached_property
     def measured(self) -> Measured:
-        """What was measured."""
+        """Measured arrays by channel."""
         return {channel.name: channel.measured for channel in self.channels}
 
     @cached_property
@@ -73,40 +101,33 @@ class TrajectoryModel:
         return frozenset(spec.name for spec in self.simulator.parameters)
 
     @cached_property
-    def _absent(self) -> dict[str, float]:
-        """Nominal values of parameters that belong to some recordings only: the others have these."""
-        own = {parameter.spec.name for parameter in self.space.parameters if parameter.recording}
-        own |= {name.partition(SEPARATOR)[0] for name in self.fixed if SEPARATOR in name}
-        return {spec.name: spec.nominal for spec in self.simulator.parameters if spec.name in own}
+    def compared(self) -> tuple[FeatureChannel, ...]:
+        """Channels that have features."""
+        return tuple(channel for channel in self.channels if isinstance(channel, FeatureChannel))
 
     @cached_property
-    def _ends_of_sums(self) -> dict[str, tuple[float, float]]:
-        """Hard bounds of the parameters that are a shared value and a group's deviation from it."""
-        summed = {parameter.added_to for parameter in self.space.parameters if parameter.added_to}
-        return {spec.name: (spec.low, spec.high) for spec in self.simulator.parameters if spec.name in summed}
+    def programs(self) -> Programs:
+        """Compiled functions of the model."""
+        return Programs(self)
 
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
-        """What the simulator is given for one recording: fixed and inferred physical parameters.
+        """Parameters of the simulator for one recording.
 
-        The sum of a shared value and a group's deviation ends at the parameter's hard bounds, as in audits. A body
-        whose poses are measured starts at the first of them.
+        A body whose poses are measured starts at the first of them.
         """
-        parts = ((name.partition(SEPARATOR), value) for name, value in self.fixed.items())
-        fixed = {name: value for (name, _, owner), value in parts if owner in ("", recording)}
-        chosen = {**self._absent, **fixed, **self.space.for_recording(values, recording)}
+        chosen = self.scopes.values_in(recording, values)
         physical = {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
-        physical |= {name: jnp.clip(physical[name], *ends) for name, ends in self._ends_of_sums.items()}
         if self._poses is None:
             return physical
         assert isinstance(self.simulator, Placing)
         return self.simulator.with_object_at(physical, self._poses.measured[self.recordings.names.index(recording), 0])
 
     def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:
-        """Roll out every recording under one set of values.
+        """Roll out every recording under a set of values.
 
         Args:
             values: inferred parameters, scalars.
-            steps: simulate only this many time steps (rows beyond hold no meaning); None for all, differentiable in
+            steps: simulate only this many time steps (later rows are meaningless); None for all, differentiable in
                 reverse mode.
 
         Returns:
@@ -120,7 +141,7 @@ class TrajectoryModel:
     def seen(self, observation: Observation, values: Values) -> Seen:
         """An observation as channels want it, with the values that it was simulated under."""
         offset = jnp.stack([offset_of(self.rollout_values(values, name)) for name in self.recordings.names])
-        return Seen(observation, {**self.fixed, **values}, offset)
+        return Seen(observation, {**self.scopes.fixed, **values}, offset)
 
     def row_log_likelihood(
         self,
@@ -129,9 +150,9 @@ class TrajectoryModel:
         measured: Measured | None = None,
         shares: Mapping[str, Any] | None = None,
     ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
-        """Log density of each row given those before it, summed over recordings, and the worst result code.
+        """Log density of each row given the earlier rows, summed over recordings, and the worst result code.
 
-        ``measured`` puts other data in the place of the model's own; ``shares`` says how much each channel counts.
+        ``measured`` replaces the model's own data; ``shares`` are the weights of channels.
         """
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
@@ -149,7 +170,7 @@ class TrajectoryModel:
         measured: Measured | None = None,
         shares: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, "..."]]:
-        """Whitened residuals by channel, zero where masked; see `Channel.residuals` and `row_log_likelihood`."""
+        """Whitened residuals by channel, zero if masked; see `Channel.residuals` and `row_log_likelihood`."""
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
         white = {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}
@@ -158,14 +179,53 @@ class TrajectoryModel:
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
         values: dict[str, Array] = {}
-        for p in self.space.parameters:  # a spread comes before what it is the spread of
-            prior = dist.Normal(0.0, values[p.scaled_by]) if p.scaled_by else p.prior
+        for p in self.scopes.parameters:
+            scale = p.scope.scaled_by
+            prior = dist.Normal(0.0, values[scale]) if scale else p.prior
             values[p.name] = numpyro.sample(p.name, prior)
         seen = self.seen(self.simulate(values), values)
         numpyro.deterministic("status", seen.observation.status)
         for index, name in enumerate(self.recordings.names):
             rows = int(self.recordings.rows[index])
             measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
-            numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
+            numpyro.sample(label("position", name), self.markers.distribution(seen, index), obs=measured)
         for channel in self.channels[1:] if observe else ():
             numpyro.factor(channel.name, channel.row_log_density(seen, channel.measured))
+
+
+class Programs:
+    """The functions of a model that are compiled, for batches of parameter sets; each when it is first called."""
+
+    def __init__(self, model: TrajectoryModel) -> None:
+        def positions(values: Values, steps: Int[Array, ""]) -> tuple[Array, Array | None, Array]:
+            observation = model.simulate(values, steps)
+            return observation.position, observation.object_pose, jnp.max(observation.status)
+
+        def features(values: Values, steps: Int[Array, ""]) -> tuple[Array, Array]:
+            seen = model.seen(model.simulate(values, steps), values)
+            found = [c.features(c.expected(seen)) for c in model.compared]
+            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
+
+        def observations(values: Values, steps: Int[Array, ""]) -> Observation:
+            observation = model.simulate(values, steps)
+            return observation._replace(status=jnp.max(observation.status))
+
+        scopes = model.scopes
+        self.unconstrained = jax.jit(scopes.to_unconstrained)
+        self.constrained = jax.jit(scopes.from_unconstrained)
+        self.log_prior = jax.jit(scopes.log_prior_unconstrained)
+        self.rows = jax.jit(jax.vmap(model.row_log_likelihood, in_axes=(0, None, None, None)))
+        self.white = jax.jit(jax.vmap(model.residuals, in_axes=(0, None, None, None)))
+        self.positions, self.features, self.observations = (
+            jax.jit(jax.vmap(function, in_axes=(0, None))) for function in (positions, features, observations)
+        )
+        gradient = jax.jit(jax.vmap(jax.grad(lambda u: scopes.log_prior_unconstrained(u[None])[0])))
+
+        def hessian(u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+            # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
+            steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
+            above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
+            found = (above - below) / (2.0 * np.diag(steps)[:, None])
+            return 0.5 * (found + found.T)
+
+        self.prior_derivatives = (lambda u: gradient(u[None])[0]), hessian

@@ -17,10 +17,11 @@ from rfdropo_bayes.cli.options import (
     Resume,
     Seed,
     folder_for,
+    same_command,
     see_calibration,
 )
 from rfdropo_bayes.cli.terminal_summary import say, show_audit
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, Interrupted
 
 Fit = Annotated[
     Path | None, typer.Option("--from", help="folder of an earlier calibration, to start the base model from")
@@ -45,6 +46,7 @@ def audit(
     """Name the effects that the simulator lacks. Writes audit.json, extended.toml and report.html."""
     see_calibration(fit, "--from")
     folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
+    from rfdropo_bayes.discrepancy.deadline import INTERRUPT
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.audit import audit as ask
 
@@ -59,6 +61,11 @@ def audit(
         show=not quiet,
     )
     show_audit(found.content, folder, quiet=quiet, as_json=as_json)
+    if found.content["stopped"] == INTERRUPT:
+        raise Interrupted(str(folder), "--resume")
+    if found.content["stopped"] and not (quiet or as_json):
+        minutes = 2.0 * found.content["minutes"]
+        typer.echo(f"to go on: {same_command('rfdropo', '--resume', '--set', f'audit.minutes={minutes:g}')}")
 
 
 def design(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from rfdropo_bayes.verbs.column_names import Guess
 
 ANGLES = ("deg", "rad", "counts")
-UNITS = ("mm", "cm", "m", *ANGLES)
+FORCES = ("N", "N m", "V", "A", "%", "-")
+UNITS = ("mm", "cm", "m", *ANGLES, *FORCES)
 MODELS = (".xml", ".urdf")
 """Suffixes of models of other simulators, see `simulators.adapters`."""
 MILLIMETRES = 1e-3
@@ -106,13 +107,20 @@ NumberOfDisks = Annotated[
 ]
 DiskThickness = Annotated[float, typer.Option("--disk-thickness-mm", help="thickness of each disk [mm]")]
 Segments = Annotated[int | None, typer.Option(help="number of segments, each with its own cables")]
+SegmentLengths = Annotated[
+    str | None, typer.Option("--segment-lengths-mm", help='lengths of the segments, base to tip: "60,62.5,64"')
+]
 Cables = Annotated[int | None, typer.Option(help="number of cables of each segment")]
 CableRadius = Annotated[
     float | None, typer.Option("--cable-radius-mm", help="distance of the cables from the axis, at the base [mm]")
 ]
 Pairs = Annotated[bool | None, typer.Option(help="opposite cables share a motor")]
 CommandUnit = Annotated[
-    str | None, typer.Option(help="mm, cm or m of cable, or deg, rad or counts of a motor; guessed from a recording")
+    str | None,
+    typer.Option(
+        help="mm, cm or m of cable; deg, rad or counts of a motor; N, N m, V, A or % of a drive; guessed from a "
+        "recording"
+    ),
 ]
 CountsPerTurn = Annotated[
     float | None,
@@ -161,6 +169,7 @@ def init(
     disks: NumberOfDisks = None,
     disk_thickness: DiskThickness = 3.0,
     segments: Segments = None,
+    segment_lengths: SegmentLengths = None,
     cables: Cables = None,
     cable_radius: CableRadius = None,
     pairs: Pairs = None,
@@ -205,8 +214,11 @@ def init(
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
     answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
+    if segment_lengths is None and answers["segments"] > 1:
+        ask.assumed.add("segment_lengths")
+    answers["segment_lengths"] = _lengths(segment_lengths)
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
-    if unit in ANGLES:
+    if unit in (*ANGLES, "N m"):
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
     answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0 for silicone", 0.0) or None
@@ -242,10 +254,9 @@ def _check_unit(unit: str, guess: Guess | None) -> None:
     if guess is None or unit != guess.command_unit:
         raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=remedy)
     raise InputError(
-        f"commands are in {unit!r} ({', '.join(guess.commands)}), neither lengths of cable nor angles of a motor",
+        f"commands are in {unit!r} ({', '.join(guess.commands)}), which no drive of a cable takes",
         where="--recording",
-        remedy="record cable lengths or motor angles, or convert the commands; if they are counts of the spool, "
-        "give --command-unit counts and --counts-per-turn",
+        remedy=f"give --command-unit, one of {', '.join(UNITS)}; counts of the spool need --counts-per-turn",
     )
 
 
@@ -290,9 +301,20 @@ def _outline(name: str, disks: int | None, unit: str, answers: dict[str, Any], a
         if key in given:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
-    kind: Literal["m", "rad"] = "rad" if unit in ANGLES else "m"
+    kind: Any = "rad" if unit in ANGLES else unit if unit in ("N", "N m") else "-" if unit in FORCES else "m"
     assumed |= {"disks"} if given["shape"] == "disks" and disks is None else set()
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
+
+
+def _lengths(text: str | None) -> tuple[float, ...] | None:
+    """Lengths of segments [m]."""
+    if text is None:
+        return None
+    try:
+        return tuple(MILLIMETRES * float(part) for part in text.split(","))
+    except ValueError:
+        where = "--segment-lengths-mm"
+        raise InputError(f"{text!r} is no list of lengths", where=where, remedy='e.g. "60,62.5,64"') from None
 
 
 def _name(folder: Path) -> str:

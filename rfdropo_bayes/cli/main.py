@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +31,7 @@ from rfdropo_bayes.cli.options import (
     Quiet,
     Resume,
     folder_for,
+    same_command,
     see_calibration,
 )
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_simulation
@@ -75,7 +75,7 @@ def calibrate(
     as_json: AsJson = False,
     fit: Annotated[
         Path | None,
-        typer.Option("--from", help="folder of an earlier calibration of this robot, to start climbs from"),
+        typer.Option("--from", help="folder of an earlier calibration of this robot, at which optimisations start"),
     ] = None,
     overrides: Overrides = None,
 ) -> None:
@@ -174,10 +174,9 @@ def run(commands: typer.Typer, name: str) -> None:
 
 def _after(stop: BaseException, name: str) -> str:
     """Next step for the user after an interrupt."""
-    again = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
     if isinstance(stop, Interrupted) and stop.going_on is not None:
-        command = shlex.join([*name.split(), *again, *stop.going_on.split()])
+        command = same_command(name, *stop.going_on.split())
         return f"interrupted; finished work is kept in {stop.folder}; to go on: {command}"
     if isinstance(stop, Interrupted):
-        return f"interrupted; {stop.folder} holds no result; to start again: {shlex.join(['rfdropo', *again])}"
+        return f"interrupted; {stop.folder} holds no result; to start again: {same_command('rfdropo')}"
     return NOTHING_LOST

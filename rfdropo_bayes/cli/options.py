@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -79,3 +81,9 @@ def see_calibration(folder: Path | None, option: str) -> None:
         raise InputError(
             f"{folder} holds no posterior.nc", where=option, remedy="name the folder of a finished rfdropo calibrate"
         )
+
+
+def same_command(name: str, *further: str) -> str:
+    """The command line that the program ``name`` was called with, and further options."""
+    kept = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
+    return shlex.join([*name.split(), *kept, *further])

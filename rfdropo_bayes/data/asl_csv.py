@@ -195,7 +195,7 @@ def _check_consecutive(identity: np.ndarray, where: str) -> None:
     if wrong.size:
         row = int(wrong[0])
         raise InputError(
-            f"ID {identity[row]} where {row} is due: rows are missing or out of order",
+            f"ID {identity[row]} instead of {row}: rows are missing or out of order",
             where=f"{where}, row {row}, column 'ID'",
             remedy="fetch it again, or use rows = [first, last] on a whole recording to leave rows out",
         )

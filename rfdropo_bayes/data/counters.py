@@ -34,7 +34,7 @@ class Wraps(NamedTuple):
 
     Attributes:
         rows: after the jumps.
-        turn: of the counter, in the unit of the column.
+        turn: turn of the counter, in the unit of the column.
         known: whether this is the turn of a known counter; else it is estimated from the jumps.
     """
 
@@ -226,7 +226,7 @@ def counter_notes(columns: Sequence[Column], motion: Motion, unit: str) -> list[
     said = ", ".join(f"{old:.6g} to {new:.6g}" for old, new in restart.jumps.values())
     return [
         f"{', '.join(restart.jumps)} jump in row {restart.row} ({said} {unit}) and the markers do not follow, as after "
-        "a restart that sets a counter anew: read the rows on one side with rows = [first, last], or mend the columns"
+        "a restart that sets a counter anew; read the rows on one side with rows = [first, last]; or correct columns"
     ]
 
 

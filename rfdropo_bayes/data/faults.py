@@ -182,8 +182,7 @@ def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[
     if not changes or not renamed.any():
         return []
     shown = "; ".join(
-        f"row {change.row}, where {' and '.join(names[m] for m in sorted(change.taken_by))} change names"
-        for change in changes[:3]
+        f"row {change.row}: {' and '.join(names[m] for m in sorted(change.taken_by))}" for change in changes[:3]
     ) + ("; ..." if len(changes) > 3 else "")
     return [
         f"markers change names in {shown}: {int(renamed.sum())} positions under other names than in row 0 are left "

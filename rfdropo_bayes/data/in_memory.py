@@ -143,7 +143,11 @@ def _table(frame: Any, name: str) -> pd.DataFrame:
 
 
 def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
-    """Arguments of `Trajectory.from_arrays` in a labelled data set; see `Trajectory.from_xarray`."""
+    """Arguments of `Trajectory.from_arrays` in a labelled data set; see `Trajectory.from_xarray`.
+
+    Raises:
+        InputError: a missing variable, other dimensions or axes, or an unknown unit.
+    """
     channel = "cable" if "cable" in dataset.dims else "channel"
     for key in ("position", "command", "marker", channel, "time"):
         if key not in dataset.variables:
@@ -200,7 +204,7 @@ def _rescaled(key: str, values: np.ndarray, factor: float) -> np.ndarray:
 
 
 def beginning(rule: str | None, where: str) -> Rule | None:
-    """The rule for the command before the first row that has this name; None if it is to be recognised."""
+    """The named rule for the command before the first row; None to recognise it; InputError for other names."""
     rules: dict[str | None, Rule | None] = {None: None, "first": "first", "zero": "zero"}
     if rule not in rules:
         remedy = 'give "first", "zero", or one value per channel'

@@ -102,7 +102,7 @@ def read_streams(path: Path, topics: Collection[str] | None = None, clock: Clock
         raise InputError(
             f"is not a bag that rosbags can read ({type(error).__name__}: {error})".replace("\n", " "),
             where=str(path),
-            remedy="fetch it again; `ros2 bag reindex` or `mcap recover` mend a bag whose recorder was stopped; an "
+            remedy="fetch it again; `ros2 bag reindex` or `mcap recover` repairs a bag whose recorder was stopped; an "
             "MCAP file has to hold messages of ROS 2",
         ) from None
 

@@ -160,7 +160,7 @@ def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Pa
     """A file beside the recordings, e.g. a mesh, found in RFDROPO_DATA if set, else in ``base``.
 
     Args:
-        name: of the file; a pattern may match a single file.
+        name: name of the file; a pattern may match a single file.
         base: folder of relative names.
         folders: whether a folder may stand for the files in it.
 
@@ -171,7 +171,7 @@ def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Pa
     if len(found) > 1:
         raise InputError(
             f"matches {len(found)} files ({', '.join(file.name for file in found[:3])}{', ...' if found[3:] else ''}) "
-            "where one is meant",
+            "but one file is expected",
             where=str(name),
             remedy="name the file; if every recording has its own commands, give an entry for each recording",
         )

@@ -45,7 +45,8 @@ def load_unseen(
         commands: the file of commands.
         start: the file of observations, if it is another file; only one row is used.
         rows: keep observation rows first to last, both included; the start pose is then from row ``first``.
-        begun: how the fitted recordings begin, "zero" or "first" (`common_beginning`), if all begin by the same rule;
+        begun: beginning of the fitted recordings, "zero" or "first" (`common_beginning`), if all begin by the same
+            rule;
             it then applies to these commands unless [data] or the file has another.
         episode: number of the episode, if the file of observations is a LeRobotDataset.
 

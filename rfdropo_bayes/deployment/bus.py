@@ -24,7 +24,7 @@ class BusTable(BaseModel):
 
     Attributes:
         interface: "hub", or any interface of python-can ("socketcan" on a robot).
-        channel: as the interface wants it; HOST:PORT or a path for the hub.
+        channel: channel of the interface; HOST:PORT or a path for the hub.
         bitrate: bit rate [bit/s], if the interface sets it.
         options: further arguments of the interface.
     """

@@ -175,7 +175,7 @@ def controlword_towards(state: DriveState, target: DriveState, previous: int) ->
     decision of its own (transition 16). A fault is reset only on the way to another state than FAULT.
 
     Args:
-        state: that the drive reports.
+        state: state that the drive reports.
         target: SWITCH_ON_DISABLED, READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED or QUICK_STOP_ACTIVE.
         previous: controlword sent last; the fault reset bit is cleared after each use, so that it can rise again.
 

@@ -118,7 +118,7 @@ class Jitter(NamedTuple):
 
     Attributes:
         fifo: whether the system permitted real-time scheduling.
-        lateness: of each beat [s].
+        lateness: lateness of each cycle [s].
         missed: beats that passed unused.
     """
 

@@ -25,7 +25,7 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
     """Measure and ask; nothing is written to any drive.
 
     Args:
-        bus: to look for drives on; None leaves that out.
+        bus: bus to search for drives; None skips the search.
         rate_hz: rate of the loop whose jitter is measured.
         seconds: length of each idle run.
         idle_runs: number of idle runs.

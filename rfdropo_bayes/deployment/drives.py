@@ -80,7 +80,7 @@ class Drive:
         motor: motor of the axis.
         offset: counts at length zero.
         identifiers: identifiers of its frames.
-        units: units of those objects that differ between vendors.
+        units: units of the objects that differ between vendors.
         unguarded: guards that it may lack, by object index.
     """
 
@@ -274,9 +274,12 @@ class Drive:
         return found
 
     def disable(self) -> bool:
-        """Bring a drive that is found powered to rest, before anything is configured; True if it was.
+        """Switch off the power of a drive before its configuration; True if it was powered.
 
-        It is commanded by SDO: process data of whoever had it last may still be configured.
+        Commands go by SDO, as process data of an earlier master may still be configured.
+
+        Raises:
+            InputError: the drive is still powered after a second.
         """
         end = time.monotonic() + 1.0
         found, previous = False, 0
@@ -435,7 +438,7 @@ def drives_of(
         motors: one motor per drive.
         offsets: counts of each motor at length zero.
         eds: path of their electronic data sheet.
-        answer: how long a node has to answer an SDO request [s].
+        answer: time limit of a node's answer to an SDO request [s].
         units, unguarded: see `Drive`.
     """
     axes = {motor.node: max(other.axis for other in motors if other.node == motor.node) for motor in motors}
@@ -469,8 +472,8 @@ class Drives:
     """All drives of a robot.
 
     Args:
-        network: that they are on.
-        drives: in the order of the robot's channels.
+        network: network of the drives.
+        drives: drives in the order of the robot's channels.
         guards: see there.
     """
 
@@ -526,7 +529,7 @@ class Drives:
         """One cycle: set-points, SYNC, heartbeat; then wait for the answers.
 
         Args:
-            timeout: how long to wait [s].
+            timeout: longest wait [s].
             meanwhile: called before the wait.
 
         Returns:

@@ -26,7 +26,7 @@ class Home(BaseModel):
     """Result of homing one channel.
 
     Attributes:
-        channel: of the robot.
+        channel: channel of the robot.
         offset_counts: counts at length zero.
         tension_n: tension at length zero [N].
         travel_m: distance from the start of the search to length zero [m].

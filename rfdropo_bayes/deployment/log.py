@@ -68,8 +68,8 @@ class SessionLog:
     """Writes a session's folder while it runs.
 
     Args:
-        folder: to write to; it must not hold a session yet.
-        robot: that is driven.
+        folder: folder to write to; it must not hold a session yet.
+        robot: robot to drive.
         facts: about the session, kept in the recording's settings.
         frames: name of the file of CAN frames; its ending chooses the format.
 

@@ -191,7 +191,11 @@ class ControlLoop:
         return self._come_to_rest(stop)
 
     def find(self) -> None:
-        """Read the first status of every drive; set-points begin at the drives' positions."""
+        """Read the first status of every drive; set-points begin at the drives' positions.
+
+        Raises:
+            Stop: a drive sends no status within a second.
+        """
         end = time.monotonic() + 1.0
         while silent := [drive.name for drive in self.drives.all if drive.reading is None]:
             self.cycle(Phase.ENABLING)
@@ -339,7 +343,7 @@ class ControlLoop:
                 raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
 
     def _brake(self, began: float, stop: Stop) -> Stop:
-        """Quick stop, and look on: the drives must show that they stand, and go on holding.
+        """Quick stop; the drives must then report standstill and keep holding.
 
         Returns:
             The stop, with the drives that did not hold; these are the cause of a session that had ended as planned.

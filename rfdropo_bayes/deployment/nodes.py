@@ -25,11 +25,11 @@ class Node:
     """One node.
 
     Args:
-        network: that it is on.
-        number: of the node.
+        network: network of the node.
+        number: number of the node.
         eds: path of its electronic data sheet.
         axes: number of the highest axis that is driven.
-        answer: how long it has to answer an SDO request [s].
+        answer: time limit of its answer to an SDO request [s].
 
     Raises:
         InputError: if the data sheet cannot be read.
@@ -70,8 +70,8 @@ class Node:
         """Read an object.
 
         Args:
-            index, subindex: of the object.
-            name: of the drive, for messages.
+            index, subindex: address of the object.
+            name: name of the drive, for messages.
 
         Raises:
             InputError: if the drive does not answer, or refuses; with index and reason.
@@ -113,7 +113,7 @@ class Node:
 
         Args:
             received, sent: numbers of the RPDOs and TPDOs that stay.
-            name: for messages.
+            name: name for messages.
         """
         for index, maps, used in (
             (Object.RPDO, self.remote.rpdo, received),

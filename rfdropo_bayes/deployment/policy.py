@@ -367,7 +367,7 @@ class RecordedCommands:
     last command wins if several fall into one period.
 
     Args:
-        recording: of an earlier session, or any trajectory of this robot.
+        recording: recording of an earlier session, or any trajectory of this robot.
         robot: robot to drive.
         rate_hz: rate of the periods; see `replay_rate`.
 

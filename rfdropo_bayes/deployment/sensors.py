@@ -56,7 +56,7 @@ class SensorTable(BaseModel):
     Attributes:
         kind: "natnet", "simulated" or "none".
         server, local: addresses of Motive's machine and of this machine (natnet).
-        multicast: how Motive streams (natnet).
+        multicast: whether Motive streams by multicast (natnet).
         rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
         object_body: identifier of the rigid body that the robot pushes (natnet); its pivot is the object's centre.
             Create it in Motive while the object is aligned with the robot's base.
@@ -113,8 +113,8 @@ class SimulatedMarkers:
     """Markers of a simulation, which comes as UDP datagrams; the newest is kept.
 
     Args:
-        markers: how many there are.
-        port: to listen at, on this machine alone; 0 takes a free one.
+        markers: number of markers.
+        port: local port to listen at; 0 takes a free port.
     """
 
     def __init__(self, markers: int, port: int = 0) -> None:
@@ -189,7 +189,7 @@ class NatNetMarkers:
 
     Args:
         table: addresses, identifiers and frame.
-        robot: whose markers they are.
+        robot: robot with these markers.
 
     Raises:
         InputError: if a marker has no rigid body of its own, the package is missing, or Motive does not answer.
@@ -309,7 +309,7 @@ class MarkerView:
         self._acted: np.ndarray | None = None
 
     def update(self, now: float) -> None:
-        """Look at the sensor once a cycle."""
+        """Read the sensor, once per cycle."""
         self.fresh, self.object_fresh = np.zeros_like(self.fresh), False  # if the sensor raises, nothing was seen
         sighting = self._sensor.latest()
         new = sighting.number != self._number and now - sighting.time <= self._table.stale_s

@@ -18,8 +18,8 @@ class SetPoints:
 
     Args:
         motors: give the limits.
-        period: of the cycle [s].
-        length: to start from, at rest [m].
+        period: length of the cycle [s].
+        length: initial length, at rest [m].
     """
 
     def __init__(self, motors: Sequence[Motor], period: float, length: Float[np.ndarray, " motor"]) -> None:

@@ -33,9 +33,9 @@ class DrivesTable(_Table):
         check_eds: whether vendor and product in the data sheet must equal the drive's own; some makers leave them out
             of step.
         answer_s: a drive has this long to answer an SDO request; more for drives that write to slow memory.
-        torque_unit: of the rated torque, object 0x6076; "uN m" for maxon's EPOS4.
-        speed_unit: of the greatest motor speed, object 0x6080; rpm by default, as in the standard.
-        acceleration_unit: of the quick stop's deceleration, object 0x6085; by default from object 0x60AA, else
+        torque_unit: unit of the rated torque, object 0x6076; "uN m" for maxon's EPOS4.
+        speed_unit: unit of the greatest motor speed, object 0x6080; rpm by default, as in the standard.
+        acceleration_unit: unit of the quick stop's deceleration, object 0x6085; by default from object 0x60AA, else
             counts/s2.
         unguarded: guards that the drives may lack, by object index; `check` lists missing guards and their
             consequences.
@@ -103,7 +103,7 @@ class SafetyTable(_Table):
         heartbeat_s: drives and master stop if the other's heartbeat is missing for this long.
         following_error_m, following_time_s: a drive faults if it lags behind by this length for this time.
         enable_s: within this time the drives must be enabled.
-        start_rate_m_s: of the ramp to the start pose; a fifth of each motor's own limit by default.
+        start_rate_m_s: rate of the ramp to the start pose; a fifth of each motor's own limit by default.
         settle_s: rest in the start pose before the policy begins.
         hold_s: time for which the drives are watched after a stop.
         after: "hold" leaves the drives braked and holding; "release" switches them off, which slackens the cables, if
@@ -148,7 +148,7 @@ class SafetyTable(_Table):
 
 
 class HomingTable(_Table):
-    """How length zero is found.
+    """Search for length zero.
 
     Attributes:
         file: file of the result; none if the robot file has the motors' offsets.
@@ -188,8 +188,8 @@ class Deployment(_Table):
 
     Attributes:
         robot: name or file of a robot with motors.
-        rate_hz: of the set-point loop.
-        duration_s: of the policy.
+        rate_hz: rate of the set-point loop.
+        duration_s: duration of the policy.
         frames: file of CAN frames in the session's folder; .log is candump, .blf binary.
         goal: x, y and z of the policy's goal [m].
         bus, drives, policy, sensor, safety, homing, simulation: see the tables.

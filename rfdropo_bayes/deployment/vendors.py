@@ -67,7 +67,7 @@ def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, wh
     Args:
         stated: unit stated by the owner of the drive.
         word: content of 0x60A9; 0 if it is empty.
-        counts_per_turn: of the motor.
+        counts_per_turn: encoder counts per turn of the motor.
         where: location for messages.
 
     Raises:
@@ -93,7 +93,7 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
     Args:
         stated: unit stated by the owner of the drive.
         word: content of 0x60AA; 0 if it is empty.
-        counts_per_turn: of the motor.
+        counts_per_turn: encoder counts per turn of the motor.
         where: location for messages.
 
     Raises:

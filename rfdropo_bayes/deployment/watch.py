@@ -133,7 +133,7 @@ class AfterStop:
     """Looks at drives after a quick stop, which they should hold: some enable themselves again, others let go.
 
     Args:
-        drives: that are stopped.
+        drives: drives that are stopped.
     """
 
     def __init__(self, drives: Drives) -> None:

@@ -1,4 +1,4 @@
-"""What is audited: a simulator with every candidate in it, recordings, and rules."""
+"""The problem of an audit: a simulator with every candidate in it, recordings, and rules."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from rfdropo_bayes.simulators.commands import Commands
 
 @dataclass(frozen=True)
 class AuditProblem:
-    """What is audited.
+    """Problem of an audit.
 
     Attributes:
         lanes: simulator with the base model's mechanisms, and every candidate at its null value.
         finer: the same on a finer mesh and time step, with the commands on its own clock; None without.
-        coordinates: of all parameters.
-        model: base model and candidates, of all recordings, fitted ones first.
-        trajectories: the fitted ones.
-        candidates: that may be named.
-        stated_noise: from the experiment file, used where nothing was repeated; None without.
-        start: values of base parameters to start from, of an earlier calibration; None for a search.
+        coordinates: coordinates of all parameters.
+        model: base model and candidates, for all recordings, fitted recordings first.
+        trajectories: fitted recordings.
+        candidates: mechanisms that may be named.
+        stated_noise: noise of the experiment file, used if nothing was repeated; None without it.
+        start: start values of base parameters from an earlier calibration; None for a search.
         rules, seed: see `Rules`.
         left_out: mechanisms that do not run on this body or engine, with the reason.
-        groups: of recordings, in which candidates may be by themselves; None without.
-        ports: of the simulator, at which unknown causes are looked for; None where nobody asks for them.
+        groups: groups of recordings with their own candidates; None without groups.
+        ports: ports of the simulator for the search for unknown causes; None if not requested.
     """
 
     lanes: Lanes
@@ -62,15 +62,21 @@ class AuditProblem:
         """A candidate by its name; None for the mesh and time step, which are none of the library's."""
         return next((candidate for candidate in self.candidates if candidate.name == name), None)
 
+    def group_of(self, name: str) -> str:
+        """The group of recordings that a candidate is in; empty for all."""
+        candidate = self.candidate(name)
+        return "" if candidate is None else candidate.group
+
     def kinds(self, names: Sequence[str]) -> list[Hashable]:
-        """What tells recordings apart beside their commands: the parameters that they have, and their group, in which a
-        mechanism or a law may act alone. Recordings of one kind may be repeats of each other."""
+        """Keys that distinguish recordings beside their commands: their parameters, and their group, in which a
+        mechanism or a law may act alone. Recordings of one kind may be repeats of each other.
+        """
         groups = [""] * len(names) if self.groups is None else [self.groups.group_of(name) for name in names]
         return [(*slots, group) for slots, group in zip(self.coordinates.slots(names), groups, strict=True)]
 
 
 def measurements_of(problem: AuditProblem, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
-    """Some of the recordings, no more rows than the longest of them has; repeats are joined where they are given."""
+    """Measurements of some recordings, cut to the longest; repeats are joined if given."""
     index = list(chosen)
     kinds = problem.kinds([problem.model.recordings.names[i] for i in index])
     rows = int(problem.model.recordings.rows[index].max())
@@ -85,7 +91,7 @@ def simulated(
     chosen: Sequence[int],
     deadline: Deadline | None = None,
 ) -> Forward:
-    """Some of the recordings, on the simulator itself or on the finer one; an object starts where they measured it."""
+    """Some of the recordings, on the simulator itself or the finer simulator; an object starts at its measured pose."""
     lanes, commands = problem.lanes, problem.model.recordings.commands
     if finer and problem.finer is not None:
         lanes, commands = problem.finer

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
-from rfdropo_bayes.bayes.space import force_power
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
@@ -26,6 +26,7 @@ from rfdropo_bayes.discrepancy.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VER
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
+FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
 REFINE = "raise [simulator] refine and, of a motion, shorten its time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
@@ -39,9 +40,9 @@ def record(
     next_experiment: Any,
     doubts: Sequence[Caution] = (),
 ) -> dict[str, Any]:
-    """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so.
+    """Results of an audit with the keys of /audit.json/; lengths in mm if a key ends in mm.
 
-    ``doubts`` are those of its recordings.
+    ``doubts`` are cautions on its recordings.
     """
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
@@ -91,6 +92,7 @@ def record(
         "seconds": round(answer.cost.seconds, 2),
         "waited_seconds": round(answer.cost.waited, 2),
         "profile": {stage: round(seconds, 2) for stage, seconds in answer.cost.profile.items()},
+        "minutes": answer.problem.rules.minutes,
         "seed": answer.problem.seed,
         "versions": versions,
         "data_sha256": data_sha256,
@@ -121,12 +123,12 @@ def _noise(answer: Answer) -> dict[str, Any]:
 
 
 def next_experiment(answer: Answer) -> dict[str, Any]:
-    """What to do at the robot next, in a sentence, and the candidates that this tells apart."""
+    """Next step at the robot, in a sentence, and the candidates that it distinguishes."""
     apart = next((step for step in answer.causes.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
-        words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
+        words = "No change is needed for commands like these; record larger and faster commands, and audit them."
     elif answer.verdict == NEGLIGIBLE:
-        words = "Nothing need be done: what is left is too small to matter."
+        words = "Nothing need be done: the residual is too small to matter."
     elif answer.law is not None:
         looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.found.terms))
         words = f"Look at {looks}: the library has no mechanism that acts so."
@@ -135,11 +137,11 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     elif not answer.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --from."
     elif answer.doubts.suspected is not None:
-        words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
+        words = "Repeat one command sequence three times: the repeats show whether the noise agrees with [noise]."
     elif answer.target.noise.doubtful:
         words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
     elif answer.verdict == UNEXPLAINED and answer.causes.steps:
-        words = f"No candidate explains it: {_watch(answer)}, for a cause that docs/mechanisms.md says how to add."
+        words = f"No candidate explains it: {_watch(answer)}, for a cause to add as in docs/mechanisms.md."
     elif answer.verdict == NO_VERDICT:
         words = "Nothing yet: raise [audit] minutes, and go on with --resume."
     elif apart is not None:
@@ -150,7 +152,9 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     elif not answer.causes.steps:
         leading = [row.name for row in answer.causes.screens[0].rows[:2]]
         asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
-        words = f"Send what `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
+        words = (
+            f"Send the commands that `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
+        )
         return {"sentence": words, "separates": leading}
     else:
         name, share = _largest(answer)
@@ -164,7 +168,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
 
 
 def _doubt(answer: Answer) -> str:
-    """What shows whether a mechanism that is not adopted is there."""
+    """Test that decides whether a named but not adopted mechanism is present."""
     gain = answer.validation.gain
     if gain is None or not gain.opposed or gain.worse or answer.problem.compared:
         return f"record {MORE_TESTS} more test recordings: they show whether the model needs it"
@@ -172,7 +176,7 @@ def _doubt(answer: Answer) -> str:
 
 
 def _largest(answer: Answer) -> tuple[str, float | None]:
-    """The step that explains most of the discrepancy, and the share; the first one where no share is known."""
+    """The step that explains most of the discrepancy, and the share; the first step if no share is known."""
     shares = zip(answer.causes.steps, _shares(answer), strict=True)
     step, share = max(shares, key=lambda entry: -np.inf if entry[1] is None else entry[1])
     return step.name, share
@@ -187,12 +191,12 @@ def _remedy(answer: Answer, name: str) -> str:
 
 
 def _watch(answer: Answer) -> str:
-    """Where on the robot to look: when and at which marker the base model fails most."""
+    """Advice on the place to watch: time and marker of the base model's largest misfit."""
     found = prequential(answer.target, answer.base)
     worst, markers = int(np.argmax(found.surprise)), answer.problem.model.recordings.markers
     marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
     first, last = found.edges[worst : worst + 2]
-    return f"watch {marker} while what was sent from {first:.2g} to {last:.2g} s is sent again"
+    return f"watch {marker} while the commands from {first:.2g} to {last:.2g} s are sent again"
 
 
 def _other_noise(answer: Answer) -> dict[str, Any]:
@@ -244,7 +248,7 @@ def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]
 
 
 def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """What differs between two groups of recordings, and what both lack; None where none are compared."""
+    """Differences between two groups of recordings, and effects that both lack; None without a comparison."""
     groups = answer.problem.compared
     if groups is None:
         return None
@@ -270,6 +274,7 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
     for i in indices:
         column = values[:, i]
         found[coordinates.names[i]] = {
+            "title": coordinates.space.parameters[i].spec.name,
             "mean": float(column.mean()),
             "sd": float(column.std()),
             "q05": float(np.quantile(column, 0.05)),
@@ -280,8 +285,9 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
 
 
 def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
-    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free,
-    so that only the ratio is known where no force was measured. First-order error propagation in logarithms."""
+    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free, so
+    that only ratios are known if no force was measured. First-order error propagation in logarithms.
+    """
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}
     place = {int(i): k for k, i in enumerate(fit.free)}
@@ -289,7 +295,8 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
     named, slopes = coordinates.named(fit.x), coordinates.slopes(fit.x[None])[0]
     found = {}
     for i in indices:
-        name, unit = coordinates.names[i], coordinates.space.parameters[i].spec.unit
+        name, own = coordinates.names[i], coordinates.space.parameters[i].spec
+        unit = own.unit
         power = force_power(unit)
         if power == 0 or i not in place or named[name] == 0.0:
             continue
@@ -299,8 +306,9 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
         ratio = named[name] / named[STIFFNESS] ** power
         spread = float(np.sqrt(gradient @ fit.covariance @ gradient))
         low, high = ratio * (1 - 1.645 * spread), ratio * (1 + 1.645 * spread)
-        title = f"{name}_over_{STIFFNESS}" if power > 0 else f"{name}_times_{STIFFNESS}"
-        found[title] = {
+        relation = f"_over_{STIFFNESS}" if power > 0 else f"_times_{STIFFNESS}"
+        found[f"{name}{relation}"] = {
+            "title": f"{own.name}{relation}",
             "parameter": name,
             "power": power,
             "mean": ratio,
@@ -327,7 +335,7 @@ def _omnibus(screen: Screen) -> dict[str, Any]:
 
 
 def _where(answer: Answer) -> dict[str, Any]:
-    """When and where the base model fails."""
+    """Time and place of the base model's misfit."""
     found, problem = prequential(answer.target, answer.base), answer.problem
     markers = problem.model.recordings.markers
     misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
@@ -369,8 +377,20 @@ def _candidate(answer: Answer, row: ScreenRow, screen: Screen, refit: float | No
         "degrees_of_freedom": row.rank,
         "p": row.p,
         "adjusted_p": row.adjusted_p,
+        "would_explain": row.lm / max(float(screen.fit.residual @ screen.fit.residual), 1e-300),
         "tried_at": at,
         "log_bayes_factor": refit,
         "named": any(step.name == row.name for step in answer.causes.steps),
         "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
     }
+
+
+def force_power(unit: str) -> int:
+    """Power of the unit of force in a unit such as "kg", "N/m", "Pa s" or "1/Pa"; exponents of its parts do not count.
+
+    1 for masses, forces and stiffnesses, -1 for compliances. Of equations of motion in which every such parameter is
+    multiplied by one factor to that power, no motion changes: where only positions are measured and lengths commanded,
+    data say nothing of that factor (Buckingham's theorem).
+    """
+    above, *below = [sum(part in FORCES for part in re.findall(r"[A-Za-z]+", side)) for side in unit.split("/")]
+    return above - sum(below)

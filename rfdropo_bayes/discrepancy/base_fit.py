@@ -1,4 +1,4 @@
-"""The base model's noise and posterior mode, point after point: where a search has come to is an answer, too."""
+"""The base model's noise and posterior mode, point by point: each intermediate point is a result."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose":
 
 @dataclass(frozen=True)
 class Reached:
-    """Where the search for a base model has come to.
+    """Intermediate point of the search for a base model.
 
     Attributes:
         target: data, noise and simulator.
         x: coordinates of all parameters.
-        fit: that ended there; None before a climb has ended.
+        fit: fit that ended there; None before the first optimisation has ended.
     """
 
     target: FitTarget
@@ -52,7 +52,7 @@ class Reached:
 
     @classmethod
     def at(cls, target: FitTarget, fit: Fit) -> Reached:
-        """Where a fit ended."""
+        """End point of a fit."""
         return cls(target, fit.x, fit)
 
     def settled(self) -> tuple[FitTarget, Fit]:
@@ -88,7 +88,7 @@ def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | N
 
 
 def beginning(problem: AuditProblem, target: FitTarget) -> Reached:
-    """Where the search begins: at an earlier calibration, or in the middle of the priors."""
+    """Start of the search: an earlier calibration, or the centre of the priors."""
     coordinates = target.forward.coordinates
     return Reached(target, coordinates.null if problem.start is None else coordinates.encode(problem.start))
 
@@ -96,8 +96,9 @@ def beginning(problem: AuditProblem, target: FitTarget) -> Reached:
 def base_fits(
     problem: AuditProblem, begun: Reached, seed: int, report: Callable[[str], None] = lambda line: None
 ) -> Iterator[Reached]:
-    """Better and better base models, from a given start or from where `calibrate`'s search leads; climbed on while
-    rollouts beside it are better. Where the noise is estimated from residuals, noise and fit in turn at the end."""
+    """A sequence of improving base models, from a given start or from `calibrate`'s search. The optimisation continues
+    while nearby rollouts are better. If the noise is estimated from residuals, noise and fit alternate at the end.
+    """
     target = begun.target
     _announce(target, problem.start is None, report)
     coordinates, known = target.forward.coordinates, target.noise.source != RESIDUALS
@@ -128,7 +129,7 @@ def base_model(
     report: Callable[[str], None] = lambda line: None,
     deadline: Deadline | None = None,
 ) -> tuple[FitTarget, Fit]:
-    """Noise and base fit; where the noise is estimated from residuals, the two in turn.
+    """Noise and base fit, alternating if the noise is estimated from residuals.
 
     Raises:
         InputError: the time was up before the base model was fitted.
@@ -149,23 +150,29 @@ def under_residual_noise(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
     """Noise and fit in turn."""
     converged = fit.converged
     for _ in range(2):
-        target = replace(target, noise=residual_noise(target, fit))
-        fit = climb(target, fit.x, fit.free)
+        target, fit = fit_with_noise(replace(target.measured, noise=residual_noise(target, fit)), fit.x, fit.free)
     return target, fit if converged else replace(fit, promise=np.inf)
 
 
 def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
-    """Autoregressions fitted to what a model leaves of every recording."""
-    measured = target.measurements
+    """What is taken for noise of what a model leaves of every recording, if nothing else says what the noise is.
+
+    An autoregression, unless the residuals change more slowly than the noise of a measurement: those are a misfit, and
+    an autoregression would explain it away. Noise is then only what the rows before do not predict, so that the model
+    counts as far off, see `inadequacy`.
+    """
+    measured = target.measured.measurements
     left = np.array(measured.spread)
     for group, error in zip(measured.members, target.errors(fit.x), strict=True):
         left[list(group)] += error
-    return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+    noise = measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
+    return Stacked(tuple(part.unpredicted if part.doubtful else part for part in noise.parts))
 
 
 def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) -> None:
-    """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
-    derivatives, which take as long to compile as rollouts did."""
+    """Announce the first fit and its expected time, from the measured pace of rollouts and the time to compile
+    derivatives, which equals the rollouts'.
+    """
     forward, own = target.forward, target.forward.coordinates
     counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
     points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)

@@ -1,4 +1,4 @@
-"""What each candidate of the library does to the data, at its null value and where its shape is not known there."""
+"""Effect of each candidate of the library on the data, at its null value and for trial values of its shape."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.score import Signature, project_out, signature, span
+from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
-WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
+WAY = np.geomspace(0.05, 1.5, 12)  # shares of the path from null to a trial shape
 NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
 NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
@@ -25,20 +25,19 @@ UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does no
 
 def spoken(name: str) -> str:
     """A candidate's name in words: ``payload@april`` is "payload in april"."""
-    title, _, group = name.partition(SEPARATOR)
-    return title.replace("_", " ") + (f" in {group.replace('_', ' ')}" if group else "")
+    return name.replace("_", " ").replace("@", " in ")
 
 
 @dataclass(frozen=True)
 class Probe:
-    """One way a candidate may look.
+    """One possible effect of a candidate on the data.
 
     Attributes:
         candidate: its name.
         point: coordinates of its parameters there, by index.
         columns: whitened effect of prior-sized changes of its amplitudes.
         amplitudes: indices of the parameters the columns belong to; empty for a secant, the effect of `point` itself.
-        mark: what of it the base parameters cannot imitate.
+        mark: the part that base parameters cannot imitate.
     """
 
     candidate: str
@@ -48,12 +47,12 @@ class Probe:
     mark: Signature
 
     def start(self, fit: Fit) -> Float[np.ndarray, " d"]:
-        """Where a fit of this candidate starts: base parameters and amplitudes moved as the linear model says."""
+        """Start of a fit of this candidate: base parameters and amplitudes from the linear model."""
         return start_together(fit, [self])
 
 
 def start_together(fit: Fit, probes: Sequence[Probe]) -> Float[np.ndarray, " d"]:
-    """Where a fit of several candidates starts, see `Probe.start`."""
+    """Start of a fit of several candidates, see `Probe.start`."""
     x, columns = fit.x.copy(), np.concatenate([probe.columns for probe in probes], axis=1)
     for probe in probes:
         x[list(probe.point)] = list(probe.point.values())
@@ -75,30 +74,31 @@ class Candidate:
     """A mechanism that may be named.
 
     Attributes:
-        name: registry name.
+        title: registry name.
         indices: coordinates of its parameters.
-        mechanism: itself.
-        source: what an experiment file calls it.
-        group: of recordings that it is in; empty for all. Its name then ends in ``@group``.
+        mechanism: the mechanism.
+        source: its name in an experiment file.
+        group: group of recordings with this candidate; empty for all.
     """
 
-    name: str
+    title: str
     indices: tuple[int, ...]
     mechanism: Mechanism
     source: str
     group: str = ""
 
     @property
-    def title(self) -> str:
-        """Its name without the group's."""
-        return self.name.partition(SEPARATOR)[0]
+    def name(self) -> str:
+        """Title and group in one word, by which it is known."""
+        return label(self.title, self.group)
 
 
 def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:
     """Probes of every candidate at a fit of the present model, all in a few batches of rollouts.
 
-    A parameter without effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid. Where
-    the shape alone changes the data, that change is the direction; else the amplitudes are differentiated there.
+    A parameter without effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid. If the
+    shape alone changes the data, that change is the direction; otherwise the amplitudes are differentiated at the trial
+    value.
     """
     base = span(fit.jacobian)
     open_ = [c for c in candidates if c.indices]
@@ -120,7 +120,7 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
 
 
 def screening_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> int:
-    """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of those that are shapes."""
+    """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of shapes."""
     forward, parameters = target.forward, target.forward.coordinates.space.parameters
     found = 0
     for candidate in candidates:
@@ -136,7 +136,7 @@ def _shapes(target: FitTarget, candidate: Candidate, size: dict[int, float]) -> 
     coordinates = target.forward.coordinates
     seen = [i for i in candidate.indices if size[i] >= UNSEEN]
     unseen = [i for i in candidate.indices if size[i] < UNSEEN]
-    # Beside an amplitude that is seen, another one without effect (a tilt about gravity itself) is no shape.
+    # If an amplitude has an effect, another amplitude without effect (a tilt about gravity itself) is no shape.
     return [i for i in unseen if not seen or not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
 
 
@@ -195,12 +195,12 @@ def _probe(
 
 
 def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, Float[np.ndarray, " d"]]:
-    """What a candidate may take from the sum of squares, and the point from which a refit should start.
+    """Possible drop of the sum of squares by a candidate, and the start of a refit.
 
-    The score statistic is the drop that an amplitude brings, if its effect is in proportion to it. One large enough to
-    shift a motion by its own period is not, so that several sizes of a single amplitude are tried besides. A shape
-    alone has no amplitude: its effect has the size it has, and may be too large where it was tried. The way there from
-    its null value is searched, with places and times held where there is also a size.
+    The score statistic is the drop for an effect proportional to its amplitude. An effect that shifts a motion by its
+    own period is not proportional, so that several sizes of a single amplitude are also tried. A shape alone has no
+    amplitude: its effect has a fixed size, and may be too large at the trial value. The path from its null value is
+    searched, with places and times fixed if there is also a size.
     """
     if len(probe.amplitudes) == 1:
         drop, start, _ = _best_of(target, fit, _sizes(target, fit, probe))
@@ -211,8 +211,8 @@ def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, F
     while True:
         drop, start, best = _best_of(target, fit, _on_the_way(target, fit, probe, ladder))
         low, high = ladder[max(best - 1, 0)], ladder[min(best + 1, len(ladder) - 1)]
-        # Of a stop that cables seldom reach, one rung does nothing and the next one far too much: the data are met
-        # between them.
+        # For a stop that cables seldom reach, a rung has no effect and the next far too much: the optimum lies between
+        # them.
         if drop > NOTHING or high < NEIGHBOURS * low:
             return drop, start
         ladder = np.geomspace(low, high, len(WAY))
@@ -221,7 +221,7 @@ def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, F
 def _on_the_way(
     target: FitTarget, fit: Fit, probe: Probe, ladder: Float[np.ndarray, " way"]
 ) -> Float[np.ndarray, "way d"]:
-    """A fit with a shape at some shares of the way from its null value to where it was tried."""
+    """A fit with a shape at some shares of the way from its null value to its trial value."""
     coordinates = target.forward.coordinates
     points = np.repeat(fit.x[None], len(ladder), axis=0)
     sizes = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
@@ -232,7 +232,7 @@ def _on_the_way(
 
 
 def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
-    """A fit with several sizes of a probe's one amplitude, of both signs where it has two."""
+    """A fit with several sizes of a probe's one amplitude, of both signs if both are allowed."""
     coordinates, (index,) = target.forward.coordinates, probe.amplitudes
     null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
     sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])
@@ -267,7 +267,7 @@ def discretisation_probe(
 
 
 def fixed_drop(fit: Fit, probe: Probe) -> float:
-    """What a change without an amplitude takes from the sum of squares, base parameters moved with it."""
+    """Drop of the sum of squares by a change without an amplitude, with base parameters refitted."""
     base = span(fit.jacobian)
     now, then = (
         np.sum(project_out(base, r) ** 2) for r in (fit.residual[:, None], fit.residual[:, None] - probe.columns)

@@ -1,14 +1,14 @@
-"""One vector for all parameters of an audit: those of the base model, and those of every candidate at its null value.
+"""One vector for all parameters of an audit: of the base model, and of every candidate at its null value.
 
 Base parameters are moved in the unconstrained space of their priors. A parameter of a candidate is measured from its
-null value in units of its prior's deviation, because a null value may lie on a hard bound, where an unconstrained
-coordinate would be infinite; a parameter that means nothing at null (a time constant) is moved unconstrained, too.
+null value in units of its prior's deviation, because a null value may lie on a hard bound, at which an unconstrained
+coordinate is infinite. A parameter without effect at null (a time constant) is also moved in the unconstrained space.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.bayes.batches import padded
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.priors import log_density
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 
 MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
 PRIOR_DRAWS = 4000
@@ -34,34 +35,34 @@ class Coordinates:
 
     Attributes:
         space: every parameter, base first; each with its prior.
-        base: how many of them belong to the base model.
-        physical: names of the simulator's parameters, the order in which rollouts want them; nominal: their values
-            where nothing else is said.
-        fixed: values that stay, by name.
-        limits: hard bounds of the simulator's parameters, at which sums of a shared value and a group's own end.
-        widening: by how much prior and unit of each coordinate are wider than its parameter's prior; empty where none
-            is.
+        base: number of base parameters.
+        physical: names of the simulator's parameters, in the order of rollouts; a sum of a shared value and a group's
+            deviation is clipped to their hard bounds.
+        widening: factor by which prior and unit of each coordinate are wider than its parameter's prior; empty for
+            none.
     """
 
-    space: ParameterSpace
+    space: Scopes
     base: int
     physical: tuple[str, ...]
-    nominal: Mapping[str, float]
-    fixed: Mapping[str, float]
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     widening: tuple[float, ...] = ()
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """Value of each of the simulator's parameters that is not inferred."""
+        return {name: self.space.fixed.get(name, self.space.specs[name].nominal) for name in self.physical}
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names, in the order of the vector."""
         return self.space.names
 
-    def with_further(self, added: ParameterSpace) -> Coordinates:
+    def with_further(self, added: Scopes) -> Coordinates:
         """The same with parameters after all others, which are measured from their null values.
 
-        What was computed of the others is kept: to sample and to compile it anew takes as long as a refit's rollouts.
+        Cached results for the others are kept: recomputing them takes as long as a refit's rollouts.
         """
-        found = replace(self, space=ParameterSpace((*self.space.parameters, *added.parameters)))
+        found = replace(self, space=self.space.with_further(added.parameters))
         assert found.affine[len(self.names) :].all()
         fresh = added.sample(jax.random.key(len(self.names)), PRIOR_DRAWS)
         kept = {"_draws": self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}}
@@ -69,17 +70,17 @@ class Coordinates:
         return found
 
     def widened(self, factors: Float[np.ndarray, " d"]) -> Coordinates:
-        """The same under priors of candidates' sizes that are so many times wider about null, and in such units."""
+        """The same with priors and units of candidates' sizes widened about null by ``factors``."""
         found = replace(self, widening=tuple(factors.tolist()))
         found.__dict__.update(_draws=self._draws, _moved=self._moved)
         return found
 
     @cached_property
     def affine(self) -> np.ndarray:
-        """True where a coordinate is measured from its null value."""
+        """Mask of coordinates that are measured from their null value."""
         return np.array(
             [
-                i >= self.base and (p.table or {}).get("distribution") in MEASURED_FROM_NULL
+                i >= self.base and p.table.get("distribution") in MEASURED_FROM_NULL
                 for i, p in enumerate(self.space.parameters)
             ]
         )
@@ -104,12 +105,12 @@ class Coordinates:
 
     @property
     def _unit(self) -> np.ndarray:
-        """Of each coordinate, for those that are measured from null."""
+        """Unit of each coordinate that is measured from null."""
         return self._scale * np.array(self.widening or 1.0)
 
     @cached_property
     def prior_mean(self) -> Float[np.ndarray, " d"]:
-        """Centre of the prior in these coordinates: where searches start, no statement of its density."""
+        """Centre of the prior in these coordinates: the start of searches, unrelated to its density."""
         return np.array([0.0 if a else float(u.mean()) for a, u in zip(self.affine, self._free_draws, strict=True)])
 
     @cached_property
@@ -131,7 +132,7 @@ class Coordinates:
 
     @cached_property
     def one_sided(self) -> np.ndarray:
-        """+1 or -1 where the null value lies on a bound and only that sign has a meaning; else 0."""
+        """+1 or -1 if the null value lies on a bound and only that sign is allowed; else 0."""
         lower, upper = self.bounds
         return np.where(self.affine & (lower >= 0.0), 1, np.where(self.affine & (upper <= 0.0), -1, 0))
 
@@ -163,7 +164,7 @@ class Coordinates:
         return dict(zip(self.names, self.values(x[None])[0].tolist(), strict=True))
 
     def encode(self, values: Mapping[str, float]) -> Float[np.ndarray, " d"]:
-        """Coordinates of physical values; what is left out stays at `null`."""
+        """Coordinates of physical values; missing values stay at `null`."""
         x = self.null.copy()
         for i, name in enumerate(self.names):
             if name in values:
@@ -179,7 +180,7 @@ class Coordinates:
         usual = self._with_moved(self._null + self._scale * x, x, 0)  # in a wider prior as far from null as usual there
         slopes = self._with_moved(np.tile(self._scale, (len(x), 1)), x, 1)
         own = zip(self.space.parameters, usual.T, strict=True)
-        density = [log_density(p.spec, p.table or p.spec.prior, value) for p, value in own]
+        density = [log_density(p.spec, p.table, value) for p, value in own]
         return np.stack(density, axis=1) + np.log(np.abs(slopes))
 
     @cached_property
@@ -206,14 +207,14 @@ class Coordinates:
     def gains(self, x: Float[np.ndarray, "n d"]) -> dict[str, Float[np.ndarray, " n"]]:
         """Values of parameters that channels want and rollouts do not, inferred or fixed."""
         return self._beside(self.values(x)) | {
-            name: np.full(len(x), value) for name, value in self.fixed.items() if name not in self.physical
+            name: np.full(len(x), value) for name, value in self.space.fixed.items() if name not in self.physical
         }
 
     def gain_tangents(
         self, x: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"]
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Derivatives of `gains` along directions."""
-        zero = {name: np.zeros(len(x)) for name in self.fixed if name not in self.physical}
+        zero = {name: np.zeros(len(x)) for name in self.space.fixed if name not in self.physical}
         return self._beside(self.slopes(x) * directions) | zero
 
     def _beside(self, columns: np.ndarray) -> dict[str, np.ndarray]:
@@ -221,7 +222,7 @@ class Coordinates:
         return {p.name: columns[:, i] for i, p in named if p.physical not in self.physical}
 
     def slots(self, recordings: Sequence[str]) -> Int[np.ndarray, "recording d"]:
-        """Where each coordinate goes in a recording's physical parameters; -1 for those of other recordings."""
+        """Index of each coordinate in a recording's physical parameters; -1 for coordinates of other recordings."""
         index = {name: i for i, name in enumerate(self.physical)}
         return np.array(
             [[index.get(p.physical, -1) if p.holds_for(r) else -1 for p in self.space.parameters] for r in recordings]
@@ -230,10 +231,10 @@ class Coordinates:
     def physical_values(
         self, x: Float[np.ndarray, "n d"], slots: Int[np.ndarray, "recording d"]
     ) -> Float[np.ndarray, "n recording physical"]:
-        """What the simulator is given for each recording."""
-        start = np.array([self.fixed.get(name, self.nominal[name]) for name in self.physical], dtype=float)
+        """Inputs of the simulator for each recording."""
+        start, specs = np.array(list(self.nominal.values())), [self.space.specs[name] for name in self.physical]
         found = self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
-        return np.clip(found, *np.transpose([self.limits.get(name, (-np.inf, np.inf)) for name in self.physical]))
+        return np.clip(found, *np.transpose([(spec.low, spec.high) for spec in specs]))
 
     def physical_tangents(
         self,
@@ -246,15 +247,15 @@ class Coordinates:
         return self._scattered(zero, self.slopes(x) * directions, slots)
 
     def _scattered(self, theta: np.ndarray, values: np.ndarray, slots: np.ndarray) -> np.ndarray:
-        added = np.array([bool(p.added_to) for p in self.space.parameters])
+        added = np.array([bool(p.scope.added_to) for p in self.space.parameters])
         for recording, places in enumerate(slots):
             own = (places >= 0) & ~added
             theta[:, recording, places[own]] = values[:, own]
-            for i in np.flatnonzero((places >= 0) & added):  # what a group's value is off the shared one
+            for i in np.flatnonzero((places >= 0) & added):  # deviation of a group's value from the shared value
                 theta[:, recording, places[i]] += values[:, i]
         return theta
 
 
 def _spread(parameter: InferredParameter, draws: np.ndarray) -> float:
-    """Scale of the prior: its own where it names one, so that a half-normal at null is a standard normal's half."""
-    return float((parameter.table or {}).get("scale", 0.0)) or float(np.std(draws)) or 1.0
+    """Scale of the prior: its own if it has a scale, so that a half-normal at null is a standard normal's half."""
+    return float(parameter.table.get("scale", 0.0)) or float(np.std(draws)) or 1.0

@@ -1,10 +1,9 @@
-"""What may differ between groups of recordings, such as days: candidates of an audit that compares two of them, and of
-every audit of recordings that belong to groups.
+"""Possible differences between groups of recordings, such as sessions: candidates of an audit that compares two groups,
+and of every audit of recordings in groups.
 
 A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
-mechanism is there, or is larger, in one group only, or is absent there. A mechanism that all groups lack is a candidate
-as well, under its plain name: without it, an error of the base model would pass for a difference wherever it pays more
-in one group.
+mechanism is present or larger in one group only, or absent there. A mechanism that all groups lack is a candidate as
+well, under its plain name: without it, an error of the base model could be taken for a difference between groups.
 """
 
 from __future__ import annotations
@@ -15,12 +14,13 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from rfdropo_bayes.bayes.pooling import deviation_spec
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter, deviation
 from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
 from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, families, stem
+from rfdropo_bayes.posteriors import Scope
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 WHERE = "--between"
@@ -32,9 +32,9 @@ class Groups:
 
     Attributes:
         members: fitted and unseen recordings of each, by the group's name.
-        left_out: recordings that belong to none; where two groups are compared, these are not looked at.
-        compared: whether an audit asks for the differences between two groups, and for no others.
-        complements: recordings outside a group, by "all but NAME", where the fitted ones of them are no group.
+        left_out: recordings without a group; ignored if two groups are compared.
+        compared: whether an audit tests only differences between two groups.
+        complements: recordings outside a group, by "all but NAME", if their fitted recordings are not a group.
     """
 
     members: Mapping[str, tuple[str, ...]]
@@ -44,7 +44,7 @@ class Groups:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the groups."""
+        """Names of the groups."""
         return tuple(self.members)
 
     @property
@@ -54,7 +54,7 @@ class Groups:
         return self.names[1:] if len(self.members) == 2 and not self.complements else self.names
 
     def recordings(self, scope: str) -> tuple[str, ...]:
-        """Of a group, or of all groups but one."""
+        """Recordings of a group, or of all groups but one."""
         return self.members[scope] if scope in self.members else self.complements[scope]
 
     def group_of(self, recording: str) -> str:
@@ -64,7 +64,7 @@ class Groups:
 
 @dataclass
 class _Space:
-    """Parameters that are found one after the other, and where each of them is."""
+    """Parameters in order of addition, with the index of each."""
 
     parameters: list[InferredParameter]
 
@@ -74,7 +74,7 @@ class _Space:
 
 
 def with_differences(
-    space: ParameterSpace,
+    space: Scopes,
     base: int,
     simulated: Sequence[ParameterSpec],
     library: Sequence[Candidate],
@@ -82,22 +82,22 @@ def with_differences(
     *,
     spreads: Mapping[str, float],
     held: Sequence[str] = (),
-) -> tuple[ParameterSpace, list[Candidate]]:
-    """Parameters and candidates, those that may differ between groups among them.
+) -> tuple[Scopes, list[Candidate]]:
+    """Parameters and candidates, including possible differences between groups.
 
     Args:
-        space: base parameters, then those of the library.
-        base: how many belong to the base model.
+        space: base parameters, then the library's.
+        base: number of base parameters.
         simulated: every parameter of the base simulator.
         library: candidates that all groups may lack.
-        groups: of the recordings.
+        groups: groups of the recordings.
         spreads: standard deviations between groups that the model states, by parameter [its unit].
-        held: parameters whose values are known, and which therefore do not differ.
+        held: fixed parameters, which therefore do not differ.
     """
     found = _Space(list(space.parameters))
     candidates = list(library)
-    shared = {p.spec.name: p for p in space.parameters[:base] if not p.recording}
-    free = {p.physical for p in space.parameters[:base] if p.recording}  # differ between recordings or groups already
+    shared = {p.spec.name: p for p in space.parameters[:base] if not p.scope.owner}
+    free = {p.physical for p in space.parameters[:base] if p.scope.owner}  # differ between recordings or groups already
     places: dict[str, dict[str, int]] = {}  # by group, by parameter
     known = {*held, *free}
     specs = [spec for spec in simulated if spec.name not in known and (spec.name in shared or spec.prior)]
@@ -111,40 +111,40 @@ def with_differences(
         for family in families([spec for spec in specs if spec.name in own]):
             candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
         candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
-    for scope in groups.complements:  # an effect of either sign is added to what all share, and so may be absent in one
+    # an effect of either sign is added to the shared value, and so may be absent in one
+    for scope in groups.complements:
         candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
-    return ParameterSpace(tuple(found.parameters)), candidates
+    return replace(space, parameters=tuple(found.parameters)), candidates
 
 
 def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) -> float:
-    """Standard deviation of a parameter's prior: what the model allows the parameter, it allows the difference."""
+    """Standard deviation of a parameter's prior: the difference has the same scale as the parameter."""
     known = shared.get(spec.name)
     prior = known.prior if known else prior_from_table(spec, dict(spec.prior), where=f"{WHERE} {spec.name}")
     return float(np.std(np.asarray(prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
 
 
 def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> InferredParameter:
-    """What one group's value is off that of the others, Normal(0, ``spread``)."""
+    """Deviation of one group's value from the others', Normal(0, ``spread``)."""
     width = spec.high - spec.low
-    own = deviation_spec(spec, spread)._replace(low=-width, high=width)
-    prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
-    return InferredParameter(own, prior, group, dict(own.prior), groups.recordings(group), spec.name)
+    scope = Scope(group, group=True, added_to=spec.name)
+    return deviation(spec, spread, scope, groups.recordings(group), width, where=WHERE)
 
 
 def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
     name = specs[0].name if len(specs) == 1 else stem(specs)
     described = specs[0].description if len(specs) == 1 else f"{name.replace('_', ' ')} ({len(specs)} of them)"
     elsewhere = next(name for name in groups.names if name != group) if groups.compared else "other groups"
-    cause = f"{described}: not the same in {group} as in {elsewhere}"
-    remedy = f"measure it in {group} and in {elsewhere}, and undo what changed"
+    cause = f"{described}: differs between {group} and {elsewhere}"
+    remedy = f"measure it in {group} and in {elsewhere}, and undo the change"
     change = OwnParameter(name, tuple(specs), cause, remedy)
-    return Candidate(f"{name}{SEPARATOR}{group}", tuple(places), change, name, group)
+    return Candidate(name, tuple(places), change, name, group)
 
 
 def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Space) -> Candidate:
-    """A mechanism of the library in one group only. Shapes, which mean nothing where it is absent, are shared."""
+    """A mechanism of the library in one group only. Shapes, which have no effect without it, are shared."""
     parameters = [found.parameters[i] for i in candidate.indices]
-    sized = [(p.table or p.spec.prior).get("distribution") in MEASURED_FROM_NULL for p in parameters]
+    sized = [p.table.get("distribution") in MEASURED_FROM_NULL for p in parameters]
     indices = []
     for index, parameter, has_size in zip(candidate.indices, parameters, sized, strict=True):
         if has_size:
@@ -154,7 +154,7 @@ def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Spac
         else:
             spread = float(np.std(np.asarray(parameter.prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
             indices.append(found.add(_difference(parameter.spec, spread, group, groups)))
-    return replace(candidate, name=f"{candidate.name}{SEPARATOR}{group}", indices=tuple(indices), group=group)
+    return replace(candidate, indices=tuple(indices), group=group)
 
 
 def _one_sided(candidate: Candidate, found: _Space) -> bool:
@@ -164,12 +164,12 @@ def _one_sided(candidate: Candidate, found: _Space) -> bool:
 
 
 def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
-    """The size of a mechanism in one group, measured from its null value and added to what all share."""
-    spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
+    """The size of a mechanism in one group, measured from its null value and added to the shared value."""
+    spec, table = parameter.spec, dict(parameter.table)
     for key in ("loc", "low", "high"):
         if key in table:
             table[key] -= spec.nominal
     low, high, grid = spec.low - spec.nominal, spec.high - spec.nominal, tuple(g - spec.nominal for g in spec.grid)
     own = spec._replace(low=low, high=high, nominal=0.0, prior=table, grid=grid)
-    prior = prior_from_table(own, table, where=f"{WHERE} {spec.name}")
-    return InferredParameter(own, prior, group, table, groups.recordings(group), spec.name)
+    scope = Scope(group, group=True, added_to=spec.name)
+    return InferredParameter.of(own, table, scope, groups.recordings(group), where=WHERE)

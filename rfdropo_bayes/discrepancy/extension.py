@@ -82,7 +82,7 @@ class Added:
             refitted candidates within `Rules.evidence`.
         before: score tests of the model without it.
         fit: fit of the model with it.
-        log_bayes_factor: of the models with and without it, by Laplace.
+        log_bayes_factor: log Bayes factor of the models with and without it, by Laplace.
         refits: log Bayes factors of all refitted candidates of this step.
         judge: the target under which the fit was found, see `inadequacy`. It has the finer simulator from the step
             `DISCRETISATION` on.

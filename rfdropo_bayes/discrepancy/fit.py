@@ -1,8 +1,8 @@
 """Posterior modes of the base model and its extensions within bounds, with Laplace's evidence.
 
-Under a long recording the likelihood has many small summits, on which climbs of the whole end. The base model's optimum
-is looked for as `calibrate` looks for it: the climbs of `inference.find_modes` start at screened draws, and at short
-prefixes. `better_nearby` then asks rollouts, not derivatives, whether the summit that was found is one.
+The likelihood of a long recording has many small local optima, at which optimisations of the whole stop. The base
+model's optimum is searched as in `calibrate`: `inference.find_modes` starts at selected draws, and at short prefixes.
+`better_nearby` then checks the optimum by rollouts instead of derivatives.
 """
 
 from __future__ import annotations
@@ -20,27 +20,30 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Fields, Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
 from rfdropo_bayes.inference import Target as Climbed
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
-ALL = 40  # most steps of a climb to its end
-USUAL = 12  # steps of a climb, each with a Jacobian
-TOLERANCE = 0.01  # nats that a step promises at the end of a climb
-CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
-SEARCHED = 3  # steps of a climb of a search: of a linear model one or two, of the demonstration's arm five
-CLIMBED = 0.1  # nats that a step of a search's climbs promises at their end; the audit's own climb goes on from there
-POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
-ALONG = (4.0, 2.0, 1.0, 0.3)  # deviations of the posterior along its principal axes, likewise
-WITHIN = 0.5 * max(ALONG) ** 2  # nats that a step of slopes promises which is no longer than those tried
+ALL = 40  # most steps of a full optimisation
+USUAL = 12  # steps of an optimisation, each with a Jacobian
+TOLERANCE = 0.01  # predicted gain of a step [nat] at the end of an optimisation
+CLOSE = 1e-3  # of the squared misfit: optimisations end at steps with less than a thousandth of it
+SEARCHED = 3  # steps of an optimisation in a search: a linear model needs one or two, the demonstration's arm five
+# predicted gain [nat] at the end of a search's optimisations; the audit's own optimisation continues from there
+CLIMBED = 0.1
+POLLED = (0.3, 0.03, 0.003)  # trial deviations of the prior to each side of an optimum
+ALONG = (4.0, 2.0, 1.0, 0.3)  # trial deviations of the posterior along its principal axes
+WITHIN = 0.5 * max(ALONG) ** 2  # predicted gain [nat] of a step no longer than the trial steps
 FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
 
 
@@ -50,13 +53,13 @@ class Fit:
 
     Attributes:
         x: coordinates of all parameters.
-        free: which of them were fitted.
-        residual: whitened, of all channels.
-        jacobian: of the whitened prediction with respect to the free coordinates.
-        covariance: of the free coordinates, prior included.
-        log_evidence: Laplace's, up to the noise's normaliser, which all models under one noise share; the prior counts
-            with its density and its curvature.
-        promise: what a Gauss-Newton step from here still promises [nat]; see `converged`.
+        free: indices of fitted coordinates.
+        residual: whitened residuals of all channels.
+        jacobian: derivative of the whitened prediction with respect to the free coordinates.
+        covariance: covariance of the free coordinates, prior included.
+        log_evidence: Laplace's, up to the noise's normaliser, which all models under the same noise share; the prior
+            counts with its density and its curvature.
+        promise: predicted gain of a further Gauss-Newton step [nat]; see `converged`.
     """
 
     x: Float[np.ndarray, " d"]
@@ -69,12 +72,12 @@ class Fit:
 
     @property
     def converged(self) -> bool:
-        """Whether no step promises more than a nat, or more than what the accuracy of a large misfit allows."""
+        """Whether the predicted gain of a step is below a nat, or below the accuracy of a large misfit."""
         return self.promise < 1.0 + CLOSE * float(self.residual @ self.residual)
 
     @property
     def counted(self) -> float:
-        """How many independent values the residuals amount to, where rows that last count as fewer."""
+        """Effective number of independent residuals, with correlated rows down-weighted."""
         return max(min(float(self.residual @ self.residual), len(self.residual)), np.e)
 
     def draws(self, rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -89,10 +92,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class FitTarget:
-    """What is fitted: measurements under a noise, by a simulator; ``journal`` keeps what was computed.
+    """Target of a fit: measurements, noise and simulator; ``journal`` stores results.
 
-    Where the noise is that of a model that is far off (see `inadequacy`), ``known`` is the same under the noise of the
-    measurement.
+    If the noise belongs to a misspecified model (see `inadequacy`), ``known`` is the same target under the measurement
+    noise.
     """
 
     forward: Forward
@@ -121,8 +124,7 @@ class FitTarget:
         return digest(self.forward.identity, *readings, data.count, *known, repr(data.weighed))
 
     def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
-        """A computation with this target, looked up where the journal has it; its rollouts and seconds count either
-        way."""
+        """A computation with this target, from the journal if stored; its rollouts and seconds count in both cases."""
         before, looked_up = self.forward.rollouts, True
 
         def counted() -> Arrays:
@@ -145,10 +147,11 @@ class FitTarget:
     def evaluate(
         self, points: Float[np.ndarray, "n d"], rows: int | None = None
     ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, " n"], np.ndarray]:
-        """Whitened residuals, the logarithms of the sizes that errors are relative to, and where rollouts ended well.
+        """Whitened residuals, the logarithms of the sizes that errors are relative to, and the mask of successful
+        rollouts.
 
-        Only the first ``rows`` rows of every recording, all by default, are simulated; later ones hold no meaning.
-        Half the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.
+        Only the first ``rows`` rows of every recording, all by default, are simulated; later rows are meaningless. Half
+        the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.
         """
         shown, fine = self.forward.observe(points, rows)
         each = [self._errors({name: part[i] for name, part in shown.items()}) for i in range(len(fine))]
@@ -156,7 +159,7 @@ class FitTarget:
         return np.where(fine[:, None], white, FAILED), np.array([float(size) for _, size in each]), fine
 
     def log_likelihood(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Of a batch of points, up to the noise's normaliser; minus infinity where a rollout did not end well."""
+        """Log likelihood of a batch of points, up to the noise's normaliser; minus infinity after a failed rollout."""
         white, sizes, fine = self.evaluate(points)
         return np.where(fine, -0.5 * np.sum(white**2, axis=1) - sizes, -np.inf)
 
@@ -169,8 +172,9 @@ class FitTarget:
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 
     def shown_errors(self, shown: Fields, several: Sequence[str] = ()) -> Float[np.ndarray, "*many group time column"]:
-        """Measured less simulated readings, given what one point shows; of fields that have ``several`` values, each
-        in turn."""
+        """Measured less simulated readings, from the observations at one point; fields in ``several`` have several
+        values, each in turn.
+        """
         if not several:
             return np.asarray(self._errors(shown)[0])
         axes = {name: 0 if name in several else None for name in shown}
@@ -183,7 +187,7 @@ class FitTarget:
         if len(points) == 0:
             return np.zeros((0, *self.measurements.count.shape)), np.zeros(0)
         along = self.forward.tangents(points, directions)
-        if self._linear:  # what is shown enters errors as it is
+        if self._linear:  # observations enter errors unchanged
             shown = {name: np.zeros(part.shape[1:]) for name, part in along.items()}
         slopes, at = [], np.zeros(0)
         for k, point in enumerate(points):
@@ -201,7 +205,9 @@ class FitTarget:
         return all(channel.linear for channel in self.measurements.channels)
 
     def _errors(self, shown: Fields) -> tuple[Float[jax.Array, "group time column"], Float[jax.Array, ""]]:
-        """Errors of all channels side by side at what one point shows, and the sum of logarithms of their sizes."""
+        """Errors of all channels side by side for the observations at one point, and the sum of logarithms of their
+        sizes.
+        """
         seen = _seen(shown)
         errors, sizes, channels = [], jnp.zeros(()), self.measurements.channels
         for channel, own in zip(channels, self.measurements.columns, strict=True):
@@ -219,7 +225,7 @@ class FitTarget:
     def weighed(
         self, points: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"] | None = None
     ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-        """Residuals of the weighed parts, and what they lose along a direction at each point."""
+        """Residuals of the weighed parts, and their decrease along a direction at each point."""
         parts, own = self.measurements.weighed, self.forward.coordinates
         if parts is None:
             return np.zeros((len(points), 0)), np.zeros((len(points), 0))
@@ -248,14 +254,14 @@ def _seen(shown: Fields) -> Seen:
 
 @dataclass(frozen=True)
 class Posterior(ProblemDefaults):
-    """The posterior over some coordinates, the others held, as inference methods see it; see `bayes.problem`.
+    """The posterior over some coordinates, with the others fixed, as a problem of `bayes.problem`.
 
-    A row is one row of every group of repeats, whitened given those before it. The noise is known.
+    A row is one row of every group of repeats, whitened given the earlier rows. The noise is known.
 
     Attributes:
-        target: what is fitted.
+        target: target of the fit.
         start: all coordinates.
-        free: those that are not held.
+        free: indices of free coordinates.
     """
 
     target: FitTarget
@@ -278,7 +284,7 @@ class Posterior(ProblemDefaults):
 
     @property
     def units(self) -> dict[str, str]:
-        """Of the parameters."""
+        """Units of the parameters."""
         return {p.name: p.spec.unit for p in self._parameters}
 
     @property
@@ -288,7 +294,7 @@ class Posterior(ProblemDefaults):
 
     @cached_property
     def prior_ends(self) -> dict[str, tuple[float, float]]:
-        """Where each prior ends: on the hard bounds or between them."""
+        """Ends of each prior, at the hard bounds or inside them."""
         return {p.name: p.ends for p in self._parameters}
 
     @property
@@ -304,7 +310,7 @@ class Posterior(ProblemDefaults):
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""
-        drawn = ParameterSpace(self._parameters).sample(key, n)
+        drawn = Scopes(self._parameters).sample(key, n)
         return {name: np.asarray(column, dtype=float) for name, column in drawn.items()}
 
     def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n free"]:
@@ -333,7 +339,9 @@ class Posterior(ProblemDefaults):
     def row_log_likelihood(
         self, values: Mapping[str, Any], horizon: int
     ) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
-        """Of each row given those before it, up to the noise's normaliser; status 1 for a rollout that was lost."""
+        """Log density of each row given the earlier rows, up to the noise's normaliser; status 1 for a failed
+        rollout.
+        """
         white, weighed, fine = self._rows(values, horizon)
         rows = -0.5 * np.sum(white**2, axis=(1, 3))
         rows[:, 0] -= 0.5 * np.sum(weighed**2, axis=1)
@@ -349,9 +357,9 @@ class Posterior(ProblemDefaults):
         return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
 
     def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whitened residuals of a prefix, those of weighed parts, and where rollouts ended well.
+        """Whitened residuals of a prefix, of weighed parts, and the mask of successful rollouts.
 
-        What the sizes of relative errors add to the likelihood is left to the climb of the whole.
+        The contribution of relative errors' sizes to the likelihood is left to the optimisation of the whole.
         """
         white, _, fine = self.target.evaluate(self.place(self.to_unconstrained(values)), horizon)
         white = np.where(fine[:, None], white, 0.0)
@@ -359,7 +367,7 @@ class Posterior(ProblemDefaults):
         return series[:, :, :horizon], white[:, self.target.measurements.count.size :], fine
 
     def whole(self) -> Climbed:
-        """All rows, as climbs want them: with the simulator's own derivatives, and those of the sizes of errors."""
+        """All rows, for an optimisation: with derivatives of the simulator and of the sizes of errors."""
         known: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
         def at(u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -402,7 +410,7 @@ def climb(
 
 
 def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
-    """A climb, and the normal approximation around where it ends."""
+    """An optimisation, and the normal approximation at its end."""
     posterior = Posterior(target, start, free)
     climbed = posterior.whole()
     low, high = climbed.bounds
@@ -420,7 +428,7 @@ def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: 
 
 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:
-    """Rollouts that a climb of so many parameters may take."""
+    """Expected rollouts of an optimisation of ``parameters`` parameters."""
     forward = target.forward
     return forward.count * USUAL * (1 + forward.lanes.slope_rollouts * parameters)
 
@@ -442,23 +450,23 @@ def best_between(
 
 
 def heights(target: FitTarget, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
-    """Log posteriors of points, up to the noise's normaliser; kept in the journal by the name of ``what``."""
+    """Log posteriors of points, up to the noise's normaliser; stored in the journal under the name ``what``."""
 
     found = target.recall(what, [points], lambda: {"height": target.log_likelihood(points)})
     return found["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
 
 
 def widened(target: FitTarget, fit: Fit) -> Fit:
-    """A fit as it is under priors no narrower than the sizes found: its point, its covariance, and its promise.
+    """A fit under priors at least as wide as the fitted sizes: its point, covariance and promise.
 
-    The prior of a candidate's size says what is usual, and decides whether the candidate is believed. Once it is, a
-    size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
-    prior deviation stay as they are. A first-order step would not do: where motion tells a ratio alone, such as that
-    of drag and modulus, the wider prior moves both far along a curve.
+    The prior of a candidate's size describes usual sizes, and decides on the candidate. After its adoption the prior
+    would bias a large size towards null by several posterior deviations. Sizes below one prior deviation are unchanged.
+    A first-order step is not sufficient: if motion determines only a ratio, such as drag over modulus, the wider prior
+    moves both far along a curve.
 
     Args:
-        target: under which it was found.
-        fit: a mode.
+        target: target of the fit.
+        fit: a mode of the posterior.
     """
     own = target.forward.coordinates
     factors = widening(fit, own)
@@ -472,32 +480,39 @@ def widened(target: FitTarget, fit: Fit) -> Fit:
 
 
 def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
-    """By how much the scale of each prior is widened for a fit's sizes; 1 where it stays as it is."""
+    """Factor by which the scale of each prior is widened for a fit's sizes; 1 for no change."""
     free = np.isin(np.arange(len(fit.x)), fit.free) & coordinates.affine
     return np.where(free, np.maximum(np.abs(fit.x / coordinates.prior_sd), 1.0), 1.0)
 
 
 def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
-    """Where the best of `calibrate`'s climbs ends.
+    """End of the best optimisation of `calibrate`.
 
     Raises:
-        NoLikelihoodError: all prior draws are lost.
+        NoLikelihoodError: all prior draws fail.
     """
 
     def compute() -> dict[str, np.ndarray]:
         own = target.forward.coordinates
         posterior = Posterior(target, own.null, np.arange(own.base))
-        # Its normal approximation is not used: the coarse differences of short climbs suffice.
-        mode = find_modes(posterior, LaplaceConfig(tolerance=CLIMBED), key).modes[0]
+        # Its normal approximation is not used: the coarse differences of short optimisations suffice.
+        mode = find_modes(posterior, _searching(target), key).modes[0]
         return {"x": posterior.place(mode.mean[None])[0]}
 
     return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
 
 
+def _searching(target: FitTarget) -> LaplaceConfig:
+    """Search settings of `calibrate`; rows of a body at rest are independent, and have one horizon."""
+    rests = getattr(target.forward.lanes.simulator, "integrator", None) == QUASI_STATIC
+    return LaplaceConfig(tolerance=CLIMBED, **({"blocks": 1} if rests else {}))
+
+
 def optimum_rollouts(target: FitTarget) -> int:
-    """Rollouts that `base_optimum` usually takes: draws that are screened, at each horizon, and climbs, of which the
-    better half goes on to the next."""
-    config, own = LaplaceConfig(), target.forward.coordinates
+    """Rollouts that `base_optimum` usually takes: evaluated draws at each horizon, and optimisations, of which the
+    better half continues.
+    """
+    config, own = _searching(target), target.forward.coordinates
     beginning, step = climb_cost(own.base, 0)
     climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
     return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))
@@ -530,9 +545,9 @@ def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> Fi
 
 
 def better_nearby(target: FitTarget, fit: Fit) -> Float[np.ndarray, " d"] | None:
-    """A point beside a fit that is clearly better; None where rollouts confirm that it is a summit.
+    """A point beside a fit that is clearly better; None if rollouts confirm the optimum.
 
-    Derivatives cannot tell: of a motion that is rough on the scale of their steps they are noise, and promise nothing.
+    Derivatives cannot show this: for a motion that is rough on the scale of their steps they are noise.
     """
     coordinates = target.forward.coordinates
     own = coordinates.prior_sd[fit.free]

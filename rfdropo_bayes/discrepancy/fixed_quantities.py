@@ -1,16 +1,15 @@
-"""Parameters of a robot that a model holds at their nominal values, as candidates of an audit.
+"""Parameters of a robot that a model fixes at nominal values, as candidates of an audit.
 
-The library has mechanisms; what a robot's own file describes and an experiment does not infer, such as the zeros of all
-cables, may be what its model lacks as well.
+A parameter of the robot's own file that is not inferred, such as the zeros of all cables, may also explain a misfit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -20,7 +19,7 @@ MEASURED = "offset_"  # of the frame: `camera_offset` is the library's name for 
 
 @dataclass(eq=False)
 class OwnParameter:
-    """A robot's own parameters as a candidate, with what a record asks of a mechanism."""
+    """A robot's own parameters as a candidate, with the interface of a mechanism for records."""
 
     name: str
     parameters: tuple[ParameterSpec, ...]
@@ -30,17 +29,17 @@ class OwnParameter:
 
 
 def with_fixed_quantities(
-    space: ParameterSpace, simulated: Sequence[ParameterSpec], known: Sequence[str]
-) -> tuple[ParameterSpace, list[Candidate]]:
-    """Parameters and candidates beyond those of the library.
+    space: Scopes, simulated: Sequence[ParameterSpec], known: Sequence[str]
+) -> tuple[Scopes, list[Candidate]]:
+    """Parameters and candidates beyond the library's.
 
-    One quantity at several places is asked for, and no other: a single value that is not inferred (a damping) is one
-    that the base model would have, were it to matter.
+    Only quantities at several places are candidates: a single value (a damping) would be in the base model if it
+    mattered.
 
     Args:
-        space: base parameters, then those of the library.
+        space: base parameters, then the library's.
         simulated: every parameter of the base simulator.
-        known: parameters whose values are known.
+        known: fixed parameters.
     """
     present = {*known, *(parameter.physical for parameter in space.parameters)}
     absent = [spec for spec in simulated if spec.name not in present and spec.prior]
@@ -49,16 +48,15 @@ def with_fixed_quantities(
     for family in families(specs):
         first = len(parameters)
         for spec in family:
-            prior = prior_from_table(spec, dict(spec.prior), where=spec.name)
-            parameters.append(InferredParameter(spec, prior, "", dict(spec.prior)))
+            parameters.append(InferredParameter.of(spec, {}, where="[audit]"))
         cause = f"{family[0].description}: not the nominal one"
         own = OwnParameter(stem(family), tuple(family), cause, _remedy(family))
         candidates.append(Candidate(own.name, tuple(range(first, len(parameters))), own, own.name))
-    return ParameterSpace(tuple(parameters)), candidates
+    return replace(space, parameters=tuple(parameters)), candidates
 
 
 def _remedy(family: Sequence[ParameterSpec]) -> str:
-    """What to do at the robot."""
+    """Remedy at the robot."""
     name = stem(family)
     if name == ZEROS:
         return (
@@ -70,8 +68,9 @@ def _remedy(family: Sequence[ParameterSpec]) -> str:
 
 
 def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
-    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names; or
-    by their family, where a simulator tells it."""
+    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names; or by
+    their family, if a simulator has it.
+    """
     alike: dict[str, list[ParameterSpec]] = {}
     for spec in specs:
         key = repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items())))
@@ -80,7 +79,7 @@ def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
 
 
 def stem(specs: Sequence[ParameterSpec]) -> str:
-    """Their family, or what the names of several parameters begin with, in whole words."""
+    """Their family, or the common beginning of several parameters' names, in whole words."""
     if specs[0].family:
         return specs[0].family
     words = zip(*(spec.name.split("_") for spec in specs), strict=False)

@@ -134,7 +134,7 @@ class Lanes:
         """Observations of each parameter set under the commands of its lane, and result codes.
 
         ``start`` (lane, 7) are initial poses of an object. ``check`` is called before every batch, and may raise. After
-        ``steps`` time steps, all by default, rows hold no meaning.
+        ``steps`` time steps, all by default, rows are meaningless.
         """
         limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
         lanes = (theta, start, commands)
@@ -264,7 +264,7 @@ class Forward:
     def identity(self) -> str:
         """Digest of the simulator, its parameters with their priors, and the commands."""
         own, simulator = self.coordinates, self.lanes.simulator
-        named = (simulator.description, own.names, own.base, sorted(own.fixed.items()), sorted(own.nominal.items()))
+        named = (simulator.description, own.names, own.base, sorted(own.space.fixed.items()), sorted(own.nominal.items()))
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
         prior = (own.prior_mean, own.prior_sd, *own.bounds)
         return digest(

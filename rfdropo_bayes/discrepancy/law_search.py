@@ -267,10 +267,10 @@ class LinearModel(NamedTuple):
 
     Attributes:
         known: target of the simulator without a law.
-        terms: of the law that the model has.
+        terms: terms of the model's law.
         fit: the model.
         found: responses, with the residual and the slopes of the fit.
-        precision: of the base parameters, see `left_out_gains`.
+        precision: precision of the base parameters, see `left_out_gains`.
     """
 
     known: FitTarget

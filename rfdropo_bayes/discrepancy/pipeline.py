@@ -1,7 +1,7 @@
 """The audit from data to verdict: show, name, extend, measure.
 
-`findings` is a generator: each `Found` that it gives holds all that is known by then, and `conclude` makes an answer of
-any of them. So an audit that is stopped, by its time limit or by Ctrl-C, answers with what it has.
+`findings` is a generator: each `Found` has all results so far, and `conclude` makes an answer of any of them. An audit
+stopped by its time limit or by Ctrl-C therefore answers with its present results.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, simulated
@@ -46,16 +46,16 @@ GAIN, LAWS = "the gain on unseen recordings", "laws at ports"
 
 @dataclass(frozen=True)
 class Found:
-    """What is known at some time of an audit.
+    """Intermediate results of an audit.
 
     Attributes:
-        problem: what is audited.
+        problem: the audited problem.
         reached: the base model.
-        named: causes; None before the base model was screened.
-        kept: of these, what unseen recordings support; None before they were asked.
-        suspected: a noise under which the base model would pass, where a stated one leaves a discrepancy.
-        described: what acts that the library does not have; None before it was asked, or where it is not.
-        ended: of the parts of an audit, those that are done.
+        named: named causes; None before the score tests of the base model.
+        kept: causes supported by unseen recordings; None before that test.
+        suspected: a noise under which the base model would pass, if the stated noise leaves a discrepancy.
+        described: effect that the library lacks; None before that search, or if it is not requested.
+        ended: finished parts of the audit.
     """
 
     problem: AuditProblem
@@ -72,7 +72,7 @@ class Found:
 
     @property
     def left(self) -> tuple[str, ...]:
-        """What was not done, in words."""
+        """Unfinished parts, in words."""
         waiting = () if self.named is None else self.named.waiting
         parts = [BASE, CAUSES, *([GAIN] if self.named is None or self.named.steps else [])]
         found = [part for part in parts if part not in self.ended]
@@ -84,14 +84,14 @@ class Found:
 
 @dataclass(frozen=True)
 class Causes:
-    """What the search over extensions has named.
+    """Result of the search over extensions.
 
     Attributes:
-        steps: that unseen recordings support, all of them where these support none.
-        unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
-        screens: of the base model, and after each step.
-        refits: log Bayes factors of the candidates that were refitted beside the last model and did not join it.
-        described: what acts that the library does not have; None where nothing was left to describe.
+        steps: steps supported by unseen recordings; all steps if none is supported.
+        unsupported: mechanisms supported by fitted but not by unseen recordings.
+        screens: score tests of the base model, and after each step.
+        refits: log Bayes factors of candidates refitted beside the last model but not added.
+        described: effect that the library lacks; None if no misfit was left.
     """
 
     steps: list[Added]
@@ -103,13 +103,13 @@ class Causes:
 
 @dataclass(frozen=True)
 class Validation:
-    """What the extension is worth on recordings that no fit has seen.
+    """Gain of the extension on recordings that no fit has seen.
 
     Attributes:
-        gain: of all steps; None where it could not be measured.
+        gain: gain of all steps; None if it could not be measured.
         stages: explained fraction after each step.
-        recordings: which they are, in words.
-        predictions: of the base model and of the last one.
+        recordings: description of the recordings.
+        predictions: predictions of the base and the last model.
         unseen: the measurements.
     """
 
@@ -121,7 +121,7 @@ class Validation:
 
     @classmethod
     def of_steps(cls, held_out: HeldOut | None, steps: int) -> Validation:
-        """What unseen recordings say of the model after so many steps, and after each of them."""
+        """Validation on unseen recordings of the model after ``steps`` steps, and after each step."""
         if held_out is None:
             return cls()
         gains = [held_out.gain(0, k) for k in range(1, steps + 1)]
@@ -131,7 +131,7 @@ class Validation:
 
     @classmethod
     def of_law(cls, described: Described) -> Validation:
-        """What unseen recordings say of the base model with a law, alone or beside mechanisms."""
+        """Validation on unseen recordings of the base model with a law, alone or beside mechanisms."""
         held = described.held_out
         if held is None:
             return cls()
@@ -142,15 +142,14 @@ class Validation:
 
 @dataclass(frozen=True)
 class Doubts:
-    """What speaks against the noise, or against the simulation.
+    """Doubts about the noise or the simulation.
 
     Attributes:
-        suspected: a noise under which the base model would pass, where a stated one leaves a discrepancy that is not
-            explained.
-        shift: distance by which constants tell repeats apart [m]; None without repeats.
-        numerical: how far half the time step and a finer mesh move the markers of the last model [m]; None where that
-            is not known, or the finer one is the model.
-        priors: parameters of the base model that their prior decides.
+        suspected: a noise under which the base model would pass, if the stated noise leaves an unexplained discrepancy.
+        shift: constant distance between repeats [m]; None without repeats.
+        numerical: motion of the last model's markers by half the time step and a finer mesh [m]; None if unknown, or if
+            the finer simulator is used.
+        priors: parameters of the base model determined by their prior.
     """
 
     suspected: Stacked | None
@@ -161,14 +160,14 @@ class Doubts:
 
 @dataclass(frozen=True)
 class Cost:
-    """What an audit took.
+    """Cost of an audit.
 
     Attributes:
-        stopped: why it ended before all was done, "time" or "interrupt"; empty where it did not.
-        left: what was not done.
-        rollouts: of the whole run.
-        profile: seconds of each stage, of all parts of an audit that was resumed.
-        waited: seconds for which its last part waited for processors that other programs held.
+        stopped: why it ended before all was done, "time" or "interrupt"; empty if it finished.
+        left: unfinished parts.
+        rollouts: rollouts of the whole run.
+        profile: seconds of each stage, summed over all parts of a resumed audit.
+        waited: seconds of waiting of its last part for processors used by other programs.
     """
 
     stopped: str
@@ -179,22 +178,22 @@ class Cost:
 
     @property
     def seconds(self) -> float:
-        """Of all stages."""
+        """Seconds of all stages."""
         return sum(self.profile.values())
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What an audit found.
+    """Result of an audit.
 
     Attributes:
         verdict: see `decide`.
-        problem: what was audited.
+        problem: the audited problem.
         target: data, noise of the measurement, and simulator.
         base: fit of the base model.
         causes, validation, doubts, cost: see their own classes.
-        remainder: what no candidate explains.
-        sizes: the last model's fit under priors that do not pull; ``draws`` are from it.
+        remainder: the residual that no candidate explains.
+        sizes: the last model's fit under widened priors; the source of ``draws``.
     """
 
     verdict: str
@@ -211,7 +210,7 @@ class Answer:
 
     @property
     def fitted(self) -> bool:
-        """Whether the base fit came to an end; where it did not, its parameters are where the search had come to."""
+        """Whether the base fit finished; if not, its parameters are the search's last point."""
         return BASE not in self.cost.left
 
     @property
@@ -226,14 +225,13 @@ class Answer:
 
     @property
     def law(self) -> Described | None:
-        """The law that joins the model for good; None without one."""
+        """The adopted law; None without one."""
         found = self.causes.described
         return found if found is not None and found.holds else None
 
     @property
     def adopted(self) -> list[Added]:
-        """Steps that join the model for good: those that unseen recordings clearly support, in a model that explains
-        more than next to nothing."""
+        """Adopted steps: clearly supported by unseen recordings, in a model with a noticeable explained share."""
         gain = self.validation.gain
         if self.law is not None:
             gain = self.validation.gain or self.law.gain
@@ -251,11 +249,11 @@ def audit(
     Args:
         problem: see `AuditProblem`.
         report: called with a line of words now and then.
-        journal: keeps what was computed, for an audit that is interrupted.
-        deadline: of a run that has begun before; by default the problem's minutes from now on.
+        journal: stores results for an interrupted audit.
+        deadline: deadline of a run that began earlier; by default the problem's minutes from now.
 
     Raises:
-        InputError: rollouts at the optimum do not end well.
+        InputError: rollouts at the optimum fail.
     """
     clock = deadline or Deadline(problem.rules.minutes)
     found = Found(problem, beginning(problem, first_target(problem, journal or Journal(), clock)))
@@ -266,7 +264,7 @@ def audit(
 
 
 def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
-    """What is known after each part of an audit.
+    """Results after each part of an audit.
 
     Raises:
         OutOfTime: the time is up.
@@ -311,8 +309,9 @@ def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
 
 
 def conclude(found: Found, report: Callable[[str], None] = lambda line: None) -> Answer:
-    """The answer that is known by now. An audit that was stopped measures the gain of what it has, if the time that is
-    kept for this suffices; all else that it does here takes no more than a few rollouts."""
+    """The answer from the present results. A stopped audit measures the gain of its present extension if the reserved
+    time suffices; the other work takes only a few rollouts.
+    """
     problem, clock = found.problem, found.reached.target.forward.deadline
     stopped = clock.reached
     kept = found.kept or _kept_in_time(found, clock)
@@ -360,8 +359,9 @@ def conclude(found: Found, report: Callable[[str], None] = lambda line: None) ->
 
 
 def _kept_in_time(found: Found, clock: Deadline) -> Kept:
-    """Of an audit that was stopped: the base model with the best that was named so far, its joint test, and the gain
-    on unseen recordings where the time that is kept for it suffices."""
+    """Result of a stopped audit: the base model with the best named causes so far, its joint test, and the gain on
+    unseen recordings if the reserved time suffices.
+    """
     named = found.named
     if named is None:
         target, base = _settled(found.reached, clock)
@@ -383,7 +383,7 @@ def _settled(reached: Reached, clock: Deadline) -> tuple[FitTarget, Fit]:
 
 
 def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
-    """The verdict on what was named, whatever has no name; ``ended`` is whether all candidates had their say."""
+    """The verdict on the named causes alone; ``ended`` is whether all candidates were tested."""
     named, rules = kept.named, problem.rules
     noise, members = named.judge.measured.noise, [len(step.members) for step in named.steps]
     gain = Validation.of_steps(kept.held_out, len(named.steps)).gain
@@ -395,21 +395,22 @@ def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
 
 
 def _named(begun: Named) -> Iterator[Named]:
-    """Named causes; asked once more where the noise is that of residuals.
+    """Named causes; the search is repeated if the noise comes from residuals.
 
-    What the base model lacks may drive its fit to a corner of the priors where motion is rough, and no climb ends.
-    Causes are asked for all the same. The noise of a base model's residuals holds the discrepancy itself, and whitens
-    away what would tell its causes apart: so the whole question is asked again under the noise that the first
-    extension leaves.
+    A missing effect may drive the base fit to a corner of the priors with rough motion, in which no optimisation
+    converges. Causes are searched nevertheless. Noise from a base model's residuals includes the discrepancy, and
+    whitening hides its causes: the search is therefore repeated with noise from the first extension's residuals.
     """
     first = begun
     for named in name_causes(begun.search, begun.base):
         first = named
         yield first
     target = first.search.target
-    if not first.steps or target.noise.source != RESIDUALS:
+    if not first.steps or target.measured.noise.source not in (RESIDUALS, INNOVATIONS):
         return
-    target = replace(target, noise=residual_noise(first.judge, first.fit))
+    target = replace(target.measured, noise=residual_noise(first.judge, first.fit))
+    if target.noise.source == INNOVATIONS:  # as far off as before
+        return
     begun.search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
     *_, again = name_causes(begun.search.under(target), climb(target, first.base.x, first.base.free))
     yield again
@@ -425,13 +426,13 @@ def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProbl
 
 
 def _noise(noise: Autoregression) -> str:
-    """What a line of words says of a noise."""
+    """Phrase about a noise for progress reports."""
     shared = "" if noise.correlation is None else ", shared between coordinates"
     return f"noise from {noise.source}, AR({noise.order}){shared}"
 
 
 def _far_off(target: FitTarget, fit: Fit) -> str:
-    """What a line of words says of a model that is far off."""
+    """Phrase about a misspecified model for progress reports."""
     if target.known is None:
         return ""
     noise, own = target.noise.first.scale, target.measurements.columns[0]
@@ -451,7 +452,7 @@ def _final_screen(last: Named) -> Screen:
 
 
 def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
-    """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
+    """Noise fitted to the base model's residuals, if the model passes under it but not under the stated noise."""
     known = search.target.measured
     if known.noise.source != STATED:
         return None

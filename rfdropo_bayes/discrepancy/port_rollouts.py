@@ -1,4 +1,4 @@
-"""Rollouts with laws at ports whose coefficients are coordinates beside those of the simulator.
+"""Rollouts with laws at ports whose coefficients are further coordinates beside the simulator's.
 
 One compiled simulator serves all laws: their signals are computed outside and handed over with the commands.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Fields, Forward, Lanes, Points
 from rfdropo_bayes.discrepancy.journal import digest
@@ -31,17 +31,17 @@ from rfdropo_bayes.simulators.robot_simulator import PASSES, RobotSimulator
 
 Signals = Float[np.ndarray, "lane row"]
 PREFIX = "law_"
-"""Of the names of coefficients."""
+"""Prefix of the names of coefficients."""
 STEP = 1e-4
-"""Prior deviations of a one-sided difference: rounding of 1e-13 m then errs by 1e-9 m a deviation."""
+"""Step of a forward difference in prior deviations: rounding of 1e-13 m then errs by 1e-9 m a deviation."""
 COARSE = 0.03
-"""The same where the engine is in single precision, whose rounding is 1e-5 m, or moves roughly."""
+"""The same for an engine in single precision, whose rounding is 1e-5 m, or with rough motion."""
 FINE = 1e-5
 """Relative steps of an engine's own differences, up to which it counts as smooth."""
 
 
 class Scope(NamedTuple):
-    """The recordings in which a law acts: those of one group, or all where ``group`` is empty."""
+    """The recordings in which a law acts: one group's, or all if ``group`` is empty."""
 
     group: str = ""
     recordings: tuple[str, ...] = ()
@@ -55,8 +55,9 @@ EVERYWHERE = Scope()
 
 
 class PlacedTerm(NamedTuple):
-    """A term of a law: the port, the feature, its coefficient, its shape where that is a parameter, too, and the
-    recordings in which it acts."""
+    """A term of a law: the port, the feature, its coefficient, its shape if that is also a parameter, and the
+    recordings in which it acts.
+    """
 
     port: Port
     feature: Feature
@@ -84,7 +85,7 @@ class FeatureTable:
 
     Args:
         lanes: the simulator.
-        features: all of time and commands that may be asked for; of the motion it has what a body can carry.
+        features: all features of time and commands; features of motion are added if the body supports them.
     """
 
     def __init__(self, lanes: Lanes, features: Sequence[Feature]) -> None:
@@ -161,7 +162,7 @@ class FeatureTable:
     def over(
         self, levels: Float[np.ndarray, "lane row channel"], chosen: Sequence[Feature] | None = None
     ) -> Float[np.ndarray, "lane feature row"]:
-        """Features, all by default; those of lanes with the same commands are computed once."""
+        """Features, all by default; computed once for lanes with the same commands."""
         once, again = distinct([levels])
         found = in_chunks(lambda own: self._values(*own), (levels[once],), chunk_sizes(self.lanes.width))
         places = slice(None) if chosen is None else [self.features.index(feature) for feature in chosen]
@@ -179,11 +180,11 @@ def _sensed(port: Port, w: jax.Array, position: jax.Array, time: jax.Array) -> j
 
 
 def signals_of(ports: PortMap, acting: Sequence[tuple[Port, Signals]]) -> Any:
-    """Signals at ports of actuation and of the body together; None where there are none."""
+    """Signals at ports of actuation and of the body together; None if there are none."""
     given = [(port, w) for port, w in acting if port.stage != "sensing"]
     if not given:
         return None
-    # Ports are hashable without the mapping of what is left out.
+    # Ports are hashable without the mapping of excluded ports.
     plain = ports._replace(left_out=())  # type: ignore[arg-type]
     found = [_port_signals(plain, port, w) for port, w in given]
     return jax.tree.map(lambda *parts: np.sum([np.asarray(part) for part in parts], axis=0), *found)
@@ -211,8 +212,8 @@ class PortedForward(Forward):
 
     Args:
         forward: without them.
-        ports: of the simulator.
-        table: that has the features of the laws.
+        ports: ports of the simulator.
+        table: table of the laws' features.
         terms: their coefficients, which become the last coordinates.
     """
 
@@ -225,7 +226,7 @@ class PortedForward(Forward):
 
     @cached_property
     def identity(self) -> str:
-        """Digest of what rollouts depend on."""
+        """Digest of the inputs of rollouts."""
         own = self.coordinates
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
         terms = [(t.port.name, t.feature, t.specs, t.scope.has(self.recordings).tolist()) for t in self.terms]
@@ -318,14 +319,14 @@ def with_laws_of(own: Forward, forward: Forward) -> Forward:
 def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
     """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
     specs = [spec for term in terms for spec in term.specs]
-    added = build_space(specs, {spec.name: {} for spec in specs}, {}, ())
+    added = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ())
     return coordinates.with_further(added)
 
 
 def placed(
     port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str, scope: Scope = EVERYWHERE
 ) -> PlacedTerm:
-    """A term whose coefficient has a prior of so many sizes of its port over the feature's own size."""
+    """A term whose coefficient has the prior scale ``size`` times the port's size over the feature's size."""
     scale = float(f"{SPREAD * port.size / max(size, 1e-300):.3g}")
     name = coefficient_name(port, feature, channels, scope.group)
     words = f"of the law at {port.words}: it changes {feature.words(channels)}"

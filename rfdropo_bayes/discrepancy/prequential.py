@@ -81,7 +81,7 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
     Args:
         found: the scores.
         markers: names, three channels each.
-        level: of the p-values, shared by all blocks.
+        level: level of the p-values, shared by all blocks.
     """
     failing = np.flatnonzero(found.p <= level / len(found.p))
     if len(failing) == 0:

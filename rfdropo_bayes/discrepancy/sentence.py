@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, REPEATS, STATED
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.deadline import INTERRUPT
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, TOLD_APART
@@ -24,7 +24,7 @@ MOST_SIZES = 4
 
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
-    """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
+    """Findings, explained share of the discrepancy, excluded causes, and residual."""
     words = (
         _words(answer, findings)
         + ports_sentence(answer)
@@ -42,7 +42,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 
 def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
-    """What two groups of recordings have in common, where they are compared."""
+    """Common part of two compared groups of recordings."""
     groups = answer.problem.compared
     if groups is None or answer.verdict == NO_VERDICT:
         return ""
@@ -62,13 +62,13 @@ def _left_out(answer: Answer) -> str:
 
 
 def _stopped(answer: Answer) -> str:
-    """What is said of an audit that was stopped: why, and what was not done."""
+    """Note on a stopped audit: the reason, and the unfinished parts."""
     cost = answer.cost
     if not cost.stopped:
         return ""
     left = f" Not done: {'; '.join(map(spoken, cost.left))}." if cost.left else ""
     if cost.stopped == INTERRUPT:
-        return f" The audit was stopped after {cost.seconds:.0f} s: this is what is known by then.{left}"
+        return f" The audit was stopped after {cost.seconds:.0f} s: these are its results so far.{left}"
     minutes, waited = answer.problem.rules.minutes, round(cost.waited / 60.0)
     busy = f" For {waited} of them the audit waited for processors that other programs held." if waited else ""
     return (
@@ -78,12 +78,12 @@ def _stopped(answer: Answer) -> str:
 
 
 def _unfitted_alone(answer: Answer) -> str:
-    """What is said where the base model could be fitted with what it lacks only."""
+    """Note if the base model could be fitted only with the missing effects."""
     if answer.base.converged or not answer.causes.steps:
         return ""
     return (
-        " The fit of the base model alone has not converged: a better one may leave less, and what was found then "
-        "explains less."
+        " The fit of the base model alone has not converged: a better fit may leave smaller residuals, "
+        "and the findings then explain less."
     )
 
 
@@ -109,23 +109,24 @@ def _shifted(answer: Answer) -> str:
 
 
 def _decided(answer: Answer) -> str:
-    """What is said of findings beside which a prior decides a parameter of the base model."""
+    """Note on findings while a prior determines a parameter of the base model."""
     return in_words(answer.doubts.priors) if answer.causes.steps else ""
 
 
 def _numerical(answer: Answer) -> str:
-    """What is said of a simulation that half the time step changes by more than the noise."""
+    """Note on a simulation that changes by more than the noise with half the time step."""
     error, noise = answer.doubts.numerical, noise_distance(answer.target.noise.first)
     if error is None or error <= noise:
         return ""
     return (
-        f" Half the time step and a finer mesh move the last model's markers by {1e3 * error:.2g} mm, the noise by "
-        f"{1e3 * noise:.2g} mm: what is found may stand for an error of the simulation; shorten [simulator] time_step."
+        f" Half the time step and a finer mesh move the last model's markers by {1e3 * error:.2g} mm, the "
+        f"noise by {1e3 * noise:.2g} mm: the findings may reflect an error of the simulation; shorten "
+        "[simulator] time_step."
     )
 
 
 def _beginning(answer: Answer) -> str:
-    """What is asked where the base model fails in the first block of rows alone."""
+    """Question to the user if the base model fails in the first block of rows only."""
     if answer.verdict == NO_DISCREPANCY or not answer.converged:
         return ""
     found = prequential(answer.target, answer.base)
@@ -143,22 +144,22 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         return _unconverged(answer, findings)
     if answer.verdict == NO_DISCREPANCY:
         return (
-            f"No discrepancy: what the base model leaves is noise as far as these data can tell "
-            f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
+            "No discrepancy: the base model's residuals are consistent with noise in these data (joint "
+            f"test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
         )
     if not findings and answer.causes.screens[0].omnibus.p > answer.problem.rules.base_passes:
         distance = 1e3 * noise_distance(answer.target.noise.first)
         return (
-            f"What the base model leaves, {distance:.2g} mm, changes too slowly to be the noise of a measurement, but "
-            f"without repeats it cannot be told from noise, and no candidate stands out of it "
-            f"(joint test p {_p(answer)})."
+            f"The base model's residuals, {distance:.2g} mm, change too slowly to be measurement noise, "
+            "but without repeats they cannot be distinguished from noise, and no candidate is "
+            f"significant (joint test p {_p(answer)})."
         )
     if not findings and answer.verdict == NO_VERDICT:
         wrong = f"Something is wrong with the base model (joint test p {_p(answer)})"
         return f"{wrong}; {_leading(answer)}."
     if not findings:
-        tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
-        asked = "no candidate of the library says what" if answer.problem.candidates else "no candidate was asked"
+        tail = f"the residual has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
+        asked = "no candidate of the library explains it" if answer.problem.candidates else "no candidate was asked"
         return f"Something is wrong with the base model, and {asked}: {tail}."
     named = " and ".join(_named(finding) for finding in findings)
     gain = answer.validation.gain
@@ -169,8 +170,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if unclear(answer.problem.rules, gain):
         verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
         head = (
-            f"{named} {verb} named, but unseen recordings do not say how much of the discrepancy that explains "
-            f"([{low:.0f}, {high:.0f}] %); they are {likelier}likelier with it"
+            f"{named} {verb} named, but unseen recordings do not determine the explained share of the "
+            f"discrepancy ([{low:.0f}, {high:.0f}] %); they are {likelier}likelier with it"
         )
     elif gain.worse:
         worse = "unseen recordings are predicted worse"
@@ -194,7 +195,9 @@ def _base_error(answer: Answer) -> str:
 
 
 def _leading(answer: Answer) -> str:
-    """The candidates that stand out so far: refitted ones with what they bring, or else those of the screen."""
+    """The candidates that stand out so far: refitted candidates with their Bayes factors, or else the leading rows of
+    the score tests.
+    """
     refits = sorted(answer.causes.refits.items(), key=lambda entry: -entry[1])[:MOST_EXCLUDED]
     if refits:
         brings = ", ".join(f"{spoken(name)} {gained:.0f} nats" for name, gained in refits)
@@ -208,7 +211,7 @@ def _leading(answer: Answer) -> str:
 
 
 def _unconverged(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
-    """What is said if the last fit has not converged."""
+    """Note if the last fit has not converged."""
     left = answer.extended.residual
     squares = f"sum of squares {left @ left:.3g} for {np.count_nonzero(left)} values, and better points beside it"
     remedy = "Start from a calibration with --from, narrow the priors, or shorten [simulator] time_step."
@@ -226,7 +229,7 @@ def _errors(gain: Gain) -> str:
 
 
 def _small(answer: Answer) -> str:
-    """What is said of a discrepancy that is sure, and too small to matter."""
+    """Note on a significant discrepancy that is too small to matter."""
     size, noise = answer.remainder.amplitude * np.sqrt(3.0), noise_distance(answer.target.noise.first)
     limit, numerical = answer.problem.rules.matters, answer.doubts.numerical
     beside = f"the noise is {1e3 * noise:.2g} mm"
@@ -241,15 +244,17 @@ def _small(answer: Answer) -> str:
 
 
 def _invisible(answer: Answer) -> str:
-    """Candidates that could be there all the same, as nothing that was measured shows them."""
+    """Candidates that remain possible because the measurements cannot show them."""
     names = [
-        row.name.replace("_", " ") for row in answer.causes.screens[0].rows if row.probe is None and "@" not in row.name
+        row.name.replace("_", " ")
+        for row in answer.causes.screens[0].rows
+        if row.probe is None and not answer.problem.group_of(row.name)
     ]
     if not names:
         return ""
     which = ", ".join(names[:MOST_EXCLUDED]) + (" ..." if len(names) > MOST_EXCLUDED else "")
     data = " and ".join(name.replace("_", " ") for name in answer.target.measurements.names_of_channels)
-    return f" What was measured ({data}) cannot show {which}."
+    return f" The measured data ({data}) cannot show {which}."
 
 
 def _p(answer: Answer) -> str:
@@ -257,7 +262,7 @@ def _p(answer: Answer) -> str:
 
 
 def _adoption(answer: Answer) -> str:
-    """What of the findings joins the model for good."""
+    """Note on the adopted findings."""
     gain = answer.validation.gain
     if not answer.adopted and gain is not None and gain.opposed and not gain.worse:
         worst, found = min(gain.against.items(), key=lambda item: item[1].elpd)
@@ -267,7 +272,7 @@ def _adoption(answer: Answer) -> str:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
     if answer.causes.unsupported:
         names = " and ".join(map(spoken, answer.causes.unsupported))
-        return f" The fitted recordings asked for {names}, too, which unseen ones do not support: not adopted."
+        return f" The fitted recordings also asked for {names}, which unseen recordings do not support: not adopted."
     return ""
 
 
@@ -275,21 +280,19 @@ def _named(finding: dict[str, Any]) -> str:
     name = finding["mechanism"].replace("_", " ") + (f" in {finding['group']}" if finding["group"] else "")
     if finding["mechanism"] == DISCRETISATION:
         return "the coarse mesh or time step"
-    # Where cables leave the common scale of forces and stiffness free, only the ratio means something.
+    # If cables leave the common scale of forces and stiffness free, only the ratio has a meaning.
     ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
     given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
     surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
-    sizes = ", ".join(
-        _size(title.replace(f"@{finding['group']}", ""), row) for title, row in given if (title, row) in surest
-    )
+    sizes = ", ".join(_size(row) for title, row in given if (title, row) in surest)
     others = [spoken(other) for other in finding["equivalence_class"][1:]]
     alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
     return f"{name} ({sizes}){alike}"
 
 
-def _size(name: str, row: dict[str, Any]) -> str:
+def _size(row: dict[str, Any]) -> str:
     unit = "" if row["unit"] == "-" else f" {row['unit']}"
-    return f"{spoken(name)} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
+    return f"{spoken(row['title'])} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
 
 
 def _excluded(answer: Answer) -> str:
@@ -312,7 +315,7 @@ def _only_noise(answer: Answer) -> bool:
 
 
 def _pattern(answer: Answer) -> str:
-    """What the joint test says of an extended model that does not pass it."""
+    """Result of the joint test of an extended model that fails it."""
     rules, last = answer.problem.rules, answer.causes.screens[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
     sure = last <= rules.base_passes and not _only_noise(answer)
@@ -340,8 +343,11 @@ def _assumption(answer: Answer) -> str:
     if source == REPEATS:
         return ""
     if source == STATED:
-        return "; the noise is what the experiment file states"
-    words = "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"
+        return "; the noise is as stated in the experiment file"
+    taken = "an autoregression fitted to the residuals themselves"
+    if source == INNOVATIONS:
+        taken = "that part of the residuals which the rows before do not predict"
+    words = f"; without repeats the noise is an assumption, {taken}"
     if apart := answer.target.measurements.apart:
         which = ", ".join(apart[:MOST_EXCLUDED]) + (" ..." if len(apart) > MOST_EXCLUDED else "")
         words += (

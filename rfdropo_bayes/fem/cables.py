@@ -1,12 +1,11 @@
 """Displacement-driven cables that can pull but not push, through guides on the sections of a rod.
 
-A cable runs straight from a fixed anchor through guide points of the body to the last of them, where it is tied. Its
+A cable runs straight from a fixed anchor through guide points of the body to the last guide, to which it is tied. Its
 length may not exceed the commanded one; tension and slack are complementary (Signorini's condition, which
 ``fem.constraints`` solves).
 
-Guides have a size: they meet before the way between two of them has no length. A way shorter than ``ROUND`` of its
-length at rest counts as longer, by a smooth law: its direction is defined, and its tension has a limit to what it
-holds.
+Guides have a size: they touch before the segment between them has zero length. A segment shorter than ``ROUND`` of its
+rest length counts as longer, by a smooth law, which keeps its direction defined and its stiffness bounded.
 """
 
 from __future__ import annotations
@@ -26,8 +25,9 @@ from rfdropo_bayes.fem.components import Matrix, Vector, cross, dot, skew, times
 from rfdropo_bayes.fem.rod import Rod, attach
 
 ROUND = 0.25
-"""Share of its length at rest below which a way counts as longer. ASSUMED: linear necks that cables press so close
-together stand for discs that touch; with half of it, a step of 10 ms passes through where discs would stop."""
+"""Share of its rest length below which a segment counts as longer. ASSUMED: necks compressed this far stand for
+touching discs; with half of it, a step of 10 ms passes through the contact.
+"""
 TINY = 1e-30
 """[m2] Keeps the derivative of a way without length finite."""
 
@@ -98,7 +98,7 @@ def routed(
     for cable, points in enumerate(guides):
         points = np.asarray(points, dtype=float).reshape(-1, 3)
         if len(points) == 0:
-            raise InputError("no guide point", where=f"cable {cable}", remedy="give the point where it is tied")
+            raise InputError("no guide point", where=f"cable {cable}", remedy="give the point to which it is tied")
         steps = np.linalg.norm(np.diff(np.concatenate([anchors[cable : cable + 1], points]), axis=0), axis=1)
         if not np.all(steps > 1e-9):
             raise InputError("two successive points coincide", where=f"cable {cable}", remedy="remove one of them")
@@ -126,10 +126,10 @@ class Threads(NamedTuple):
 
 
 class Courses(NamedTuple):
-    """Where cables run."""
+    """Courses of cables."""
 
-    length: Float[Array, "cables guides ..."]  # from the point before to each guide [m]; zero where unused
-    direction: Float[Array, "3 cables guides ..."]  # derivative of that by the guide's place, zero where unused
+    length: Float[Array, "cables guides ..."]  # from the previous point to each guide [m]; zero if unused
+    direction: Float[Array, "3 cables guides ..."]  # its derivative by the guide's place, zero if unused
     inverse: Float[Array, "cables guides ..."]  # its second derivative is inverse - sharp * direction direction' [1/m]
     sharp: Float[Array, "cables guides ..."]
     lever: Float[Array, "3 cables guides sides ..."]  # of the guides, in space [m]
@@ -149,8 +149,9 @@ def _sides(layout: CableLayout) -> int:
 
 
 def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"]:
-    """Stations of the guides. Cables that share those of their guides, which most do, are told by a first axis of one:
-    then fewer parts are gathered."""
+    """Stations of the guides. Cables that share the stations of their guides, as most do, have a first axis of length
+    1, so that fewer parts are gathered.
+    """
     station = layout.station[:, :, : _sides(layout)]
     if not len(station):
         return station
@@ -162,7 +163,8 @@ def _stations(layout: CableLayout) -> Int[np.ndarray, "cables_or_1 guides sides"
 def _gathered(values: Float[Array, "k n ..."], index: Int[np.ndarray, " m"]) -> Float[Array, "m k ..."]:
     """Parts of the second axis, which becomes the first.
 
-    On lanes a loop copies long rows. Without, a product with ones and zeros is quick in both modes of differentiation.
+    On lanes a loop copies long rows. Without lanes, a product with a 0-1 matrix is fast in both modes of
+    differentiation.
     """
     if values.ndim == 2:
         return (index[:, None] == np.arange(values.shape[1])).astype(float) @ values.T
@@ -177,7 +179,7 @@ def threads(layout: CableLayout) -> Threads:
 
 
 def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matrix) -> Courses:
-    """Where the cables run, from the places and frames of the stations."""
+    """Courses of the cables, from the places and frames of the stations."""
     index, lanes = _stations(layout), position.shape[2:]
     parts = _gathered(jnp.concatenate([position, frame.reshape(9, *frame.shape[2:])]), index.ravel())
     parts = jnp.moveaxis(parts, 0, 1).reshape(12, *index.shape, *lanes)
@@ -238,7 +240,7 @@ def _at_stations(
     bound: Bool[np.ndarray, "guides sides"],
     stations: int,
 ) -> Float[Array, "stations k ..."]:
-    """Sums over what is bound to each station."""
+    """Sums over the parts bound to each station."""
     flat = parts.reshape(len(parts), -1, *parts.shape[3:])
     flat = jnp.concatenate([flat, jnp.zeros_like(flat[:, :1])], axis=1)
     index = _entries(station.ravel(), bound.ravel(), stations)
@@ -246,7 +248,7 @@ def _at_stations(
 
 
 class Held(NamedTuple):
-    """How taut cables hold the ends of elements: forces and moments of changes of strain times length, in space."""
+    """Stiffness of taut cables at the ends of elements: forces and moments per strain times length, in space."""
 
     force: Matrix  # by stretch and shear [N/m]
     mixed: Matrix  # force by bending and twist [N]
@@ -258,9 +260,11 @@ def _outer(a: Vector, b: Vector) -> Matrix:
 
 
 def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ..."], elements: int) -> Held:
-    """What the cables at a tension [N] hold: P of the change of every way, with P its length's second derivative.
+    """Stiffness of the cables at a tension [N]: P times the change of every segment, with P the second derivative of
+    its length.
 
-    With what the rod's force does as its sections turn, that is the exact tangent of a body that only cables load.
+    Together with the rod's forces that turn with its sections, this is the exact tangent of a body loaded by cables
+    only.
     """
     offset = sum((course.lever[:, :, :, side] for side in range(1, course.lever.shape[3])), course.lever[:, :, :, 0])
     before = jnp.concatenate([offset[:, :, :1], offset[:, :, :-1]], axis=2)

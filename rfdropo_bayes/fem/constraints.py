@@ -231,7 +231,7 @@ def solve_constraints(
             its opening and sliding, without the gap.
         previous: impulses of the cables, the start of the iterations [N s].
         time_step: h [s].
-        give: of every cable's length per tension, over the time step squared [1/kg].
+        give: compliance of every cable's length per tension, over the time step squared [1/kg].
     """
     cables = len(previous)
     compliance = compliance.at[jnp.arange(cables), jnp.arange(cables)].add(give)

@@ -3,9 +3,9 @@
     A d = q (f(x) + m g + f_ext - r K v - a M v - gyro) + q J' T,    A = (1 + q a) M + q (q + b) K,    v1 = v + d
 
 for velocities and spins, with lumped mass and rotary inertia M, Rayleigh damping a M + b K, the tangent K of the
-elements (``rod_elements``), cable Jacobian J and tensions T >= 0. Implicit Euler takes its forces where the step
-starts, with q = h and r = h + b; SDIRK2 where the velocity leads, r = b, see ``integrators``. What ``effects`` add is
-implicit in the same way: their force, linearised, at the end of the stage. Everything is a pure function of arrays:
+elements (``rod_elements``), cable Jacobian J and tensions T >= 0. Implicit Euler takes its forces at the start of the
+step, with q = h and r = h + b; SDIRK2 at the position predicted by the velocity, r = b, see ``integrators``. Forces of
+``effects`` are implicit in the same way: linearised at the end of the stage. Everything is a pure function of arrays:
 batch with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad`` (``stage_solve``). A ``System`` is static and is
 closed over, never traced.
 """
@@ -42,7 +42,7 @@ LOST = 3.0
 
 
 class System(NamedTuple):
-    """What does not change between rollouts: body, cables, and how many stations are held, from the first one on."""
+    """Constants of all rollouts: body, cables, and number of held stations, from the first."""
 
     body: Rod
     cables: CableLayout
@@ -65,7 +65,7 @@ class Material(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What is computed once a rollout."""
+    """Quantities computed once per rollout."""
 
     section: Sections
     mass: Float[Array, " stations"]  # [kg]
@@ -98,7 +98,7 @@ class State(NamedTuple):
 
 
 class StepInfo(NamedTuple):
-    """How a step went."""
+    """Diagnostics of a step."""
 
     diverged: Bool[Array, ""]  # the step was not finite, or left the body's surroundings, and was not taken
     converged: Bool[Array, ""]  # whether the impulses of all constraints were found
@@ -218,7 +218,7 @@ def remembering(
 
 
 class Carried(NamedTuple):
-    """What the stage before did, with a share of which the motion goes on; nothing before the first stage."""
+    """Changes in the previous stage, a share of which is carried on; zero before the first stage."""
 
     velocity: Float[Array, "stations 6"]  # change of velocities and spins in it
     sudden: Float[Array, "stations 6"]  # impacts in it [N s], [N m s]: no share of them
@@ -240,7 +240,7 @@ def within(system: System, prepared: Prepared, state: State, time_step: Scalar, 
 
     The strain q of a Prony branch's dashpot follows q' = (u - q) / tau as the velocity follows the forces. In implicit
     Euler its force at the end of a step is gamma K (u - q) with gamma = fraction tau / (tau + h) and q of the start
-    (Simo and Hughes 1998, Computational Inelasticity, ch. 10). It follows when the place it follows to is known.
+    (Simo and Hughes 1998, Computational Inelasticity, ch. 10). It is updated once u is known.
     """
     memory = state.memory
     if memory.branch is not None:
@@ -252,7 +252,7 @@ def within(system: System, prepared: Prepared, state: State, time_step: Scalar, 
 
 
 def firm(prepared: Prepared, memory: Memory) -> Sections:
-    """The sections with what softening and ``section_loads`` make of their stiffness."""
+    """The sections with their stiffness after softening and ``section_loads``."""
     section, left = prepared.section, None
     if prepared.effects.softening_rate is not None and memory.clock is not None:
         left = jnp.exp(-prepared.effects.softening_rate * memory.clock)
@@ -272,7 +272,9 @@ def stage_body(
     stage: Stage = EULER,
     carried: Carried | None = None,
 ) -> StageBody:
-    """What a stage linearises: the body, its effects and its surroundings at a state, with the memory of the stage."""
+    """The system that a stage linearises: the body, its effects and its surroundings at a state, with the memory of the
+    stage.
+    """
     length, memory = stage.span * time_step, state.memory
     gain = _gain(prepared, stage.length * time_step)[1]
     lookahead = length * (1.0 + gain) + prepared.rayleigh_stiffness
@@ -322,8 +324,8 @@ def step(
     """One time step to the commanded cable displacements [m] (pull > 0) at its end.
 
     ``external_force`` are forces [N] and moments [N m] on the stations throughout the step. With a ``scene`` and a
-    ``cube`` the body touches them; the state says where the cube is. A step that is not finite leaves everything where
-    it was, at rest and without tension, and says so: a batch goes on. With a scene, effects that have a memory, or
+    ``cube`` the body touches them; the state has the cube's pose. A step that is not finite keeps the old positions, at
+    rest and without tension, and is reported, so that a batch continues. With a scene, effects that have a memory, or
     several stages a step, the state comes from ``remembering``.
     """
     take = partial(take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
@@ -336,9 +338,9 @@ def in_stages(
     displacement: Float[Array, " cables"],
     stages: Sequence[Stage],
 ) -> tuple[State, StepInfo]:
-    """A step, given how a stage is taken; commands within the step lie on the way to those at its end.
+    """A step made of stages; commands within the step are interpolated to the commands at its end.
 
-    Several stages are one loop, compiled once: before the first, nothing is carried on.
+    Several stages are one loop, compiled once: nothing is carried into the first.
     """
     if len(stages) == 1:
         return take(state, displacement, stages[0], None)[:2]
@@ -369,9 +371,9 @@ def _nothing_carried(state: State) -> Carried:
 
 
 class StageBegun(NamedTuple):
-    """What a stage solves, before its constraints."""
+    """The linear system of a stage, before its constraints."""
 
-    at: State  # where forces are taken, with the memory of the stage
+    at: State  # state at which forces are taken, with the memory of the stage
     push: Push | None
     stage: Stage  # made longer by impacts
     body: StageBody
@@ -389,7 +391,7 @@ def begin_stage(
     scene: PushGeometry | None = None,
     cube: Cube | None = None,
 ) -> StageBegun:
-    """Where a stage that starts from a state takes its forces; ``carried`` is of the stage before."""
+    """Evaluate the forces of a stage that starts from a state; ``carried`` is from the previous stage."""
     at = state._replace(memory=within(system, prepared, state, time_step, stage))
     if stage.predicted:
         at = displaced(at, stage.elapsed * time_step * twist_of(state))
@@ -500,7 +502,7 @@ def _carried_from(
     sudden_twist: Float[Array, "6"] | None,
     info: StepInfo,
 ) -> Carried:
-    """What a stage that was taken did; nothing if it was not."""
+    """Changes of an accepted stage; zero if it was rejected."""
     twist = slip = None
     if before.cube is not None and after.cube is not None and sudden_twist is not None:
         parts = after.cube.velocity - before.cube.velocity, after.cube.spin - before.cube.spin
@@ -512,7 +514,7 @@ def _carried_from(
 
 
 def accept(system: System, state: State, moved: State, converged: Bool[Array, ""]) -> tuple[State, StepInfo]:
-    """The new state if it is finite and near the body, else the old one at rest."""
+    """The new state if it is finite and near the body, else the old state at rest."""
     station = jnp.asarray(system.body.station)
     away = moved.position - jnp.zeros_like(moved.position).at[:, 2].set(station)
     fine = jnp.max(jnp.abs(away)) < LOST * system.body.length

@@ -1,7 +1,7 @@
-"""Static equilibrium under gravity, external forces and cables: where a rollout starts, and quasi-static motion.
+"""Static equilibrium under gravity, external forces and cables: the start of a rollout, and quasi-static motion.
 
-Newton's method with the tangent and the constraints of a step. What friction of the cables has mobilised goes on from
-the state before, so that its path counts. Derivatives are those of the equations at the solution, with all terms.
+Newton's method with the tangent and the constraints of a step. Mobilised friction of the cables continues from the
+previous state, so that it depends on the path. Derivatives are of the equations at the solution, with all terms.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NO_TIME = Stage(0.0, 1.0, 0.0, True)
 
 
 class EquilibriumInfo(NamedTuple):
-    """How well the body is in equilibrium."""
+    """Quality of an equilibrium."""
 
     residual: Float[Array, ""]  # largest force on a station out of balance / sum of the loads
     converged: Bool[Array, ""]  # the body came to rest, cable problem solved
@@ -46,10 +46,10 @@ class EquilibriumInfo(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What an equilibrium is computed from."""
+    """Inputs of an equilibrium."""
 
     prepared: Prepared
-    start: State  # where the iterations start; the slip of cables counts from there
+    start: State  # start of the iterations; the slip of cables counts from it
     displacement: Float[Array, " cables"]
     external: Float[Array, "stations 6"]
     slip: Slip | None
@@ -108,7 +108,8 @@ def _bonds(system: System, task: Task, place: State, previous: Float[Array, " ca
 
 def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
     """Newton's method. The increments are limited in length, and relaxed more whenever two in a row point against each
-    other, which makes soft bodies far from straight converge, too."""
+    other, so that strongly bent soft bodies also converge.
+    """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     length = system.body.length
 
@@ -145,7 +146,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
 def _unbalanced(
     system: System, task: Task, found: Found, change: Float[Array, "stations 6"], impulse: Float[Array, " rows"]
 ) -> tuple[Float[Array, "6 free"], Float[Array, " rows"]]:
-    """Forces out of balance, and what constraints lack, near an equilibrium."""
+    """Residuals of forces and constraints near an equilibrium."""
     place = displaced(task.start._replace(position=found.position, orientation=found.orientation), change)
     body, cables = _body(system, task, place), len(found.softness)
     bonds = _bonds(system, task, place, found.impulse[:cables])
@@ -204,7 +205,8 @@ def settled(
     the stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
     radians.
 
-    Friction of the cables that the state's memory holds goes on; what flows has relaxed. Needs a clamped station.
+    Friction of the cables continues from the state's memory; viscoelastic effects have relaxed. Needs a clamped
+    station.
     """
     memory, slip = state.memory, None
     if memory.slip is not None and memory.segment is not None:

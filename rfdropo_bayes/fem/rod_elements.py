@@ -1,13 +1,13 @@
 """Geometrically exact rod elements between two stations: strains, their rates, forces and tangent.
 
-Strains are those of Simo and Reissner in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with
-q_v the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
-Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent leaves out the terms with which the
-forces turn. Where guided cables load the rod its forces turn with theirs: what the two leave is the stiffness of taut
-strings between sections, which depends on the strains alone (``cables.held``).
+Strains are Simo and Reissner's in the frame half-way between both sections, (R_m' d / h - e3) and 2 q_v / h with q_v
+the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
+Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent neglects the rotation of the forces. The
+forces of guided cables rotate with the rod's: the sum of both is the stiffness of taut strings between sections, which
+depends on the strains alone (``cables.held``).
 
-An arc is longer than its chord: the stretch of an element is that of its chord, and h^2 / 24 times its squared
-curvature. Without that an element that is pressed together between its ends would be too stiff in bending.
+An arc is longer than its chord: the stretch of an element is its chord's plus h^2 / 24 times its squared curvature.
+Without this term an axially compressed element would be too stiff in bending.
 
 Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
 moment, or velocity and spin, in space.
@@ -107,7 +107,7 @@ def strain_rates(elements: Elements, twist: Six) -> Six:
 
 
 def station_forces(elements: Elements, resultant: Six) -> Six:
-    """Forces and moments on all stations of the sections' forces and moments, those in the elements' frames."""
+    """Forces and moments on all stations from the sections' forces and moments in the elements' frames."""
     force = times(elements.frame, resultant[:3])
     bowed = jnp.concatenate([resultant[3:5] + _bow(elements) * resultant[2], resultant[5:]])
     moment = _less_turn(elements, times(elements.frame, bowed))

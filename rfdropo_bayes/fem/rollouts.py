@@ -120,6 +120,9 @@ def simulate(
     ``time_step`` [s] is the length of a substep. With a ``scene`` and a ``cube`` the body pushes it; ``state.cube`` is
     its initial pose. ``horizon`` as for `roll`. If a step has several stages, ``state.commanded`` are the displacements
     before the first step, zero if None. ``loads`` act in every step.
+
+    Raises:
+        InputError: a scene in quasi-static motion.
     """
     still = integrator == "quasi-static"
     if still and scene is not None:

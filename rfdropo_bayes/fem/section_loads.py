@@ -16,7 +16,7 @@ class SectionLoads(NamedTuple):
     """Signals; row 0 acts on the initial equilibrium, row k during the k-th step.
 
     Attributes:
-        force: on the sections at some stations [N].
+        force: forces on the sections at some stations [N].
         stiffness, damping: logarithms of factors; of the damping both of Rayleigh's coefficients.
         gravity: added to gravity [m/s2].
         station: indices of the stations that forces act on, each once; not batched.

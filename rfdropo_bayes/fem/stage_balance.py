@@ -1,8 +1,8 @@
 """Forces and energies of rollouts of a rod: they are simulated again, stage by stage.
 
-Over a step of two stages the momentum changes by all impulses of the second and by those of the first times
-1 + going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the
-velocities at the ends of the stages add up to the way, so that work is summed by stages.
+Over a step of two stages the momentum changes by all impulses of the second stage and by the first stage's times 1 +
+going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the
+velocities at the ends of the stages add up to the displacement, so that work is summed by stages.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from rfdropo_bayes.fem.stage_solve import Way, inertia_times, linearised, matrix
 class _Done(NamedTuple):
     """Impulses [N s], [N m s] and work [J] of a stage, or of a step."""
 
-    residual: Float[Array, "stations 6"]  # of what holds and touches the body
+    residual: Float[Array, "stations 6"]  # of holding and touching bodies
     held: Float[Array, ""]  # its work
     pulled: Float[Array, ""]  # work of the cables
     lost: Float[Array, ""]  # to Rayleigh damping
 
 
 class _Reached(NamedTuple):
-    """Where a step ends, and what it did."""
+    """End state of a step, and its effects."""
 
     position: Float[Array, "stations 3"]
     done: _Done
@@ -63,7 +63,7 @@ def cable_wrench(system: System, state: State, tension: Float[Array, " cables"])
 
 
 def _done(system: System, prepared: Prepared, before: State, after: State, begun: StageBegun, length: Scalar) -> _Done:
-    """What a stage did, of this length [s]."""
+    """Effects of a stage of this length [s]."""
     body, twist = begun.body, twist_of(after)
     way = Way(system.clamped_stations, begun.stage.predicted, system.cables)
     line = linearised(way, body, threads(system.cables), begun.at.tension)
@@ -120,10 +120,10 @@ def stepped_balance(
     """Forces and energies of a rollout of a rod.
 
     Args:
-        state: where it starts, with the commanded displacements before the first step.
-        displacement: commanded at the end of every step [m].
-        integrator: how a step is taken.
-        scene, cube: what the body touches.
+        state: initial state, with the commanded displacements before the first step.
+        displacement: commanded displacement at the end of every step [m].
+        integrator: scheme of a step.
+        scene, cube: bodies in contact.
 
     Raises:
         InputError: cables with friction.

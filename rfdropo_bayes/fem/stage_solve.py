@@ -4,9 +4,9 @@ A stage finds the change d of velocities and spins, and the impulses g of all co
 
     A d = r + J' g,    g = P(J (v + d) + b)
 
-Everything dear runs on lanes of a batch (``lanes``). A derivative is one more right-hand side of the system that is
-factorised already: that of what the equations lack when the inputs change and the solution does not, which needs no
-matrix. In reverse it is the transposed system's.
+All expensive operations run on lanes of a batch (``lanes``). A derivative is one more right-hand side of the factorised
+system: the residual of the equations when the inputs change and the solution does not, which needs no matrix. Reverse
+mode uses the transposed system.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class StageBody(NamedTuple):
     section: Sections
     mass: Float[Array, "stations ..."]  # [kg]
     inertia: Float[Array, "3 stations ..."]  # about the sections' axes [kg m2]
-    position: Vector  # where forces are taken [m]
+    position: Vector  # points at which forces are taken [m]
     orientation: Quaternion
-    twist: Six  # velocities and spins where the stage starts
+    twist: Six  # velocities and spins at the start of the stage
     load: Six  # forces and moments besides [N], [N m]
     span: Scalar  # p [s]
     lookahead: Scalar  # [s] times the tangent times the change of velocity is the change of force
@@ -70,7 +70,7 @@ class Bonds(NamedTuple):
     reach: Float[Array, " cables"]  # commanded lengths [m]
     previous: Float[Array, " cables"]  # impulses that the iterations start from [N s]
     give: Scalar  # of every cable's length per tension [m/N]
-    follows: Scalar  # length of the stage for what has a memory [s]
+    follows: Scalar  # length of the stage for variables with memory [s]
     rows: Float[Array, "stations 6 others"] | None = None  # of friction and contacts
     base: Float[Array, " others"] | None = None  # velocities in these rows besides the body's
     compliance: Float[Array, "others others"] | None = None  # in these rows besides the body's
@@ -79,7 +79,7 @@ class Bonds(NamedTuple):
 
 
 class Way(NamedTuple):
-    """What is static: how many stations are held, whether forces are taken where the velocity leads, and the cables."""
+    """Static settings: number of held stations, whether forces are taken at the predicted position, and the cables."""
 
     held: int
     predicted: bool
@@ -87,9 +87,9 @@ class Way(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Of a stage."""
+    """Solution of a stage."""
 
-    change: Float[Array, "6 stations"]  # of velocities and spins; zero where the body is held
+    change: Float[Array, "6 stations"]  # of velocities and spins; zero at held stations
     impulse: Float[Array, " rows"]  # of all constraints [N s]
     converged: Float[Array, ""]  # 1 if the impulses were found, else 0
 
@@ -106,7 +106,7 @@ class Linearised(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What a derivative of the solution needs."""
+    """Data for derivatives of the solution."""
 
     factor: Factor
     columns: Float[Array, "stations 6 rows"]  # C^-1 J'
@@ -122,7 +122,7 @@ def inertia_times(body: StageBody, frame: Matrix, twist: Six) -> Six:
 
 
 def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array, "cables ..."]) -> Linearised:
-    """The right-hand side of a stage, and what its matrix is made of; at the tensions [N] of the stage before."""
+    """The right-hand side of a stage, and the parts of its matrix, at the tensions [N] of the previous stage."""
     frame = rotation(body.orientation)
     course = courses(way.layout, thread, body.position, frame)
     between = held(way.layout, course, tension, len(body.length))
@@ -185,7 +185,7 @@ def along(rows: Float[Array, "stations 6 rows"], twist: Six) -> Float[Array, " r
 def free_velocities(
     way: Way, body: StageBody, bonds: Bonds, moving: Float[Array, "rows ..."], reached: Float[Array, "cables ..."]
 ) -> Float[Array, "rows ..."]:
-    """b: velocities of the constraints at the start of the stage, cables with what is left of their lengths."""
+    """b: velocities of the constraints at the start of the stage, cables with their remaining lengths."""
     cables = len(reached)
     slack = (bonds.reach - reached) / body.span
     free = slack if way.predicted else moving[:cables] + slack
@@ -240,7 +240,7 @@ def _solve(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Kept]:
 
 
 def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bonds) -> tuple[Array, Array]:
-    """What the equations of a stage lack at a solution, as functions of the inputs."""
+    """Residuals of a stage's equations at a solution, as functions of the inputs."""
     line = linearised(way, body, bonds.thread, bonds.previous / body.span)
     rows, reached = all_rows(way, body, bonds, line.course)
     pulled = jnp.einsum("sir,r->is", rows, found.impulse)

@@ -5,8 +5,8 @@ Other rooms import from here, and the module `methods`; a name's module is loade
 | to find | look in |
 |---|---|
 | the methods by name | `methods` |
-| where SMC starts, how it goes on, how its particles move | `smc.start`, `smc.sampler`, `smc.moves` |
-| where modes are searched | `modes.mode_search` |
+| the start, the stages and the moves of SMC | `smc.start`, `smc.sampler`, `smc.moves` |
+| the search for modes | `modes.mode_search` |
 | RF-DROPO | `rfdropo.phi_search` |
 """
 

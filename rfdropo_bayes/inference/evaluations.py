@@ -116,6 +116,9 @@ def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tu
         blocks: number of blocks wanted; fewer if there are too few rows.
         spacing: ``"geometric"`` doubles (the sum of all prefixes stays below ``2 n_rows``), ``"linear"`` has equal
             blocks.
+
+    Raises:
+        InputError: no row, no block, or an unknown spacing.
     """
     if n_rows < 1 or blocks < 1:
         raise InputError("a schedule needs at least one row and one block", where="[inference] blocks")

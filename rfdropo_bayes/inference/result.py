@@ -171,7 +171,7 @@ def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
     """
     if replicates > 1 and climbs != 1:
         return []
-    alone = "one replicate" if replicates == 1 else "one climb to an optimum"
+    alone = "one replicate" if replicates == 1 else "a single optimisation"
     sentence = (
         f"{alone} cannot show whether other modes of the posterior were lost: allow more rollouts, state "
         "replicates = 4, or compare seeds"

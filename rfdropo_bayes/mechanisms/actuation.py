@@ -7,20 +7,21 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
+from rfdropo_bayes.mechanisms.sizes import USUAL, scaled
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-SPOOL = 0.02  # [m], a usual radius: a prior for metres of cable becomes one for radians of the motor that winds it
-STROKE = 0.03  # [m], a usual pull: what commands in units of their own are measured by
+SPOOL = 0.02  # [m], radius of a usual spool, for motors of which no usual command is known
 POWERS = {"m": 1, "m/s": 1, "1/m": -1, "s/m": -1}  # of a length in each unit
 NUMBERED = tuple(str(k + 1) for k in range(8))
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
 GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)  # of travels to a stop, inverted
-SIZES = ("loc", "scale")  # entries of a prior's table that have the parameter's unit
 
 
 class InCommandUnit:
@@ -29,39 +30,29 @@ class InCommandUnit:
 
     Args:
         unit: unit of the commands.
-        stroke: size of usual commands, if they are neither metres nor radians.
+        usual: size of usual commands, in their unit; a usual trunk's if unknown.
     """
 
     parameters: tuple[ParameterSpec, ...]
     in_metres: ClassVar[tuple[ParameterSpec, ...]]
 
-    def __init__(self, unit: str = "m", stroke: float | None = None) -> None:
-        per_metre = {"m": 1.0, "rad": 1.0 / SPOOL}.get(unit, (stroke or 1.0) / STROKE)
+    def __init__(self, unit: str = "m", usual: float | None = None) -> None:
+        unknown = {"m": USUAL.pull, "rad": USUAL.pull / SPOOL}.get(unit, 1.0)
+        per_metre = (unknown if usual is None else usual) / USUAL.pull
         self.parameters = tuple(in_unit(spec, unit, per_metre) for spec in self.in_metres)
 
     @classmethod
     def for_robot(cls, robot: Robot) -> InCommandUnit:
         """With parameters in the unit that a robot is commanded in."""
-        return cls(robot.command_unit, getattr(robot, "stroke", None))
+        return cls(robot.command_unit, robot.usual_command)
 
 
 def in_unit(spec: ParameterSpec, unit: str, per_metre: float) -> ParameterSpec:
-    """A parameter given for metres of cable, in another unit of commands, with ``per_metre`` units per metre.
-
-    For radians this is a usual spool; for other units, the ratio of usual commands.
+    """A parameter given for metres of cable of a usual trunk, in another unit of commands: ``per_metre`` is the ratio
+    of usual commands.
     """
-    if unit == "m":
-        return spec
-    factor = per_metre ** POWERS[spec.unit]
     word = {"-": "1", "N m": "(N m)"}.get(unit, unit) if "/" in spec.unit else unit
-    return spec._replace(
-        unit=word.join(spec.unit.rsplit("m", 1)),
-        low=factor * spec.low,
-        high=factor * spec.high,
-        nominal=factor * spec.nominal,
-        prior={name: factor * value if name in SIZES else value for name, value in spec.prior.items()},
-        grid=tuple(factor * value for value in spec.grid),
-    )
+    return scaled(spec, per_metre ** POWERS[spec.unit])._replace(unit=word.join(spec.unit.rsplit("m", 1)))
 
 
 def kept_over(time_step: float, time_constant: Float[Array, ""]) -> Float[Array, ""]:
@@ -110,7 +101,7 @@ def _read_late(
 ) -> Float[Array, "*step channel"]:
     """Value of ``read`` by ``late`` steps earlier, not before step 0, linear between steps."""
     at = step - late
-    # Interpolating towards the past keeps the derivative right at zero delay, where only later times count.
+    # Interpolation towards the past keeps the derivative right at zero delay, at which only later times count.
     after = jnp.maximum(jnp.ceil(at), 0).astype(int)
     weight = jnp.where(at > 0, after - at, 0.0)[..., None]
     newer = read(after)
@@ -210,7 +201,7 @@ class CableSlack(InCommandUnit, MemorylessActuation):
     remedy = "tension the cables until each just moves the body, and set zero there"
     in_metres = (
         ParameterSpec(
-            "cable_slack", "m", 0.0, 0.1, 0.0, half_normal(0.001), "command that is lost before a cable is taut"
+            "cable_slack", "m", 0.0, 0.1, 0.0, half_normal(0.003), "command that is lost before a cable is taut"
         ),
     )
 
@@ -242,7 +233,7 @@ class Backlash(InCommandUnit, SteppedActuation):
         """Drag the cable's end along with the drive."""
         half, (lead, last) = values["backlash"], memory
         move = given - last
-        # Written with strict comparisons, so that without play the derivative stays that of the last move.
+        # Strict comparisons keep the derivative of the last move without play.
         ahead = lead + jnp.where(jnp.abs(move) > REST, move, 0.0)
         lead = jnp.where(ahead > half, half, jnp.where(ahead < -half, -half, ahead))
         return (lead, given), given - lead
@@ -423,26 +414,66 @@ class DriveCreep(SteppedActuation):
         return (slow, start), given - values["drive_creep"] * (slow - start)
 
 
-class DriveDrift(InCommandUnit, SteppedActuation):
-    """The zero of all drives moves at a steady rate from the start of the recording; no rate at null."""
+class GuideAzimuth(MemorylessActuation):
+    """Guides of each cable turned about the body's axis by an angle; zero is the base simulator.
 
-    name = "drive_drift"
+    The cable then has the length of one at another azimuth. A body of constant curvature with lengths imposed at the
+    turned azimuths bends as the drawn one does with other lengths, which are a mixture of the commanded lengths.
+
+    Args:
+        channels: names of the command channels; numbers by default.
+        rows: what a unit of each strain of the body (bending about two axes and stretch, of every segment) winds in of
+            each channel, and the same per angle of its cables.
+    """
+
+    name = "guide_azimuth"
     stage = "actuation"
     inside_drive = False
-    cause = "drives or cables that slip, or spools that wind unevenly, so that the zero wanders"
-    remedy = "return to zero at the end of a recording and compare the pose with that at the start"
-    in_metres = (
-        ParameterSpec(
-            "drive_drift", "m/s", -0.1, 0.1, 0.0, normal(0.0005), "rate at which the zero of every drive moves"
-        ),
-    )
+    cause = "guides or channels of a cable that do not sit at the azimuth of the drawing"
+    remedy = "measure the azimuth of the guides of each cable"
 
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Int[Array, ""]:
-        """Number of steps."""
-        return jnp.zeros((), int)
+    def __init__(
+        self,
+        channels: Sequence[str] = (),
+        rows: tuple[Float[np.ndarray, "channel strain"], Float[np.ndarray, "channel strain"]] | None = None,
+    ) -> None:
+        self.rows = rows
+        self.parameters = tuple(
+            ParameterSpec(
+                f"guide_azimuth_error_{channel}", "rad", -1.0, 1.0, 0.0, normal(0.1), f"turn of the guides of {channel}"
+            )
+            for channel in channels
+        )
 
-    def advance(
-        self, values: Values, memory: Int[Array, ""], given: Float[Array, " channel"], now: float
-    ) -> tuple[Int[Array, ""], Float[Array, " channel"]]:
-        """Add the drift to every channel."""
-        return memory + 1, given + values["drive_drift"] * now * (memory + 1)
+    @classmethod
+    def for_robot(cls, robot: Robot) -> GuideAzimuth:
+        """One angle for every channel that drives one cable; no angles if channels share cables."""
+        gain = np.array(robot.channels.gain)
+        if any(np.count_nonzero(line) != 1 for line in (*gain, *gain.T)):
+            return cls()
+        order = [int(np.flatnonzero(column)[0]) for column in gain.T]
+        cables = [robot.cables[index] for index in order]
+        ends = sorted({cable.guide_z_m[-1] for cable in cables})
+        straight, turned = ([_strains(cable, ends, turn) for cable in cables] for turn in (0.0, 0.5 * np.pi))
+        return cls(robot.channel_names, (np.array(straight), np.array(turned)))
+
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Give the lengths at the drawn azimuths that bend the body as the sent ones do at the turned azimuths."""
+        if self.rows is None:
+            return sent
+        straight, turned = self.rows
+        angle = jnp.stack([values[spec.name] for spec in self.parameters])[:, None]
+        stretch = jnp.arange(straight.shape[1]) % 3 == 2
+        rows = jnp.where(stretch, straight, jnp.cos(angle) * straight + jnp.sin(angle) * turned)
+        change = (straight - rows) @ jnp.linalg.pinv(rows)
+        return sent + sent @ change.T
+
+
+def _strains(cable: Cable, ends: Sequence[float], turn: float) -> Float[np.ndarray, " strain"]:
+    """Shortening of a cable by bending about both axes and by stretch of each segment, relative to its length."""
+    azimuth, radius, found, begin = math.radians(cable.azimuth_deg) + turn, cable.guide_radius_m[-1], [], 0.0
+    for end in ends:
+        length = max(min(end, cable.guide_z_m[-1]) - begin, 0.0)
+        found += [length * radius * math.cos(azimuth), length * radius * math.sin(azimuth), length * radius]
+        begin = end
+    return np.array(found)

@@ -20,6 +20,7 @@ from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 AXES = ("x", "y", "z")
+PART = 0.1  # of the length: half the width of a part of the body
 
 
 class Payload:
@@ -81,6 +82,63 @@ class AxialStiffness:
     def embody(self, values: Values, material: Material, body: Rod) -> Material:
         """Scale the stiffness in tension of every layer."""
         return material._replace(axial_scale=material.axial_scale * jnp.exp(values["axial_stiffness"]))
+
+
+class SoftPart:
+    """A part of the body, about a fifth of its length, is softer or stiffer; zero is the base simulator."""
+
+    name = "soft_part"
+    stage = "body"
+    cause = "a cavity, a crack, glue or an insert in a part of the body"
+    remedy = "bend the body by hand and look for the part that bends more or less than its neighbours"
+    parameters = (
+        ParameterSpec("soft_part", "-", -3.0, 3.0, 0.0, normal(0.5), "log ratio of the part's modulus to the others'"),
+        ParameterSpec(
+            "soft_part_place",
+            "-",
+            0.0,
+            1.0,
+            0.5,
+            {"distribution": "Uniform", "low": 0.0, "high": 1.0},
+            "middle of the part, as a share of the length from the clamp",
+            grid=(0.1, 0.3, 0.5, 0.7, 0.9),
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
+        """Scale each element by a bell curve around the part."""
+        middle = 0.5 * (body.station[1:] + body.station[:-1])
+        s = (middle - body.station[0]) / (body.station[-1] - body.station[0])
+        bell = jnp.exp(-(((s - values["soft_part_place"]) / PART) ** 2))
+        return material._replace(stiffness_scale=material.stiffness_scale * jnp.exp(values["soft_part"] * bell))
+
+
+class BaseCompliance:
+    """The clamp gives, as if the first element were softer; zero is the base simulator."""
+
+    name = "base_compliance"
+    stage = "body"
+    cause = "a mount, a glued joint or a printed clamp that bends"
+    remedy = "push at the base and watch whether the clamp turns; stiffen it"
+    parameters = (
+        ParameterSpec(
+            "base_compliance",
+            "-",
+            0.0,
+            10.0,
+            0.0,
+            half_normal(0.1),
+            "compliance of the clamp in bending, relative to that of the whole body",
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: Rod) -> Material:
+        """Soften the first element by the compliance that the clamp adds."""
+        length = np.diff(body.station)
+        moment = body.bending_moment_area.mean(axis=1)
+        share = float(np.sum(length / moment) / (length[0] / moment[0]))
+        factor = 1.0 / (1.0 + values["base_compliance"] * share)
+        return material._replace(stiffness_scale=material.stiffness_scale.at[0].multiply(factor))
 
 
 class BaseTilt:

@@ -145,8 +145,8 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     if robot is None:
         left_out["cables, command delay"] = "the simulator takes no signals"
     else:
-        unit, stroke = getattr(simulator, "command_unit", "m"), getattr(robot, "stroke", None)
-        ports += _of_actuation(channels, unit, stroke, wound=engine is not None)
+        unit = getattr(simulator, "command_unit", "m")
+        ports += _of_actuation(channels, unit, robot.usual_command, wound=engine is not None)
     gravity, places = (0.0, 0.0, 0.0), 0
     if engine is not None and robot is not None and engine.carries_loads:
         places = len(engine.load_stations)
@@ -159,11 +159,11 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     return PortMap(tuple(ports), left_out, len(channels), places, gravity)
 
 
-def _of_actuation(channels: Sequence[str], unit: str, stroke: float | None, *, wound: bool) -> list[Port]:
-    """Ports of drives that wind cables, or of the commands of your own simulator; metres are cable lengths. In units
-    other than metres and radians an effect is scaled by the size of usual commands, ``stroke``.
+def _of_actuation(channels: Sequence[str], unit: str, usual: float | None, *, wound: bool) -> list[Port]:
+    """Ports of drives that wind cables, or of the commands of your own simulator; metres are cable lengths. Effects
+    are scaled by the size of usual commands, if it is known.
     """
-    cables, size = wound or unit == "m", SIZES.get(unit, SHARE * (stroke or 1.0))
+    cables, size = wound or unit == "m", SIZES.get(unit, SHARE) if usual is None else SHARE * usual
     look = "guide, spool and tension of cable {0}, and all parts shared with other cables"
     look = look if wound else "the drive of {0}, its load, and all parts shared with other drives"
     found = []

@@ -24,14 +24,15 @@ from rfdropo_bayes.mechanisms.actuation import (
     CommandDelay,
     CommandGain,
     DriveCreep,
-    DriveDrift,
     EndStop,
+    GuideAzimuth,
     RateLimit,
     SpoolGrowth,
     TravelStop,
 )
 from rfdropo_bayes.mechanisms.body_mechanisms import (
     AxialStiffness,
+    BaseCompliance,
     BaseTilt,
     BendTwistCoupling,
     CableCompliance,
@@ -42,12 +43,13 @@ from rfdropo_bayes.mechanisms.body_mechanisms import (
     PlaneAnisotropy,
     QuadraticDrag,
     Softening,
+    SoftPart,
     StiffnessGradient,
     ViscoelasticBranch,
     WallContact,
 )
+from rfdropo_bayes.mechanisms.drift import CableGainDrift, CameraDrift, CameraTurn, CameraZoom, DriveDrift, GainDrift
 from rfdropo_bayes.mechanisms.sensing import (
-    CameraDrift,
     CameraOffset,
     CameraRotation,
     CameraScale,
@@ -55,6 +57,7 @@ from rfdropo_bayes.mechanisms.sensing import (
     MarkerOffset,
     SensorLag,
 )
+from rfdropo_bayes.mechanisms.sizes import scales_of, sized
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
@@ -68,6 +71,7 @@ REGISTRY: dict[str, type] = {
         CommandGain,
         CableGain,
         CableSlack,
+        GuideAzimuth,
         Backlash,
         EndStop,
         TravelStop,
@@ -75,9 +79,13 @@ REGISTRY: dict[str, type] = {
         SpoolGrowth,
         DriveCreep,
         DriveDrift,
+        GainDrift,
+        CableGainDrift,
         Payload,
         AxialStiffness,
         StiffnessGradient,
+        SoftPart,
+        BaseCompliance,
         BaseTilt,
         CoulombFriction,
         CapstanFriction,
@@ -93,6 +101,8 @@ REGISTRY: dict[str, type] = {
         CameraScale,
         CameraOffset,
         CameraDrift,
+        CameraTurn,
+        CameraZoom,
         MarkerOffset,
         SensorLag,
         ClockOffset,
@@ -128,17 +138,22 @@ class MechanismChoice:
     kind: Any
 
     def made_for(self, robot: Robot | BlackBox | None) -> Mechanism:
-        """The mechanism; one with parameters per cable (a class method ``for_robot``) is made for the robot."""
+        """The mechanism; a class with parameters per cable (a class method ``for_robot``) is made for the robot, and
+        mechanisms of the library have its sizes."""
         if not isinstance(self.kind, type):
             return self.kind
         kind: Any = self.kind
-        return kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind()
+        made = kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind()
+        if isinstance(robot, Robot) and made.stage != "actuation" and REGISTRY.get(kind.name) is kind:
+            scales = scales_of(robot)
+            made.parameters = tuple(sized(spec, scales) for spec in made.parameters)
+        return made
 
 
 def choose_mechanisms(
     names: Iterable[Any], *, folder: Path = Path(), where: str = "[model] mechanisms"
 ) -> tuple[MechanismChoice, ...]:
-    """The mechanisms that names stand for.
+    """The named mechanisms.
 
     Args:
         names: names in the registry, ``module:ClassName`` of user code, or mechanisms as classes or objects.
@@ -170,7 +185,7 @@ def source_of(mechanism: Any) -> str:
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:
-    """The class that ``module:ClassName`` or ``file.py:ClassName`` stands for."""
+    """The class named by ``module:ClassName`` or ``file.py:ClassName``."""
     source, _, attribute = name.rpartition(":")
     try:
         if source.endswith(".py"):

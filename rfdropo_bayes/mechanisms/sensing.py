@@ -30,7 +30,7 @@ class CameraRotation:
     cause = "registration of the motion-capture frame to the robot's base"
     remedy = "register the frame on three points of the base"
     parameters = tuple(
-        ParameterSpec(f"camera_rotation_{axis}", "rad", -0.8, 0.8, 0.0, _ANGLE, f"rotation of the frame about {axis}")
+        ParameterSpec(f"camera_rotation_{axis}", "rad", -1.6, 1.6, 0.0, _ANGLE, f"rotation of the frame about {axis}")
         for axis in "xyz"
     )
 
@@ -55,7 +55,7 @@ class CameraScale:
     cause = "scale calibration of the motion capture"
     remedy = "measure a known length"
     parameters = (
-        ParameterSpec("camera_scale_error", "-", -0.5, 0.5, 0.0, normal(0.02), "relative error of measured lengths"),
+        ParameterSpec("camera_scale_error", "-", -0.9, 9.0, 0.0, normal(0.02), "relative error of measured lengths"),
     )
 
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
@@ -80,46 +80,6 @@ class CameraOffset:
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
         """Shift all positions."""
         return position + jnp.stack([values[spec.name] for spec in self.parameters])
-
-
-class CameraDrift:
-    """The measuring frame moves at a steady velocity from the start of the recording; none at null."""
-
-    name = "camera_drift"
-    stage = "sensing"
-    cause = "cameras or a base that move or warm up during the recording"
-    remedy = "record a marker that is fixed to the base"
-    parameters = tuple(
-        ParameterSpec(
-            f"camera_drift_{axis}",
-            "m/s",
-            -0.1,
-            0.1,
-            0.0,
-            normal(0.0005),
-            f"velocity of measured positions along {axis}",
-        )
-        for axis in "xyz"
-    )
-
-    def sense_over_time(
-        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
-    ) -> Float[Array, "time marker 3"]:
-        """Shift the positions in proportion to time."""
-        return position + self._shift(values, (time - time[0])[:, None, None])
-
-    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[()]:
-        """Nothing to remember."""
-        return ()
-
-    def advance(
-        self, values: Values, memory: tuple[()], given: Float[Array, "marker 3"], now: Float[Array, ""]
-    ) -> tuple[tuple[()], Float[Array, "marker 3"]]:
-        """Shift the positions in proportion to time."""
-        return memory, given + self._shift(values, now)
-
-    def _shift(self, values: Values, elapsed: Float[Array, "..."]) -> Float[Array, "..."]:
-        return elapsed * jnp.stack([values[spec.name] for spec in self.parameters])
 
 
 class MarkerOffset:

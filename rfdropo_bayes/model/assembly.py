@@ -1,4 +1,4 @@
-"""From what a model means to the simulator, the probabilistic program and the problem that make it up."""
+"""Assembly of a model: from its specification to simulator, probabilistic program and problem."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from rfdropo_bayes.bayes.calibration_problem import Batch, CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import (
     Channel,
     Markers,
@@ -22,6 +22,7 @@ from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
 from rfdropo_bayes.bayes.channels.orientation import FRAME_TURNS, ORIENTATION_NOISE
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.noise import (
     NOISE_CORRELATION_TIME,
     NOISE_MODELS,
@@ -30,11 +31,10 @@ from rfdropo_bayes.bayes.noise import (
     noise_specs,
 )
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
-from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_repeats
-from rfdropo_bayes.bayes.space import ParameterSpace, build_space
+from rfdropo_bayes.bayes.scopes import Scopes, build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import DataSpec, Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
@@ -46,6 +46,7 @@ from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.compute_backend import backend
 from rfdropo_bayes.model.experiment import matching
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
+from rfdropo_bayes.posteriors import DrawsByOwner, ParameterInfo
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
@@ -76,10 +77,10 @@ REST_CLOCK = 0.05
 
 
 def robot_of(spec: ModelSpec) -> Robot:
-    """The robot of a model, where only a robot will do.
+    """The robot of a model that must have a robot.
 
     Raises:
-        InputError: a black box.
+        InputError: the model is a black box.
     """
     if isinstance(spec.robot, BlackBox):
         raise InputError("a black box has no body", where=spec.robot.name, remedy="use a robot")
@@ -87,7 +88,7 @@ def robot_of(spec: ModelSpec) -> Robot:
 
 
 def integrator_of(spec: ModelSpec) -> str | None:
-    """How time steps are taken: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
+    """Integrator of time steps: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
     black box."""
     if isinstance(spec.robot, BlackBox):
         return None
@@ -104,10 +105,10 @@ def build_simulator(spec: ModelSpec) -> AnySimulator:
 
 
 def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
-    """The same where only a robot will do: body, engine and mechanisms.
+    """The simulator of a model that must have a robot: body, engine and mechanisms.
 
     Raises:
-        InputError: a black box.
+        InputError: the model is a black box.
     """
     table, robot = spec.simulator, with_drives(robot_of(spec), spec.drives, spec.groups)
     if table.drives == "direct":
@@ -151,7 +152,7 @@ def _with_mechanisms(simulator: Extended, spec: ModelSpec) -> Extended:
 
 
 def with_drives(robot: Robot, drives: Sequence[DriveTravel], groups: Patterns) -> Robot:
-    """A robot with what an experiment states of its drives, and the groups that it states it for.
+    """A robot with the drives that an experiment states, and their groups.
 
     Raises:
         InputError: a cable that the robot does not have.
@@ -168,7 +169,7 @@ def with_groups(simulator: AnySimulator, groups: Patterns) -> AnySimulator:
 
 
 def measurement_specs(noise: str, channels: DataChannels) -> tuple[ParameterSpec, ...]:
-    """Parameters of the channels that are data: the noise of the positions, and of what else is measured."""
+    """Parameters of the channels that are data: the noise of the positions and of other measured channels."""
     own = () if noise in KNOWN else noise_specs(noise)
     further = [spec for key, chosen in asdict(channels).items() if chosen for spec in SWITCHED[key]]
     if noise == "white":
@@ -197,13 +198,13 @@ def fixed_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float]:
 
 
 def physical_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float]:
-    """Those of `fixed_values` that the simulator is given."""
+    """The part of `fixed_values` that belongs to the simulator."""
     known = {each.name for each in simulator.parameters}
     return {name: value for name, value in fixed_values(spec, simulator).items() if name in known}
 
 
 def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *, where: str) -> None:
-    """Raise InputError for a parameter that the model does not have, and say what would bring it in."""
+    """Raise InputError for a parameter that the model does not have, and name the mechanism that has it."""
     specs, chosen = model_specs(spec, simulator), asdict(spec.channels)
     known = [each.name for each in specs]
     further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
@@ -240,14 +241,14 @@ def check_spec(spec: ModelSpec, simulator: AnySimulator) -> None:
 
 
 def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
-    """The recordings of one role, ``"fit"`` or ``"test"``."""
+    """The recordings of one role, ``"fit"`` or ``"test"``; InputError without [data]."""
     if data is None:
         raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
     return load_recordings(data, folder, role=role)
 
 
 def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) -> dict[str, Entry]:
-    """Write out the keys that stand for several parameters: ``offset`` for ``offset_x``, ``offset_y``, ``offset_z``."""
+    """Expand keys for several parameters: ``offset`` for ``offset_x``, ``offset_y``, ``offset_z``."""
     known = [spec.name for spec in specs]
     expanded: dict[str, Entry] = {}
     for name, entry in table.items():
@@ -259,10 +260,10 @@ def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) ->
 def pooling(
     spec: ModelSpec, specs: Sequence[ParameterSpec], fitted: Sequence[str], others: Sequence[str] = ()
 ) -> dict[str, Pooled]:
-    """The parameters of [model.per_group], with the recordings of each group that has one to fit.
+    """The parameters of [model.per_group], with the recordings of each fitted group.
 
     Raises:
-        InputError: a name that is none of ``specs``, those of the simulator: noise is the same for all recordings.
+        InputError: a name outside ``specs``, the simulator's parameters: noise is the same for all recordings.
     """
     groups = gather_groups([*fitted, *others], spec.groups)
     known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
@@ -303,36 +304,53 @@ def scoping(
     return found
 
 
-def build_model(spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
+def build_model(
+    spec: ModelSpec,
+    simulator: AnySimulator,
+    trajectories: Sequence[Trajectory],
+    *,
+    specs: Sequence[ParameterSpec] | None = None,
+    fitted: int | None = None,
+    later: Sequence[Mechanism] = (),
+) -> TrajectoryModel:
     """The probabilistic program of a model for the given recordings.
+
+    Args:
+        spec: the model; simulator: with all mechanisms.
+        trajectories: the recordings.
+        specs: parameters that may be inferred; all by default.
+        fitted: number of recordings, the first ones, that are fitted; all by default.
+        later: see `model_scopes`.
 
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     recordings = gather_recordings(simulator, trajectories)
-    space = model_space(spec, simulator, model_specs(spec, simulator), recordings.names)
-    channels = gather_channels(spec, simulator, trajectories, recordings, space.names)
-    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels)
+    count, chosen = len(trajectories) if fitted is None else fitted, model_specs(spec, simulator)
+    groups = recordings.names[:count], recordings.names[count:]
+    scopes = model_scopes(spec, simulator, chosen if specs is None else specs, *groups, later)
+    channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
+    return TrajectoryModel(simulator, scopes, recordings, channels)
 
 
-def model_space(
+def model_scopes(
     spec: ModelSpec,
     simulator: AnySimulator,
     specs: Sequence[ParameterSpec],
     fitted: Sequence[str],
     others: Sequence[str] = (),
     later: Sequence[Mechanism] = (),
-) -> ParameterSpace:
-    """What is inferred: parameters of the model, those of ``later`` mechanisms after all others.
+) -> Scopes:
+    """Space of inferred parameters: the model's, followed by the parameters of ``later`` mechanisms.
 
     The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
 
     Args:
-        spec: says which have a prior.
-        simulator: with all mechanisms.
+        spec: specification with the priors.
+        simulator: simulator with all mechanisms.
         specs: parameters that may be inferred.
-        fitted: names of the recordings that are fitted; others: of those that are not, which may belong to groups.
-        later: mechanisms whose parameters come last, such as the candidates of an audit.
+        fitted: names of the fitted recordings; others: names of other recordings, which may belong to groups.
+        later: mechanisms whose parameters come last, such as candidates of an audit.
 
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
@@ -353,11 +371,11 @@ def model_space(
     defaults = [name for name in (*added, *shared, *groups, *measured) if name not in fixed and name not in given]
     priors: dict[str, Any] = {name: given.get(name, {}) for name in (*given, *defaults) if name not in last}
     priors |= {name: given.get(name, {}) for name in last if name not in fixed and name not in priors}
-    scopes = {
+    alone = {
         name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
     }
     pooled = pooling(spec, simulator.parameters, fitted, others)
-    return build_space(specs, priors, scopes, fitted, pooled=pooled, scoped=groups)
+    return build_scopes(specs, priors, alone, fitted, pooled=pooled, only_in=groups, fixed=fixed)
 
 
 def gather_channels(
@@ -365,13 +383,13 @@ def gather_channels(
     simulator: AnySimulator,
     trajectories: Sequence[Trajectory],
     recordings: RecordingSet,
-    inferred: Sequence[str],
+    inferred: Sequence[ParameterInfo],
     fitted: int | None = None,
 ) -> tuple[Channel, ...]:
-    """What was measured and is to be used, markers first and weighed parts last.
+    """Data channels in use, markers first and weighed parts last.
 
-    ``inferred`` are the names of parameters, of which some may be weighed; ``fitted`` is the number of recordings, the
-    first ones, that need what [model] asks for; all by default.
+    Some ``inferred`` parameters may be weighed. The first ``fitted`` recordings must have the channels that [model]
+    requires; all by default.
     """
     chosen, length = spec.channels, recordings.time.shape[1]
     stated = stated_noise(spec, recordings, trajectories[0]) if spec.noise == STATED else None
@@ -409,7 +427,7 @@ def stated_noise(spec: ModelSpec, recordings: RecordingSet, first: Trajectory) -
     return Markers.gather(recordings, STATED).stated(values, step).at(recordings.steps)
 
 
-def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:
+def build_problem(model: TrajectoryModel, earlier: DrawsByOwner | None = None) -> CalibrationProblem:
     """The model as the inference methods see it, in chunks that suit its engine; ``earlier``: see the problem."""
     lanes = model.simulator.lanes
-    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier)
+    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier or {})

@@ -41,7 +41,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     try:
         tables = read_toml(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
+        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="correct the syntax there") from None
     if path.name in WRITTEN_BY_RUNS and any((path.parent / name).is_file() for name in RESULTS_OF_RUNS):
         stated = tables.setdefault("simulator", {})
         if isinstance(stated, dict) and "motion" not in stated:

@@ -1,4 +1,4 @@
-"""A model: what is simulated, what is inferred, and what is measured, whether a file or a program says so."""
+"""A model: its simulator, inferred parameters and data channels, from a file or a program."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rfdropo_bayes.model.assembly import (
 from rfdropo_bayes.model.experiment import Experiment, ModelTable, load_experiment
 from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe
 from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
-from rfdropo_bayes.prediction.predictive import Batch
+from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.signatures import with_keywords_of
@@ -45,8 +45,8 @@ class ExperimentFile(NamedTuple):
     """The file that a model was read from.
 
     Attributes:
-        path: of the file.
-        tables: as they were read, with the overrides in place.
+        path: path of the file.
+        tables: its tables with the overrides applied.
     """
 
     path: Path
@@ -59,26 +59,26 @@ class Model:
     Args:
         robot: name of a robot that comes with the package, path of a robot file or of a MuJoCo model, a `Robot`, or a
             `BlackBox`.
-        priors: what is inferred: {parameter: prior}. A prior is a numpyro distribution, a table such as
-            ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default.
-            For a black box, all its parameters with their own priors by default, less those of its `families`.
-        mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or mechanisms
-            of one's own, as classes or objects.
-        noise: of the positions, by name as in an experiment file; or, where it is known,
-            ``{"standard_deviation": m}``, perhaps with a ``correlation_time`` [s].
+        priors: inferred parameters: {parameter: prior}. A prior is a numpyro distribution, a table such as
+            ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default. For
+            a black box, all its parameters with their own priors by default, less its `families`.
+        mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or your own
+            mechanisms, as classes or objects.
+        noise: noise of the positions, by name as in an experiment file; or, if it is known, ``{"standard_deviation":
+            m}``, perhaps with a ``correlation_time`` [s].
         fixed: values of parameters that are not inferred.
         simulator: body, engine and discretisation: the keys of an experiment file's [simulator].
-        folder: that paths are relative to.
+        folder: base of relative paths.
         title: heading of reports; the robot's name by default.
         more: further keys of an experiment file's [model], such as ``tension = True`` or ``per_recording``.
 
     Attributes:
-        spec: what it means, as objects.
-        settings: what its experiment says beside the model.
-        file: that it was read from, if any; a changed model has none.
+        spec: its specification, as objects.
+        settings: settings of its experiment beside the model.
+        file: its source file, if any; a changed model has none.
 
     Raises:
-        InputError: an unknown robot, key, mechanism or parameter; or a prior that cannot be one of its parameter.
+        InputError: an unknown robot, key, mechanism or parameter; or a prior that does not fit its parameter.
     """
 
     file: ExperimentFile | None = None
@@ -114,19 +114,19 @@ class Model:
 
     @classmethod
     def of(cls, spec: ModelSpec, settings: RunSettings | None = None) -> Model:
-        """The model that is meant, with what its experiment says beside it."""
+        """The model of a specification, with the settings of its experiment."""
         model = cls.__new__(cls)
         model.spec, model.settings = spec, settings or RunSettings()
         return model
 
     @classmethod
     def of_experiment(cls, experiment: Experiment, folder: Path) -> Model:
-        """The model that an experiment file describes; ``folder`` is that of the file."""
+        """The model that an experiment file describes; ``folder`` is the folder of the file."""
         return cls.of(spec_of(experiment, folder), RunSettings.of(experiment))
 
     @classmethod
     def read(cls, path: Path | str, overrides: Sequence[str] | None = None) -> Model:
-        """The model of an experiment file, with what the file says beside it: recordings, method, seed.
+        """The model of an experiment file, with its further settings: recordings, method, seed.
 
         Args:
             path: the file.
@@ -167,7 +167,7 @@ class Model:
 
     @property
     def name(self) -> str:
-        """That of the robot."""
+        """Name of the robot."""
         return self.robot.name
 
     @property
@@ -177,7 +177,7 @@ class Model:
 
     @property
     def parameters(self) -> pd.DataFrame:
-        """Every parameter of simulator and measurement: unit, hard bounds, nominal value, prior where inferred."""
+        """Every parameter of simulator and measurement: unit, hard bounds, nominal value, prior if inferred."""
         specs = model_specs(self.spec, self.simulator)
         given = expand_groups(self.spec.priors, specs)
         added = {spec.name for mechanism in self.simulator.mechanisms for spec in mechanism.parameters}
@@ -204,17 +204,17 @@ class Model:
         refuse_lost_threads()
         return build_model(self.spec, self.simulator, runs)
 
-    def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:
+    def problem(self, runs: Sequence[Trajectory], earlier: DrawsByOwner | None = None) -> CalibrationProblem:
         """The posterior given these recordings, as the inference methods see it."""
         return build_problem(self.numpyro(runs), earlier)
 
     def runs(
         self, fit: Sequence[Trajectory] | None, test: Sequence[Trajectory] | None = None
     ) -> tuple[Sequence[Trajectory], Sequence[Trajectory]]:
-        """Recordings to fit and to test that a call gives, or else those that the experiment file names.
+        """Recordings to fit and to test that a call gives, or else the recordings of the experiment file.
 
         Raises:
-            InputError: something else than recordings was given, or none to fit.
+            InputError: the arguments are not recordings, or none to fit.
         """
         if fit is None:
             return self.recordings("fit"), self.recordings("test") if test is None else given_recordings(test, "test")
@@ -227,15 +227,16 @@ class Model:
         """Tables for the record of a run, as an experiment file has them.
 
         Args:
-            meant: keys that a file would need to mean the run; what the model was read from says them already.
-            given: those that a call gave in their place; None where it did not.
+            meant: keys that describe the run in a file; a model read from a file has them already.
+            given: keys that a call overrides; None if it does not.
         """
         stated = {name: value for name, value in given.items() if value is not None}
         return {**self.tables(), **(meant if self.file is None else {}), **stated}
 
     def tables(self) -> dict[str, Any]:
-        """The tables of the file it was read from, or of one that says the same, as far as a file can; the integrator
-        is stated, so that another default does not change what they mean."""
+        """Tables of its source file, or equivalent tables as far as a file allows. They state the integrator, so that a
+        changed default does not alter their meaning.
+        """
         if self.file is not None:
             found = dict(self.file.tables)
         else:

@@ -33,11 +33,12 @@ def trunk_simulator(
     Args:
         push: put the robot's cube and plate before it.
         mechanisms: extensions by name, or of a file relative to ``folder``.
-        precision: of the body's motion, as in an experiment file; single precision is up to twice as fast and moves the
+        precision: precision of the body's motion, as in an experiment file; single precision is up to twice as fast and
+            moves the
             tip by 0.01 mm.
-        threads: that the engine may use; all processors by default.
+        threads: number of threads of the engine; all processors by default.
         time_step: [s]; the robot's own by default.
-        integrator: how a time step is taken; as the robot says by default.
+        integrator: scheme of a time step; the robot's by default.
     """
     discretisation = Discretisation(time_step or robot.time_step_s)
     assembly = assemble(robot, discretisation)
@@ -68,11 +69,11 @@ def make_episodes(
     Args:
         task: name of the environment.
         lanes: number of episodes simulated at once.
-        simulator: to use as it is; made from the next arguments by default.
+        simulator: simulator to use unchanged; made from the next arguments by default.
         robot: name, file or description; the task's own by default.
         mechanisms, precision, threads, integrator: see `trunk_simulator`.
         parameters: fixed values; the others are nominal.
-        randomisation: of parameters; instead of ``parameters``.
+        randomisation: randomisation of parameters; instead of ``parameters``.
         settings: see `Settings`.
 
     Raises:

@@ -1,6 +1,6 @@
 """A critic that sees the simulator's parameters of the episode, which a robot never shows.
 
-Only the actor is exported, so that the critic may know more (Pinto et al. 2018, "Asymmetric actor critic for
+Only the actor is exported, so that the critic may have more inputs (Pinto et al. 2018, "Asymmetric actor critic for
 image-based robot learning"). Environments append the parameters to the observation; the actor's network begins with the
 numbers before them.
 """
@@ -30,8 +30,8 @@ class VariedParameters(NamedTuple):
     """Parameters that differ between episodes, in the order of the randomisation.
 
     Attributes:
-        names: of the parameters.
-        mean, deviation: of `DRAWS` draws [parameter units].
+        names: names of the parameters.
+        mean, deviation: statistics of `DRAWS` draws [parameter units].
     """
 
     names: tuple[str, ...]
@@ -109,8 +109,8 @@ class AsymmetricPolicy(ActorCriticPolicy):
 
     Args:
         given: spaces and learning rate, as `ActorCriticPolicy` takes them.
-        unseen: how many numbers at the end of an observation the actor does not see.
-        options: of `ActorCriticPolicy`.
+        unseen: number of values at the end of an observation that the actor does not see.
+        options: options of `ActorCriticPolicy`.
     """
 
     def __init__(self, *given: Any, unseen: int, **options: Any) -> None:

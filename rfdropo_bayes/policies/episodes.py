@@ -84,7 +84,7 @@ class Episodes:
     """Lanes of a task.
 
     Args:
-        simulator: whose parameters are drawn, with mechanisms or without.
+        simulator: simulator whose parameters are drawn, with or without mechanisms.
         task: goal and reward.
         lanes: number of episodes simulated at once.
         randomisation: source of the parameters.

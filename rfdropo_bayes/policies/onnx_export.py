@@ -96,7 +96,7 @@ def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Pa
     Args:
         model: the trained model.
         normalisation: the ``VecNormalize`` it was trained under, or None.
-        layout: of its observation and action.
+        layout: layout of its observation and action.
         path: file to write.
         facts: further metadata: hashes, seed, versions.
 
@@ -141,10 +141,10 @@ class ExportedPolicy:
     """An exported policy, ready to act.
 
     Args:
-        path: of the ONNX file.
+        path: path of the ONNX file.
 
     Attributes:
-        layout: of its observation and action.
+        layout: layout of its observation and action.
         facts: its other metadata.
 
     Raises:

@@ -45,7 +45,7 @@ def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float
 
     Args:
         normalisation: the ``VecNormalize`` of the policy, or None for observations in metres.
-        size: of an observation.
+        size: size of an observation.
         largest: deviations of the last row.
     """
     rows = np.random.default_rng(0).normal(size=(ROWS, size)) * np.geomspace(SMALLEST, largest, ROWS)[:, None]
@@ -56,7 +56,7 @@ def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float
 
 
 def difference(policy: ExportedPolicy, act: Act, seen: Float[np.ndarray, "row size"]) -> str | None:
-    """How an exported policy acts otherwise than ``act``, in words; None if it does not."""
+    """Difference between an exported policy and ``act``, in words; None if it does not."""
     found, wanted = policy.act(seen), np.asarray(act(seen))
     if policy.layout.kind == "discrete":
         share = float(np.mean(found != wanted))
@@ -72,10 +72,10 @@ def check_exportable(model: Any, normalisation: Any, act: Act, layout: PolicyLay
     """Refuse a model whose export would act otherwise; model, normalisation and random generators stay as they are.
 
     Args:
-        model: of Stable-Baselines3, untrained or not.
+        model: model of Stable-Baselines3, trained or untrained.
         normalisation: the ``VecNormalize`` around its environments, or None.
-        act: from observations as the environments give them to the model's most likely actions.
-        layout: of its observation and action.
+        act: map from the environments' observations to the model's most likely actions.
+        layout: layout of its observation and action.
 
     Raises:
         InputError: a layer that cannot be exported, or another action.

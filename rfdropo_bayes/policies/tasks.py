@@ -167,7 +167,7 @@ def layout_of(
             moved by up to ``step``.
         observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
             marker has moved since the last action; "markers", the same with the markers that motion capture sees.
-        period: from one action to the next [s].
+        period: time from one action to the next [s].
         step: largest change of a channel per action, in the unit of its commands, or a value per channel; by default
             the command that pulls a cable by 5 mm, see `Commanded.command_of`.
         history: number of past actions whose commands and marker displacements are observed.

@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from rfdropo_bayes.signatures import as_options
+
 
 class TrainingTable(BaseModel):
     """[training]: a task, an algorithm and a budget."""
@@ -95,3 +97,8 @@ class TrainingTable(BaseModel):
         "was killed goes on from the last",
     )
     evaluation_episodes: int = Field(default=64, ge=1, description="episodes of an evaluation during training")
+
+
+@as_options
+class TrainingOptions(TrainingTable):
+    """Options of `rb.train`, `rb.evaluate` and `rb.make_vec`: keys of an experiment file's [training]."""

@@ -10,20 +10,25 @@ from rfdropo_bayes.posteriors.inference_data import (
     summarise,
     to_tree,
 )
-from rfdropo_bayes.posteriors.parameter_info import SPREAD, ParameterInfo
-from rfdropo_bayes.posteriors.record import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors.parameter_info import SHARED, DrawsByOwner, ParameterInfo, Scope, by_owner, label
+from rfdropo_bayes.posteriors.record import HELD, PosteriorRecord, RecordingPrediction
 
 __all__ = [
-    "SPREAD",
+    "HELD",
+    "SHARED",
+    "DrawsByOwner",
     "InferenceData",
     "ParameterInfo",
     "PosteriorRecord",
     "ProductOfPowers",
     "RecordingPrediction",
+    "Scope",
+    "by_owner",
     "central_interval",
     "contradiction",
     "contradicts",
     "evaluate_products",
+    "label",
     "load_posterior",
     "piled_at",
     "save_posterior",

@@ -42,7 +42,7 @@ def contradicts(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) 
     outermost but dense.
 
     Args:
-        draws: of one parameter's posterior.
+        draws: draws of one parameter's posterior.
         prior: draws of its prior, some 400 at least.
     """
     prior, centre = np.sort(prior[np.isfinite(prior)]), float(np.median(draws))

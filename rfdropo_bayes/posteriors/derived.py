@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors.parameter_info import label
 
 
 @dataclass(frozen=True)
@@ -18,16 +19,23 @@ class ProductOfPowers:
     Every combination that a scale ridge leaves determined has this form (E / density, friction / E, ...).
 
     Attributes:
-        name: of the quantity.
+        parameter: name of the quantity.
         unit: SI unit, "-" if it has none.
         powers: exponent of each parameter, ``{"young_modulus": 1, "density": -1}``.
         description: one line on its physical meaning.
+        owner: the recording or group that has it; empty if all share it.
     """
 
-    name: str
+    parameter: str
     unit: str
     powers: Mapping[str, float]
     description: str = ""
+    owner: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its label, see `ParameterInfo.name`."""
+        return label(self.parameter, self.owner)
 
 
 def evaluate_products(

@@ -72,15 +72,9 @@ def to_tree(
     def described(values: Mapping[str, np.ndarray]) -> xr.Dataset:
         dataset = _draws_dataset(values)
         for name in values:
-            info = known.get(name, ParameterInfo(name, ""))
-            dataset[variable_key(name)].attrs = {
-                "name": name,
-                "unit": info.unit,
-                "low": float(info.low),
-                "high": float(info.high),
-                "prior": json.dumps(dict(info.prior)),
-                "description": info.description,
-            }
+            said = known.get(name, ParameterInfo(name, "")).as_dict()
+            said |= {key: json.dumps(said[key]) for key in ("prior", "scope")}
+            dataset[variable_key(name)].attrs = {"name": name, **said}
         return dataset
 
     groups = {

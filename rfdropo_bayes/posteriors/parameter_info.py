@@ -1,14 +1,42 @@
-"""Facts about a parameter beside its draws."""
+"""Facts about a parameter beside its draws, and whose it is."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-SPREAD = "_spread"  # ends the name of a standard deviation between groups
+Draws = Mapping[str, Float[np.ndarray, " n"]]
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Owner of a parameter, and the composition of its value.
+
+    Attributes:
+        owner: the recording or group of recordings that has it; empty if all recordings share it.
+        group: whether the owner is a group, whose further recordings have it as well.
+        added_to: the parameter that it is added to; empty if it is a value of its own.
+        scaled_by: the parameter that is its standard deviation, instead of its prior's; empty if there is none.
+        spread: whether it is the standard deviation of others, between groups.
+    """
+
+    owner: str = ""
+    group: bool = False
+    added_to: str = ""
+    scaled_by: str = ""
+    spread: bool = False
+
+
+SHARED = Scope()
+
+
+def label(name: str, owner: str) -> str:
+    """A parameter and its owner in one word, for people and as a key: ``offset_x@AKLWI_1``. It is never taken apart."""
+    return f"{name}@{owner}" if owner else name
 
 
 @dataclass(frozen=True)
@@ -16,19 +44,35 @@ class ParameterInfo:
     """Facts about a parameter beside its draws.
 
     Attributes:
-        name: name in the experiment file; ``name@recording`` for a parameter of one recording.
+        parameter: name in the experiment file.
         unit: SI unit, "-" if it has none.
         low, high: hard bounds, infinite without a bound.
         prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.
         description: one line on its physical meaning.
+        scope: its owner and the composition of its value.
     """
 
-    name: str
+    parameter: str
     unit: str
     low: float = -np.inf
     high: float = np.inf
     prior: Mapping[str, Any] = field(default_factory=dict)
     description: str = ""
+    scope: Scope = SHARED
+
+    @classmethod
+    def from_dict(cls, given: Mapping[str, Any]) -> ParameterInfo:
+        """Inverse of `as_dict`."""
+        return cls(**{**given, "scope": Scope(**given["scope"])})
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as JSON has it."""
+        return {**asdict(self), "low": float(self.low), "high": float(self.high), "prior": dict(self.prior)}
+
+    @property
+    def name(self) -> str:
+        """Its label, under which its draws are."""
+        return label(self.parameter, self.scope.owner)
 
     @property
     def logarithmic(self) -> bool:
@@ -41,7 +85,26 @@ class ParameterInfo:
 
         Zero is not counted as an end of a spread between groups: the groups are then equal.
         """
-        if self.name.endswith(SPREAD):
+        if self.scope.spread:
             return -np.inf, min(self.high, self.prior.get("high", np.inf))
         low = 0.0 if self.prior.get("distribution") == "HalfNormal" else self.prior.get("low", -np.inf)
         return max(self.low, low), min(self.high, self.prior.get("high", np.inf))
+
+    def spread_of(self, values: Draws, count: int) -> Float[np.ndarray, " n"]:
+        """Standard deviation between groups of a deviation's parameter, for each of ``count`` draws."""
+        if self.scope.scaled_by:
+            return np.asarray(values[self.scope.scaled_by])
+        return np.full(count, float(self.prior["scale"]))
+
+
+DrawsByOwner = Mapping[str, Draws]
+"""Draws by parameter and by owner, see `Scope`."""
+
+
+def by_owner(infos: Iterable[ParameterInfo], draws: Draws) -> dict[str, dict[str, Float[np.ndarray, " n"]]]:
+    """Draws that have labels, by parameter and owner."""
+    found: dict[str, dict[str, Float[np.ndarray, " n"]]] = {}
+    for info in infos:
+        if info.name in draws:
+            found.setdefault(info.parameter, {})[info.scope.owner] = np.asarray(draws[info.name])
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,11 @@ from rfdropo_bayes.posteriors.inference_data import (
     to_tree,
     variable_key,
 )
-from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
+from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, Scope
 
 AXES = ("x", "y", "z")
 DRAWS = "draws"  # attribute of a prediction: how many draws are its own
+HELD = "held_parameters"  # attribute of a posterior
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class PosteriorRecord:
         trace: numbers of the sampler, one dictionary per stage.
         block_scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows
             before it), ``sd``.
-        log_likelihood: of each data row at each draw, or None.
+        log_likelihood: log likelihood of each data row at each draw, or None.
         attrs: data hash, seed, versions and the like.
     """
 
@@ -112,6 +113,11 @@ class PosteriorRecord:
         names = {product.name for product in self.derived}
         return tuple(info for info in self.parameters if info.name not in names)
 
+    @property
+    def held(self) -> list[tuple[ParameterInfo, float]]:
+        """Parameters whose values the fit took for known, with these."""
+        return [(ParameterInfo.from_dict(each["parameter"]), each["value"]) for each in self.attrs.get(HELD, ())]
+
     def flat(self, name: str) -> Float[np.ndarray, " n"]:
         """Draws of one variable, chains joined."""
         return np.asarray(self.posterior[name]).reshape(-1)
@@ -122,7 +128,9 @@ class PosteriorRecord:
         Raises:
             InputError: see `evaluate_products`.
         """
-        infos = tuple(ParameterInfo(p.name, p.unit, 0.0, np.inf, {}, p.description) for p in products)
+        infos = tuple(
+            ParameterInfo(p.parameter, p.unit, 0.0, np.inf, {}, p.description, Scope(p.owner)) for p in products
+        )
         prior = {**self.prior, **evaluate_products(self.prior, products)} if self.prior else {}
         return PosteriorRecord(
             self.parameters + infos,
@@ -142,10 +150,7 @@ class PosteriorRecord:
 
     def tree(self) -> xr.DataTree:
         """The same as a tree of datasets, one for each of ArviZ's groups."""
-        products = [
-            {"name": p.name, "unit": p.unit, "powers": dict(p.powers), "description": p.description}
-            for p in self.derived
-        ]
+        products = [{**asdict(p), "powers": dict(p.powers)} for p in self.derived]
         return to_tree(
             self.posterior,
             prior=self.prior,
@@ -188,15 +193,14 @@ def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
     names = json.loads(tree.attrs["names"])
     variables = [data["posterior"][variable_key(name)] for name in names]
     parameters = tuple(
-        ParameterInfo(
-            name,
-            v.attrs["unit"],
-            float(v.attrs["low"]),
-            float(v.attrs["high"]),
-            json.loads(v.attrs["prior"]),
-            v.attrs["description"],
+        ParameterInfo.from_dict(
+            {
+                **{key: v.attrs[key] for key in ("parameter", "unit", "description")},
+                **{key: float(v.attrs[key]) for key in ("low", "high")},
+                **{key: json.loads(v.attrs[key]) for key in ("prior", "scope")},
+            }
         )
-        for name, v in zip(names, variables, strict=True)
+        for v in variables
     )
     prior, stats = data.get("prior", xr.Dataset()), data.get("sample_stats", xr.Dataset())
     return PosteriorRecord(
@@ -213,7 +217,7 @@ def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
 
 
 def _predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Recordings differ in length and may differ in draws, of which ArviZ knows one number."""
+    """Recordings differ in length and may differ in the number of draws, but ArviZ has a single number of draws."""
     predicted = {i: np.asarray(r.predicted, dtype=np.float32) for i, r in enumerate(recordings)}
     data = _with_draws(predicted)
     for i, r in enumerate(recordings):
@@ -255,7 +259,7 @@ def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | Non
 
 
 def _masks(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Which observations are there; ArviZ looks for a prediction of everything that is observed data."""
+    """Masks of the observations; ArviZ looks for a prediction of everything that is observed data."""
     data = {
         f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8)) for i, r in enumerate(recordings)
     }

@@ -1,9 +1,9 @@
-"""What is a day's own, found from one short recording of it under every draw of the body.
+"""Parameters of a new session, fitted to one short recording under every draw of the body.
 
-The body keeps its posterior. Under each of its draws the day's parameters are fitted to the recording and to draws
-from their priors, perturbed (`fit_own`), which makes the optimum a draw from their posterior given that body. Each body
-then counts by its evidence: the likelihood of the recording with the day's parameters integrated out. For a linear
-model with normal noise the draws are those of the joint posterior.
+The body keeps its posterior. Under each draw the session's parameters are fitted to perturbed data and perturbed prior
+means (`fit_own`), so that the optimum is a draw from their posterior given that body. Each body is then weighted by its
+evidence: the likelihood of the recording with the session's parameters integrated out. The draws are exact for a linear
+model with normal noise.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from scipy.special import softmax
 from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.space import InferredParameter
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.inference import next_step
-from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE, spread_of_draws
+from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
 
 class DayFit(NamedTuple):
-    """Draws of body and day together.
+    """Joint draws of body and session parameters.
 
     Attributes:
-        values: of all parameters, each draw as often as its body counts.
-        chosen: which draw of the body each is.
-        log_evidence: of each body's draw, up to a constant.
-        power: that the evidences were raised to, so that a tenth of the draws is left; 1 where it is no less.
-        excess: how many times as large as stated the noise is, by what the fits leave; at least 1.
-        unconverged: draws whose fit did not converge.
-        steps: that the fits took.
+        values: draws of all parameters, resampled by the evidence of their body.
+        chosen: index of each draw's body.
+        log_evidence: log evidence of each body, up to a constant.
+        power: exponent of the evidences that keeps an effective tenth of the draws; 1 if no less remains.
+        excess: ratio of the noise in the residuals to the stated noise; at least 1.
+        unconverged: number of draws whose fit did not converge.
+        steps: steps of the fits.
     """
 
     values: Batch
@@ -60,16 +60,16 @@ def fit_day(
     *,
     share: float = 1.0,
 ) -> DayFit:
-    """Draws of a day's parameters, and of the body, given one recording of the day.
+    """Draws of a session's parameters and of the body, given one recording of the session.
 
     Args:
-        problem: of that recording, under noise whose size is a lower bound: where the recording is fitted worse than it
-            says, the noise is taken for as much larger (the ratio of Birge 1932), and the day is fitted again.
+        problem: problem of that recording; its noise is a lower bound. If the residuals are larger, the noise is scaled
+            up (the ratio of Birge 1932), and the session is fitted again.
         body: draws of all other parameters.
-        own: the day's: deviations of its group, and parameters of the recording.
-        key: of draws from the priors, perturbations of the data, and the choice of the body's draws.
-        report: is told the step, and the share of the draws that have converged.
-        share: what a coordinate of a row counts, because markers err together (`ModelError.share`).
+        own: parameters of the session: deviations of its group, and parameters of the recording.
+        key: random key of prior draws, perturbations of the data, and resampling of the body's draws.
+        report: called with the step and the share of converged draws.
+        share: weight of a coordinate of a row, because errors of markers are correlated (`ModelError.share`).
     """
     count = len(next(iter(body.values())))
     centre_key, noise_key, choice_key = jax.random.split(key, 3)
@@ -106,13 +106,13 @@ def physical_of_normal(
     parameter: InferredParameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """Values of a parameter at standard normal coordinates of its prior."""
-    if parameter.added_to:
-        return normal * spread_of_draws(parameter, given, len(normal))
+    if parameter.scope.added_to:
+        return normal * parameter.info.spread_of(given, len(normal))
     return np.asarray(parameter.prior.icdf(norm.cdf(normal)))
 
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
-    """Of the data as they were measured, for every body, from the linearisation at its own optimum."""
+    """Log evidence of the unperturbed data for every body, from the linearisation at its own optimum."""
     found = -_least_cost(fit, noise) - 0.5 * np.linalg.slogdet(_curvature(fit))[1]
     return np.where(np.isfinite(found), found, -np.inf)
 

@@ -1,12 +1,12 @@
-"""What the first row of a recording says of the parameters that are its own, and of all others.
+"""Conditioning of parameters on the first row of a recording.
 
-`match_first_row` moves what is a recording's or a new group's own until the row agrees. `weighed_by_first_row` chooses
-among draws for recordings whose group was fitted: nothing of theirs is free, but some draws fit the row better.
+`match_first_row` fits the parameters of a recording or a new group to the row. `weighed_by_first_row` resamples draws
+for recordings of a fitted group: nothing is free, but some draws fit the row better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -18,8 +18,8 @@ from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import next_step
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -41,45 +41,43 @@ def match_first_row(
     left: ModelError | None,
     key: PRNGKeyArray,
 ) -> tuple[Batch, int]:
-    """Condition what is a recording's own on its first row: the frame's offset, and deviations of a new group.
+    """Condition the parameters of recordings on their first rows: the frame's offset, and deviations of a new group.
 
-    Offsets are set: each draw is shifted so that the weighted mean over the markers agrees, and a marker weighs as
-    little as the model is wrong about it. Deviations are drawn given the row, in which the model is as wrong as it was
-    in the fitted recordings: each draw from their prior is moved to the optimum under a perturbed row, pulled back to
-    where it was drawn (`fit_own`). The offset is taken out of the row's error at every step of that. Of a group's
-    recordings the first that has a first row is used.
+    Offsets are set: each draw is shifted so that the mean over the markers agrees, weighted by the inverse squared
+    model error of each marker. Deviations are drawn given the row, with the model error of the fitted recordings: each
+    prior draw is moved to the optimum under a perturbed row and its prior (`fit_own`). The offset is removed from the
+    row's error at every step. The first recording of a group with a first row is used.
 
     Args:
-        problem: of the new recordings.
+        problem: problem of the new recordings.
         values: draws of all its parameters.
-        names: recordings whose offset is to be found.
-        deviations: those that were drawn from their prior.
-        left: how far the model was off for each marker; without, offsets weigh all markers the same, and deviations
-            stay as they were drawn.
-        key: of the perturbations.
+        names: recordings with an unknown offset.
+        deviations: deviations drawn from their prior.
+        left: model error of each marker; without it, offsets weight all markers equally, and deviations are unchanged.
+        key: random key of the perturbations.
 
     Returns:
-        the values, and how many draws did not converge: they keep the best that they have found.
+        the values, and the number of unconverged draws, which keep their best point.
 
     Raises:
         InputError: a first row that is masked throughout.
     """
     recordings = problem.model.recordings
-    shifted = [p for p in problem.model.space.parameters if p.recording in names and p.spec.name in OFFSETS]
+    shifted = [p for p in problem.model.scopes.parameters if p.scope.owner in names and p.spec.name in OFFSETS]
     if shifted:
-        values = _with_offsets(problem, values, names, left)
+        values = _with_offsets(problem, values, shifted, left)
     if left is None or not deviations:
         return values, 0
     lost = 0
-    for number, group in enumerate(dict.fromkeys(p.recording for p in deviations)):
-        own = [p for p in deviations if p.recording == group]
+    for number, group in enumerate(dict.fromkeys(p.scope.owner for p in deviations)):
+        own = [p for p in deviations if p.scope.owner == group]
         seen = [r for r in own[0].members if recordings.line.valid[recordings.names.index(r), 0].any()]
         if seen:
-            free = any(p.recording == seen[0] for p in shifted)
+            free = any(p.scope.owner == seen[0] for p in shifted)
             own_key = jax.random.fold_in(key, number)
             values, unmatched = _with_deviations(problem, values, seen[0], own, left, own_key, shifted=free)
             lost += unmatched
-    return (_with_offsets(problem, values, names, left) if shifted else values), lost
+    return (_with_offsets(problem, values, shifted, left) if shifted else values), lost
 
 
 def weighed_by_first_row(
@@ -89,17 +87,17 @@ def weighed_by_first_row(
     left: ModelError | None,
     key: PRNGKeyArray,
 ) -> Int[np.ndarray, "n recording"]:
-    """Draws to predict each recording with: resampled by how well they predict its first row.
+    """Indices of draws for each recording, resampled by the likelihood of its first row.
 
-    The likelihood of a row is normal, with the model's own error for each marker. Where it would leave less than a
-    tenth of the draws (in effective sample size), it is raised to a power that leaves as many.
+    The likelihood of a row is normal, with the model's own error for each marker. If the effective sample size were
+    less than a tenth of the draws, the likelihood is raised to a power that keeps a tenth.
 
     Args:
-        recordings: those to predict.
+        recordings: recordings to predict.
         position: simulated markers [m] in their first rows.
-        names: those among them whose first row `match_first_row` has not used.
-        left: how far the model was off for each marker; without, all draws count the same.
-        key: of the resampling.
+        names: recordings whose first row `match_first_row` has not used.
+        left: model error of each marker; without it, all draws have equal weight.
+        key: random key of the resampling.
     """
     count = len(position)
     index = np.tile(np.arange(count)[:, None], (1, len(recordings.names)))
@@ -116,11 +114,10 @@ def weighed_by_first_row(
 
 
 def far_first_rows(predictions: Sequence[RecordingPrediction], left: ModelError | None) -> dict[str, float]:
-    """How many times as far as the model is wrong measured first rows are from the predicted ones, where that is too
-    much for chance.
+    """Distance of measured from predicted first rows in units of the model error, if it exceeds chance.
 
-    A row's errors are taken for normal, of the sizes that the model has left, in as many independent coordinates as
-    these have shown (`ModelError.share`).
+    Errors of a row are assumed normal, with the sizes and the number of independent coordinates of the residuals
+    (`ModelError.share`).
     """
     found = {}
     for p in predictions:
@@ -135,24 +132,26 @@ def far_first_rows(predictions: Sequence[RecordingPrediction], left: ModelError 
     return found
 
 
-def _with_offsets(problem: CalibrationProblem, values: Batch, names: Sequence[str], left: ModelError | None) -> Batch:
+def _with_offsets(
+    problem: CalibrationProblem, values: Batch, offsets: Sequence[InferredParameter], left: ModelError | None
+) -> Batch:
     recordings = problem.model.recordings
     position = _first_rows(problem, values)
     precision = 1.0 / _errors(recordings.markers, left) ** 2
     shifted = dict(values)
     for index, name in enumerate(recordings.names):
         valid = recordings.line.valid[index, 0]
-        if name not in names or not recordings.line.valid[index].any():
-            continue  # commands alone: where the frame lies is as uncertain as it was among the fitted recordings
+        own = [p for p in offsets if p.scope.owner == name]
+        if not own or not recordings.line.valid[index].any():
+            continue  # commands alone: the position of the frame is as uncertain as among the fitted recordings
         if not valid.any():
             raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
         error = recordings.position[index, 0, valid] - position[:, index, valid]
-        for axis, offset in enumerate(OFFSETS):
-            key = f"{offset}{SEPARATOR}{name}"
-            if key in shifted:
-                shift = np.average(error[:, :, axis], axis=1, weights=precision[valid])
-                # A draw that fails here is counted when all is rolled out.
-                shifted[key] = shifted[key] + np.nan_to_num(shift)
+        for offset in own:
+            axis = OFFSETS.index(offset.spec.name)
+            shift = np.average(error[:, :, axis], axis=1, weights=precision[valid])
+            # A draw that fails here is counted when all is rolled out.
+            shifted[offset.name] = shifted[offset.name] + np.nan_to_num(shift)
     return shifted
 
 
@@ -166,12 +165,13 @@ def _with_deviations(
     *,
     shifted: bool,
 ) -> tuple[Batch, int]:
-    """Each draw of the deviations, in units of their spread, at the optimum for a perturbed first row, and how many did
-    not converge; where ``shifted``, the frame is free to shift and only the row's shape counts."""
+    """Each draw of the deviations, in units of their spread, at the optimum for a perturbed first row, and the number
+    of unconverged draws. With ``shifted`` the frame may shift, and only the row's shape counts.
+    """
     recordings = problem.model.recordings
     index = recordings.names.index(recording)
     valid = recordings.line.valid[index, 0]
-    spread = np.stack([spread_of_draws(p, values, len(values[p.name])) for p in own], axis=1)
+    spread = np.stack([p.info.spread_of(values, len(values[p.name])) for p in own], axis=1)
     drawn = np.stack([values[p.name] for p in own], axis=1) / spread
     sd = _errors(recordings.markers, left)[valid, None] / np.sqrt(3.0)
     noise = np.asarray(jax.random.normal(key, (len(drawn), int(valid.sum()), 3)))
@@ -190,15 +190,6 @@ def _with_deviations(
     return {**values, **dict(matched)}, int((~found.converged).sum())
 
 
-def spread_of_draws(
-    deviation: InferredParameter, values: Mapping[str, np.ndarray], count: int
-) -> Float[np.ndarray, " n"]:
-    """Standard deviation between groups of what a deviation is added to, for each of ``count`` draws."""
-    if deviation.scaled_by:
-        return np.asarray(values[deviation.scaled_by])
-    return np.full(count, float((deviation.table or {})["scale"]))
-
-
 def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray, "n recording marker 3"]:
     """Simulated markers [m] in the first row of every recording; NaN for rollouts that do not reach it well."""
     rows, status = problem.rollouts(values, 1)
@@ -207,6 +198,6 @@ def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray,
 
 
 def _errors(markers: Sequence[str], left: ModelError | None) -> Float[np.ndarray, " marker"]:
-    """How far [m] the model is off for each marker; a metre for one that was not fitted."""
+    """Error [m] of the model for each marker; a metre for one that was not fitted."""
     known = () if left is None else left.markers
     return np.array([max(left.of_marker(name), SMALLEST_ERROR) if left and name in known else 1.0 for name in markers])

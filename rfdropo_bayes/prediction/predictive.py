@@ -1,6 +1,6 @@
 """Predictions under a posterior: of the recordings it was fitted to, and of recordings it has never seen.
 
-A cube that is pushed starts where it was measured before a new recording.
+A pushed cube starts at its measured pose in a new recording.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from rfdropo_bayes.bayes.channels.object_pose import (
     OFFSETS,
     draw_object_error,
 )
-from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.scopes import Extension, Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
-from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.day_error import DayError
 from rfdropo_bayes.prediction.day_spread import draw_deviation
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
-# Among the attributes of a posterior.
-FITTED, HELD = "fitted_recordings", "held_parameters"
+# Keys of a posterior's attributes.
+FITTED = "fitted_recordings"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
-KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
+KNOWN_NOISE = "known_noise"  # of the positions, if its parameters are not inferred
 SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
 PLACE = ("cube_x", "cube_y", "cube_z", "cube_yaw")
 
@@ -54,10 +54,10 @@ class NewPredictions(NamedTuple):
 
     Attributes:
         recordings: the predictions.
-        unmatched: draws that did not converge in matching a first row.
-        far: how many times as far as the model is wrong in the fitted recordings a first row is from the simulated one,
-            by recording, where that is too much for chance.
-        without: cautions of groups that no fit has seen, see `without_cautions`.
+        unmatched: number of draws that did not converge on a first row.
+        far: distance of the measured from the simulated first row in units of the model error, by recording, if it
+            exceeds chance.
+        without: cautions on groups that no fit has seen, see `without_cautions`.
     """
 
     recordings: list[RecordingPrediction]
@@ -67,8 +67,9 @@ class NewPredictions(NamedTuple):
 
 
 def match_cautions(found: NewPredictions) -> list[Caution]:
-    """Cautions where draws did not converge in matching a first row, where one stays far from the simulated one, and
-    where a group is without what others have."""
+    """Cautions on draws that did not converge on a first row, on distant first rows, and on groups that lack parameters
+    of others.
+    """
     cautions = list(found.without)
     if found.unmatched:
         sentence = (
@@ -78,29 +79,26 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
         cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
     for name, times in found.far.items():
         sentence = (
-            f"the first row of {name} is {times:.2g} times as far from the simulated one as the model was wrong in the "
-            "fitted recordings: see that frame, units and start are those of the fitted recordings, or adapt to a "
-            "recording of that day"
+            f"the first row of {name} is {times:.2g} times as far from the simulated row as the model "
+            "error in the fitted recordings: check that frame, units and start match the fitted "
+            "recordings, or adapt to a recording of that session"
         )
         cautions.append(Caution(Code.FIRST_ROW_FAR, sentence))
     return cautions
 
 
-def without_cautions(space: ParameterSpace, groups: Sequence[str], known: Container[str]) -> list[Caution]:
-    """Cautions of groups that no fit has seen, where some of the fitted groups alone have a parameter.
+def without_cautions(scopes: Scopes, groups: Sequence[str], known: Container[str]) -> list[Caution]:
+    """Cautions on groups that no fit has seen, if only some fitted groups have a parameter.
 
     Args:
-        space: of the fit.
-        groups: that are predicted; known: those of the fitted recordings.
+        scopes: scopes of the fit.
+        groups: groups to predict; known: groups of the fitted recordings.
     """
-    owners: dict[str, list[str]] = {}
-    for parameter in space.parameters:
-        if parameter.scoped:
-            owners.setdefault(parameter.spec.name, []).append(parameter.recording)
+    owners = scopes.groups_alone
     names = "; ".join(f"{name} in {' and '.join(own)}" for name, own in owners.items())
     sentence = (
-        "{0} is predicted without what some of the fitted groups alone have ({1}); if {0} may have it, name {0} in "
-        "[model.only_in] and calibrate with a recording of {0}"
+        "{0} is predicted without ({1}), which only some of the fitted groups have; if {0} may have it, "
+        "name {0} in [model.only_in] and calibrate with a recording of {0}"
     )
     unseen = [group for group in groups if group not in known]
     return [Caution(Code.GROUP_WITHOUT, sentence.format(group, names)) for group in unseen if owners]
@@ -135,36 +133,37 @@ def predict_new(
 ) -> NewPredictions:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
-    A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
-    them at random for every draw; what is of a group of recordings takes, for a new group, values from the spread
-    between groups. The offset of the measuring frame and the deviations of a new group are then conditioned on the
-    first row (`match_first_row`), and for a new recording of a known group draws count as they predict its first row
+    A parameter that was free per recording takes, for a new recording, its value in a random fitted recording, chosen
+    anew for every draw. A parameter of a group takes, for a new group, values from the spread between groups. The
+    offset of the measuring frame and the deviations of a new group are then conditioned on the first row
+    (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
     (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
-    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A parameter
-    that some groups alone have is that of their new recordings, too; a group that no fit has seen is without it. A cube
-    starts where it was measured in the first row.
+    A parameter that only some fitted recordings had free, such as a payload, applies to them alone. A parameter that
+    only some groups have also applies to their new recordings; an unseen group lacks it. A cube starts at its measured
+    pose in the first row.
 
     Args:
-        fitted: names of the recordings that were fitted.
-        left: what the model left of the fitted recordings, which is its error in new ones where its noise is taken to
-            be independent from row to row; without, all markers weigh the same in a first row.
-        groups: which recordings belong together, by name or wildcard; each is a group of its own without.
-        slow: error of the day of each recording that no fit has seen, by its name.
+        fitted: names of the fitted recordings.
+        left: residuals of the model on the fitted recordings, its error in new recordings if its noise is white;
+            without it, all markers have equal weight in a first row.
+        groups: recordings that belong together, by name or wildcard; by default each is its own group.
+        slow: error of the session of each unseen recording, by name.
     """
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
-    space, extended = _for_new_recordings(model.space, values, names, fitted, own_key, groups or {})
+    extension = model.scopes.extended(names, fitted, groups or {})
+    scopes, extended = extension.scopes, draw_extended(extension, values, names, own_key)
     recordings = gather_recordings(model.simulator, trajectories)
     markers = model.markers.like(recordings)
     if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
         step = sample_time(*(t.time for t in trajectories))
         noise = noise_of_markers(left.every(step), left.markers, recordings)
         markers = replace(markers, known=noise.at(recordings.steps))
-    fresh = replace(model, space=space, recordings=recordings, channels=(markers,))
+    fresh = replace(model, scopes=scopes, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)
-    own = _known_recordings(model.space, fitted)
-    drawn = [p for p in space.parameters if p.added_to and p.name not in values]
+    own = model.scopes.recordings_known(fitted)
+    drawn = [p for p in scopes.deviating if p.name not in values]
     new = [n for n in names if whole(n) not in own]
     extended, unmatched = match_first_row(problem, extended, new, drawn, left, row_key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
@@ -179,8 +178,8 @@ def predict_new(
         for p, k in zip(predictions, keys, strict=True)
     ]
     patterns = groups or {}
-    known = {*gather_groups(fitted, patterns), *(p.recording for p in model.space.parameters if p.added_to or p.scoped)}
-    without = without_cautions(model.space, list(gather_groups(names, patterns)), known)
+    known = {*gather_groups(fitted, patterns), *(p.scope.owner for p in model.scopes.parameters if p.scope.group)}
+    without = without_cautions(model.scopes, list(gather_groups(names, patterns)), known)
     return NewPredictions(predictions, unmatched, far_first_rows(predictions, left), without)
 
 
@@ -199,10 +198,10 @@ def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKey
 def with_repeats_marked(
     predictions: Sequence[RecordingPrediction], trajectories: Sequence[Trajectory]
 ) -> list[RecordingPrediction]:
-    """Predictions that say which of them repeat the commands of another one of the same split.
+    """Predictions with repeats of the same commands marked within each split.
 
     Args:
-        predictions: of recordings.
+        predictions: predictions of recordings.
         trajectories: these recordings, in the same order.
     """
     marked, number = list(predictions), 0
@@ -216,62 +215,27 @@ def with_repeats_marked(
     return marked
 
 
-def _for_new_recordings(
-    space: ParameterSpace,
-    values: Batch,
-    names: Sequence[str],
-    fitted: Sequence[str],
-    key: PRNGKeyArray,
-    groups: Patterns,
-) -> tuple[ParameterSpace, Batch]:
-    """The space with its per-recording parameters renamed to the new recordings, and values for them."""
-    own = _known_recordings(space, fitted)
-    shared = [p for p in space.parameters if not p.recording]
-    families: dict[str, list[InferredParameter]] = {}
-    for parameter in space.parameters:
-        if parameter.of_recordings_alone:
-            families.setdefault(parameter.spec.name, []).append(parameter)
-    extended = {p.name: values[p.name] for p in shared}
-    count = len(next(iter(values.values())))
-    parameters = list(shared)
-    for index, recording in enumerate(names):
-        # One fitted recording is chosen per draw for all families at once: its values belong together.
-        chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
-        for name, family in families.items():
-            members = [p for p in family if whole(p.recording) == whole(recording)]
-            of_fit = [p for p in family if p.recording in fitted]
-            if not members and len(of_fit) == len(fitted) and whole(recording) not in own:
-                members = of_fit
-            if not members:
-                continue
-            pool = np.stack([values[member.name] for member in members])
-            extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
-            parameters.append(replace(members[0], recording=recording))
-    gathered = gather_groups(names, groups)
-    for parameter in space.parameters:
-        if parameter.scoped and parameter.recording in gathered:
-            extended[parameter.name] = values[parameter.name]
-            parameters.append(replace(parameter, members=gathered[parameter.recording]))
-    deviating = [p for p in space.parameters if p.added_to]
-    for parameter in _deviations(deviating, gathered):
-        drawn = values.get(parameter.name)
-        if drawn is None:
-            own_key = jax.random.fold_in(key, len(names) + len(parameters))
-            drawn = draw_deviation(parameter, values, own_key, count)
-        extended[parameter.name] = drawn
-        parameters.append(parameter)
-    return ParameterSpace(tuple(parameters)), extended
+def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key: PRNGKeyArray) -> Batch:
+    """Values of the parameters of new recordings, from draws of the fitted parameters.
 
-
-def _known_recordings(space: ParameterSpace, fitted: Sequence[str]) -> set[str]:
-    """Recordings that were fitted, or that an adapted posterior has values of from the fit before."""
-    return {whole(name) for name in (*fitted, *(p.recording for p in space.parameters if p.of_recordings_alone))}
-
-
-def _deviations(fitted: Sequence[InferredParameter], groups: Mapping[str, tuple[str, ...]]) -> list[InferredParameter]:
-    """The deviations of the groups that new recordings belong to, whether any of a group was fitted or not."""
-    kinds = {p.spec.name: p for p in fitted}
-    return [replace(p, recording=group, members=members) for group, members in groups.items() for p in kinds.values()]
+    One fitted recording is chosen per draw for all parameters of a new recording: its values belong together.
+    """
+    count, found = len(next(iter(values.values()))), {}
+    chosen = {
+        name: np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
+        for index, name in enumerate(names)
+    }
+    for number, parameter in enumerate(extension.scopes.parameters):
+        like = extension.like[parameter.name]
+        if not like:
+            own_key = jax.random.fold_in(key, len(names) + number)
+            found[parameter.name] = draw_deviation(parameter.info, values, own_key, count)
+        elif len(like) == 1:
+            found[parameter.name] = values[like[0]]
+        else:
+            pool = np.stack([values[name] for name in like])
+            found[parameter.name] = pool[chosen[parameter.scope.owner] % len(like), np.arange(count)]
+    return found
 
 
 def _predictions(
@@ -284,7 +248,7 @@ def _predictions(
     unseen: Sequence[str] = (),
     left: ModelError | None = None,
 ) -> list[RecordingPrediction]:
-    """Predictions of the recordings of a problem; draws count for those ``unseen`` as they predict the first row."""
+    """Predictions of the recordings of a problem; draws of ``unseen`` recordings are weighted by the first row."""
     recordings = problem.model.recordings
     position, pose, fine = _ended_well(problem, values)
     key, choice, again_key = jax.random.split(key, 3)
@@ -337,27 +301,26 @@ def _ended_well(problem: CalibrationProblem, values: Batch) -> tuple[np.ndarray,
 def with_measured_starts(
     model: TrajectoryModel, trajectories: Sequence[Trajectory], values: Batch
 ) -> tuple[TrajectoryModel, Batch]:
-    """Let the cube of every recording start where it was measured in the first row, standing on the plate.
+    """Let the cube of every recording start at its measured pose in the first row, standing on the plate.
 
-    Whatever the values say of its place is replaced, for those recordings; the measuring frame's offset, which differs
-    between draws, is taken off. A recording without a measured cube keeps what the values say.
+    Its pose in the values is replaced for these recordings, less the measuring frame's offset of each draw. A recording
+    without a measured cube keeps the pose of the values.
     """
     simulator = model.simulator
     if not isinstance(simulator, RobotSimulator) or not simulator.pushes:
         return model, values
     specs = {spec.name: spec for spec in simulator.parameters}
-    kept = [p for p in model.space.parameters if p.spec.name not in PLACE]
-    placed = {p.name: values[p.name] for p in kept}
-    parameters = list(kept)
-    for trajectory in trajectories:
-        known = model.space.for_recording(values, trajectory.name)
-        known |= _place(simulator, model, trajectory, values)
-        for name in PLACE:
-            if name in known:
-                prior = prior_from_table(specs[name], dict(specs[name].prior), where=name)
-                parameters.append(InferredParameter(specs[name], prior, trajectory.name))
-                placed[f"{name}{SEPARATOR}{trajectory.name}"] = np.asarray(known[name])
-    return replace(model, space=ParameterSpace(tuple(parameters))), placed
+    inferred = {p.spec.name for p in model.scopes.parameters}
+    parameters = [p for p in model.scopes.parameters if p.spec.name not in PLACE]
+    placed = {p.name: values[p.name] for p in parameters}
+    for run in trajectories:
+        measured = _place(simulator, model, run, values)
+        known = {**model.scopes.values_in(run.name, values), **measured}
+        for name in (name for name in PLACE if name in measured or (name in inferred and name in known)):
+            own = InferredParameter.of(specs[name], {}, Scope(run.name), (run.name,), where="prediction")
+            parameters.append(own)
+            placed[own.name] = np.asarray(known[name])
+    return replace(model, scopes=replace(model.scopes, parameters=tuple(parameters))), placed
 
 
 def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajectory, values: Batch) -> Batch:
@@ -366,13 +329,15 @@ def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajec
     if pose is None or not np.isfinite(pose[0]).all():
         return {}
     count = len(next(iter(values.values())))
-    known = {**model.fixed, **model.space.for_recording(values, trajectory.name)}
+    known = model.scopes.values_in(trajectory.name, values)
     placed = simulator.with_object_at(known, pose[0])
     return {name: np.broadcast_to(np.asarray(placed[name]), (count,)) for name in PLACE}
 
 
 def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]:
-    """Shift [m] of measured against simulated positions among the values of one recording; zero where it is none's."""
+    """Shift [m] of measured against simulated positions among the values of one recording; zero if no offset is a
+    parameter.
+    """
     return np.stack(
         [np.broadcast_to(np.asarray(known.get(name, 0.0), dtype=float), (count,)) for name in OFFSETS], axis=1
     )
@@ -381,13 +346,14 @@ def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]
 def measured_objects(
     problem: CalibrationProblem, pose: Float[np.ndarray, "n recording time 7"], values: Batch, key: PRNGKeyArray
 ) -> Float[np.ndarray, "n recording time 7"]:
-    """Simulated poses of the cube as they would be measured: with the offset of the measuring frame and, where measured
-    poses were among the data, with the error that the model was found to have."""
+    """Simulated poses of the cube as they would be measured: with the offset of the measuring frame and, if measured
+    poses were data, with the fitted model error.
+    """
     model = problem.model
     shifted = np.array(pose)
     count = len(shifted)
     for index, name in enumerate(model.recordings.names):
-        known = {**model.fixed, **model.space.for_recording(values, name)}
+        known = model.scopes.values_in(name, values)
         shifted[:, index, :, :3] += offsets(known, count)[:, None]
         sizes = {s.name: np.broadcast_to(known[s.name], (count,)) for s in SIZES if s.name in known}
         if sizes:

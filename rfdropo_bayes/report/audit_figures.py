@@ -53,6 +53,28 @@ def _strongest(series: np.ndarray, main: np.ndarray) -> int:
 
 
 @dataclass(frozen=True)
+class ClassEffect:
+    """Part of the residuals explained by a class of candidates, row by row as in `Residuals`.
+
+    Attributes:
+        names: candidates of the class, the leading one first.
+        before, after: mean square of the whitened residual of the markers, without and with its linear effect.
+        markers, recordings: both mean squares of each marker and each group of repeats, by name.
+    """
+
+    names: tuple[str, ...]
+    before: Float[np.ndarray, " row"]
+    after: Float[np.ndarray, " row"]
+    markers: Mapping[str, tuple[float, float]]
+    recordings: Mapping[str, tuple[float, float]]
+
+    @property
+    def share(self) -> float:
+        """Explained share of the sum of squares."""
+        return 1.0 - float(self.after.sum() / max(float(self.before.sum()), 1e-300))
+
+
+@dataclass(frozen=True)
 class Signal:
     """A signal at a port, with its band.
 
@@ -88,6 +110,7 @@ class Shown:
             remains.
         tracks: replays of unseen recordings.
         port: the signal at the port with an effect that the library lacks; None without such an effect.
+        classes: leading classes of candidates.
     """
 
     residuals: Residuals
@@ -100,6 +123,7 @@ class Shown:
     remainder: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row 3"], Float[np.ndarray, "row 3"]] | None
     tracks: Sequence[Track] = ()
     port: Signal | None = None
+    classes: Sequence[ClassEffect] = ()
 
 
 def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:
@@ -267,3 +291,45 @@ def signal_figure(signal: Signal) -> Figure:
     unit = "" if signal.unit == "-" else f" [{signal.unit}]"
     every[0].set_ylabel(f"{signal.port}{unit}")
     return figure
+
+
+@style.styled
+def class_figure(residuals: Residuals, effect: ClassEffect) -> Figure:
+    """Residuals with and without a class of candidates, against time, command, direction, marker and recording."""
+    figure = Figure(figsize=(style.WIDTH, 2.2))
+    every = figure.subplots(1, 5, sharey=True)
+    channel = _strongest(residuals.command, residuals.main)
+    against = (
+        ("time [s]", residuals.time),
+        (f"{residuals.channels[channel]} [{residuals.unit}]", residuals.command[:, channel]),
+        ("direction", np.sign(residuals.rate[:, channel])),
+    )
+    for axes, (label, cause) in zip(every, against, strict=False):
+        centres, means = binned(cause, np.stack([effect.before, effect.after]))
+        for mean, colour in zip(means, (style.TEST, style.POSTERIOR), strict=True):
+            axes.plot(centres, mean, color=colour, marker=".", linewidth=1.0)
+        axes.set_xlabel(label)
+    for axes, bars, label in zip(every[3:], (effect.markers, effect.recordings), ("marker", "recording"), strict=True):
+        place = np.arange(len(bars))
+        for shift, colour, which in ((-0.2, style.TEST, 0), (0.2, style.POSTERIOR, 1)):
+            axes.bar(place + shift, [pair[which] for pair in bars.values()], width=0.4, color=colour)
+        axes.set_xticks(place, list(bars) if len(bars) <= MOST_SIGNALS else [""] * len(bars))
+        axes.set_xlabel(label)
+    every[0].set_ylabel("mean square [noise]")
+    return figure
+
+
+def binned(
+    cause: Float[np.ndarray, " row"], values: Float[np.ndarray, "k row"]
+) -> tuple[Float[np.ndarray, " bin"], Float[np.ndarray, "k bin"]]:
+    """Means over rows with as much of a cause: over each of its values, or, of more than `BINS`, over quantiles."""
+    known = np.unique(cause)
+    if len(known) > BINS:
+        edges = np.unique(np.quantile(cause, np.linspace(0.0, 1.0, BINS + 1)))
+        place = np.clip(np.searchsorted(edges, cause, side="right") - 1, 0, len(edges) - 2)
+    else:
+        place = np.searchsorted(known, cause)
+    counts = np.bincount(place)
+    kept = counts > 0
+    means = [np.bincount(place, weights=value)[kept] / counts[kept] for value in (cause, *values)]
+    return means[0], np.stack(means[1:])

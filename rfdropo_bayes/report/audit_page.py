@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from rfdropo_bayes.discrepancy.omnibus import BLOCK
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.score import likeness
+from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.replay import Track, replay
@@ -37,7 +38,7 @@ def render_audit(
         seen: data of its figures.
         content: content of audit.json.
         title: title of the experiment.
-        config: the experiment file as it was run.
+        config: the experiment file of the run.
         outline: outline of the robot.
     """
     return render(
@@ -46,6 +47,7 @@ def render_audit(
         title=title,
         sections=SECTIONS,
         pictures=_pictures(seen, outline),
+        classes=[(c, embed(figures.class_figure(seen.residuals, c), _said(c))) for c in seen.classes],
         replayed=replay(seen.tracks, outline),
         config=config,
     )
@@ -117,7 +119,48 @@ def shown(answer: Answer) -> figures.Shown:
         (rest.time, rest.mean[0, :, -3:], rest.sd[0, :, -3:]) if rest.amplitude > 0.0 else None,
         tracks,
         _signal(answer),
+        class_effects(answer),
     )
+
+
+def class_effects(answer: Answer) -> list[figures.ClassEffect]:
+    """Effects of the leading classes of candidates on the base model's residuals, adopted or not."""
+    first, rules = answer.causes.screens[0], answer.problem.rules
+    heads: list[list[ScreenRow]] = []
+    for row in first.rows:
+        if row.probe is None or row.adjusted_p > rules.family:
+            continue
+        own = next((h for h in heads if _alike(h[0], row) > rules.class_cosine), None)
+        if own is not None:
+            own.append(row)
+        elif len(heads) < rules.classes:
+            heads.append([row])
+    return [_effect(answer, first, members) for members in heads]
+
+
+def _alike(first: ScreenRow, second: ScreenRow) -> float:
+    return likeness(first.probe.mark, second.probe.mark) if first.probe and second.probe else 0.0
+
+
+def _effect(answer: Answer, screen: Screen, members: Sequence[ScreenRow]) -> figures.ClassEffect:
+    """The linear effect of the leading member of a class at the size that explains most."""
+    assert members[0].probe is not None
+    measured, basis, left = answer.target.measurements, members[0].probe.mark.basis, screen.fit.residual
+    both = [measured.series(each)[..., : measured.markers] ** 2 for each in (left, left - basis @ (basis.T @ left))]
+    valid = measured.valid[..., : measured.markers]
+    rows, each = valid.any(axis=2), valid.reshape(*valid.shape[:2], -1, 3)
+    counts = np.maximum(valid.sum(axis=2), 1)
+
+    def pairs(names: Sequence[str], axis: int) -> dict[str, tuple[float, float]]:
+        others = tuple(k for k in range(4) if k != axis)
+        count = np.maximum(each.sum(axis=others), 1)
+        found = [np.where(each, square.reshape(each.shape), 0.0).sum(axis=others) / count for square in both]
+        return {name: (float(b), float(a)) for name, b, a in zip(names, *found, strict=True)}
+
+    before, after = ((np.where(valid, square, 0.0).sum(axis=2) / counts)[rows] for square in both)
+    names = tuple(row.name for row in members)
+    markers = answer.problem.model.recordings.markers
+    return figures.ClassEffect(names, before, after, pairs(markers, 2), pairs(measured.names, 0))
 
 
 def _signal(answer: Answer) -> figures.Signal | None:
@@ -131,6 +174,10 @@ def _signal(answer: Answer) -> figures.Signal | None:
         row = next(each for each in described.found.ports if each.port in members)
     names = answer.target.measurements.names
     return figures.Signal(row.port.words, row.port.unit, names, described.found.centre, row.mean, row.sd)
+
+
+def _said(effect: figures.ClassEffect) -> str:
+    return f"Misfit with and without {display_name(effect.names[0])}"
 
 
 def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:

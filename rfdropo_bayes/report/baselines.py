@@ -1,7 +1,7 @@
 """The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, repeats, a regression on the
 commands.
 
-None of them knows anything of the robot. A calibrated simulator that does not beat them has not earned its keep.
+They use no model of the robot. A calibrated simulator that does not beat them has not earned its keep.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class BaselineErrors:
     Attributes:
         name: key in summary.json.
         title: name for people.
-        description: how it predicts, in one sentence.
+        description: the method, in one sentence.
         fit, test: its errors; None if it has none.
         reason: why it could not predict; empty if it could.
     """
@@ -42,14 +42,14 @@ class BaselineErrors:
 
 
 def held_initial_pose(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-    """The first usable position of each marker, for ever."""
+    """The first usable position of each marker, held constant."""
     first = np.argmax(recording.position_mask, axis=0)
     pose = recording.position[first, np.arange(recording.position.shape[1])]
     return np.broadcast_to(pose, recording.position.shape)
 
 
 def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean position of each marker over all rows of the fit recordings, for ever."""
+    """The mean position of each marker over all rows of the fit recordings, held constant."""
     weight = np.concatenate([t.position_mask for t in fit]).astype(float)
     total = np.einsum("tm,tma->ma", weight, np.concatenate([t.position for t in fit]))
     pose = total / np.maximum(weight.sum(axis=0), 1.0)[:, None]
@@ -153,7 +153,7 @@ def baseline_errors(
     groups = [list(group) for group in group_repeats(fit)]
     linear, cubic = fit_fir(fit, groups, degree=1), fit_fir(fit, groups, degree=3)
     predictors: dict[str, tuple[str, str, Predictor]] = {
-        "initial_pose": ("initial pose held", "each recording's own first pose, for ever", held_initial_pose),
+        "initial_pose": ("initial pose held", "each recording's own first pose, held constant", held_initial_pose),
         "mean_pose": ("constant mean pose", f"mean pose of the fit recordings ({trained_on})", mean_pose(fit)),
         "copied_mean": (
             "fit mean copied",
@@ -169,7 +169,7 @@ def baseline_errors(
         "fir_cubic": ("cubic FIR", _describe(cubic, trained_on), cubic.predict),
     }
     return {
-        name: _scored(name, title, description, predict, fit, test)
+        name: scored(name, title, description, predict, fit, test)
         for name, (title, description, predict) in predictors.items()
     }
 
@@ -190,7 +190,7 @@ def _describe(fir: FirRegression, trained_on: str) -> str:
     )
 
 
-def _scored(
+def scored(
     name: str,
     title: str,
     description: str,
@@ -198,6 +198,7 @@ def _scored(
     fit: Sequence[Trajectory],
     test: Sequence[Trajectory],
 ) -> BaselineErrors:
+    """Errors of a predictor on the fitted and the test recordings, or the reason if it cannot predict."""
     figures: list[ErrorFigures | None] = []
     reason = ""
     for recordings in (fit, test):

@@ -71,7 +71,7 @@ class TransformCurve(NamedTuple):
         grid: probabilities.
         ecdf: share of the values at or below them.
         independent: number of independent values that the data are worth.
-        half_width: of the 95 % simultaneous band about the diagonal (Kolmogorov).
+        half_width: half width of the 95 % simultaneous band about the diagonal (Kolmogorov).
     """
 
     grid: Float[np.ndarray, " grid"]

@@ -82,8 +82,8 @@ class RunFacts:
         cautions: reasons to doubt the result.
         recordings: fit first, then test.
         model: label -> words, e.g. mechanisms, noise, fixed values, time step.
-        residuals: from `check_residuals`; empty if the method has no likelihood.
-        baselines: from `baseline_errors`; empty if not computed.
+        residuals: result of `check_residuals`; empty if the method has no likelihood.
+        baselines: result of `baseline_errors`; empty if not computed.
         fitted_commands: test recordings whose commands were also fitted.
         noise_floor: noise between repeats of each marker [m]; None without repeats.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
@@ -94,7 +94,7 @@ class RunFacts:
         limits: further sentences on the limits of this analysis.
         versions: versions of the software.
         details: further values of the method.
-        outline: of the robot, as `robots.robot_shape` makes it, for its picture.
+        outline: outline of the robot from `robots.robot_shape`, for its picture.
     """
 
     title: str

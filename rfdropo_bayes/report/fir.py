@@ -22,12 +22,12 @@ class FirRegression:
     """A trained regression.
 
     Attributes:
-        lags: ages of the commands it looks at [s].
+        lags: ages of its input commands [s].
         degree: highest power of a command.
         low, high: range of each feature in training; features are cut there, so that powers do not run away.
-        centre, scale: that standardise the features.
+        centre, scale: constants that standardise the features.
         offset: mean pose.
-        weights: of the standardised features.
+        weights: weights of the standardised features.
         penalty: ridge penalty per row.
         error: cross-validated root mean square distance, all markers [m].
     """

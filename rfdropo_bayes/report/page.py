@@ -84,7 +84,7 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
     Args:
         record: posterior and predictions.
         summary: content of summary.json, as `build_summary` made it.
-        config: the experiment file as it was run, TOML.
+        config: the experiment file of the run, TOML.
     """
     return render(
         "page.html.j2",
@@ -183,7 +183,7 @@ def _prior_rows(record: PosteriorRecord) -> list[tuple[str, ParameterInfo]]:
     """
     kinds: dict[tuple[str, str], list[ParameterInfo]] = {}
     for info in record.free:
-        kinds.setdefault((info.name.split("@")[0] if "@" in info.name else info.name, str(info.prior)), []).append(info)
+        kinds.setdefault((info.parameter, str(info.prior)), []).append(info)
     return [
         (f"{name} (one for each of {len(infos)} recordings)" if len(infos) > 1 else infos[0].name, infos[0])
         for (name, _), infos in kinds.items()
@@ -193,15 +193,15 @@ def _prior_rows(record: PosteriorRecord) -> list[tuple[str, ParameterInfo]]:
 def _posterior_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The posterior table in units that read well, one unit per parameter for all recordings."""
     magnitude: dict[str, float] = {}
-    for name, row in summary["parameters"].items():
-        base = name.split("@")[0]
+    for row in summary["parameters"].values():
+        base = row["parameter"]
         magnitude[base] = max(magnitude.get(base, 0.0), abs(row["q05"]), abs(row["q95"]))
     rows = []
     for name, row in summary["parameters"].items():
-        factor, unit = display_unit(row["unit"], magnitude[name.split("@")[0]])
+        factor, unit = display_unit(row["unit"], magnitude[row["parameter"]])
         keys = ("mean", "sd", "q05", "median", "q95", "prior_q05", "prior_q95")
         scaled = {key: None if row.get(key) is None else row[key] / factor for key in keys}
-        rows.append({**row, **scaled, "name": name, "unit": unit, "own": "@" in name})
+        rows.append({**row, **scaled, "name": name, "unit": unit, "own": bool(row["owner"])})
     return rows
 
 
@@ -231,8 +231,8 @@ def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[st
     floor = summary.get("noise_floor_mm")
     scored = any(row[role] is not None for row in rows for role in ("fit", "test"))
     pair = posterior_figures.paired_names(record)
-    own = [info.name for info in record.free if "@" in info.name]
-    shared = [info.name for info in record.parameters if "@" not in info.name][: posterior_figures.MOST_PANELS]
+    own = [info for info in record.free if info.scope.owner]
+    shared = [info.name for info in record.parameters if not info.scope.owner][: posterior_figures.MOST_PANELS]
     outline = summary.get("outline")
     return {
         "robot": embed(robot_figure(outline), "The robot from the side and from its base") if outline else None,

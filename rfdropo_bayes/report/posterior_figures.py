@@ -25,7 +25,7 @@ def paired_names(record: PosteriorRecord) -> list[str]:
     """Parameters that the pair plot shows: varying shared parameters, the most correlated first if there are too
     many.
     """
-    names = [i.name for i in record.free if "@" not in i.name and np.ptp(record.flat(i.name)) > 0]
+    names = [i.name for i in record.free if not i.scope.owner and np.ptp(record.flat(i.name)) > 0]
     if len(names) <= MOST_PAIRED:
         return names
     strength = np.abs(np.corrcoef(np.stack([_transformed(record, name) for name in names])))
@@ -41,7 +41,7 @@ def _transformed(record: PosteriorRecord, name: str) -> Float[np.ndarray, " n"]:
 
 
 class _Scale:
-    """How the values of one parameter are put on an axis: unit, logarithm, range."""
+    """Axis of the values of one parameter: unit, logarithm, range."""
 
     def __init__(self, info: ParameterInfo, values: Float[np.ndarray, " n"], *, margin: float = 0.08) -> None:
         self.factor, unit = display_unit(info.unit, float(np.median(np.abs(values))))
@@ -257,23 +257,20 @@ def _heights(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 @style.styled
-def forest_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
+def forest_figure(record: PosteriorRecord, owned: Sequence[ParameterInfo]) -> Figure:
     """Median with 50 % and 90 % intervals of parameters that belong to one recording, recording by recording."""
-    bases = list(dict.fromkeys(name.split("@", 1)[0] for name in names))
-    recordings = list(dict.fromkeys(name.split("@", 1)[1] for name in names))
-    infos = {info.name: info for info in record.parameters}
+    bases = list(dict.fromkeys(info.parameter for info in owned))
+    recordings = list(dict.fromkeys(info.scope.owner for info in owned))
     columns = min(2, len(bases))
     rows = -(-len(bases) // columns)
     figure = Figure(figsize=(style.WIDTH, rows * (0.9 + 0.26 * len(recordings))))
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True).reshape(-1)
     for axes, base in zip(grid, bases, strict=False):
-        present = [r for r in recordings if f"{base}@{r}" in infos]
-        draws = [record.flat(f"{base}@{r}") for r in present]
-        factor, unit = display_unit(
-            infos[f"{base}@{present[0]}"].unit, float(max(np.quantile(np.abs(d), 0.9) for d in draws))
-        )
-        for recording, values in zip(present, draws, strict=True):
-            y = recordings.index(recording)
+        own = [info for info in owned if info.parameter == base]
+        draws = [record.flat(info.name) for info in own]
+        factor, unit = display_unit(own[0].unit, float(max(np.quantile(np.abs(d), 0.9) for d in draws)))
+        for info, values in zip(own, draws, strict=True):
+            y = recordings.index(info.scope.owner)
             q05, q25, q50, q75, q95 = np.quantile(values / factor, [0.05, 0.25, 0.5, 0.75, 0.95])
             axes.plot([q05, q95], [y, y], color=style.POSTERIOR, linewidth=1.2)
             axes.plot([q25, q75], [y, y], color=style.POSTERIOR, linewidth=4)

@@ -58,7 +58,7 @@ def replay(tracks: Sequence[Track], outline: Mapping[str, Any] | None) -> Markup
 
     Args:
         tracks: replays to choose from; the first is shown.
-        outline: of the robot, as `robots.robot_shape` makes it: base, width and direction of gravity. Without an
+        outline: outline of the robot from `robots.robot_shape`: base, width and direction of gravity. Without an
             outline, markers are joined by a line, and the third axis points upwards.
     """
     if not tracks:

@@ -21,7 +21,7 @@ def robot_figure(outline: Mapping[str, Any]) -> Figure:
     """Seen from the side, with gravity in the picture if it points across the robot, and seen from the base.
 
     Args:
-        outline: as `robots.robot_shape` makes it.
+        outline: outline of the robot from `robots.robot_shape`.
     """
     figure = Figure(figsize=(style.WIDTH, 3.0))
     side, section = figure.subplots(1, 2, width_ratios=(1.4, 1.0))

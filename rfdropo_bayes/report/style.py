@@ -1,4 +1,4 @@
-"""One look for all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
+"""Common style of all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
 distinguish.
 """
 
@@ -74,7 +74,7 @@ class Panel:
 
     Attributes:
         source: data URI.
-        share: of the figure's width, in percent.
+        share: share of the figure's width, in percent.
         kind: "cell"; "legend"; "whole" if the figure has no parts.
     """
 
@@ -88,10 +88,10 @@ class Picture:
     """A figure inside a page: panels that fill its rows side by side, or stand below each other on a narrow screen.
 
     Attributes:
-        panels: from the upper left to the lower right.
+        panels: panels from the upper left to the lower right.
         alt: text for readers who cannot see it.
-        caption: how to read it.
-        width: in CSS pixels.
+        caption: explanation of the figure.
+        width: width in CSS pixels.
     """
 
     panels: tuple[Panel, ...]
@@ -165,7 +165,7 @@ def _inches(figure: Figure, box: Bbox) -> Bbox:
 
 
 def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
-    """Axes that stand in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
+    """Axes in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
 
     None if the figure is one piece: a single column, axes outside of a grid, or a grid too fine to be taken apart.
     """
@@ -196,6 +196,7 @@ def thin(rows: int) -> np.ndarray:
 
 
 def label_with_unit(name: str, unit: str) -> str:
+    """Displayed name with its unit in brackets, if it has a unit."""
     return f"{display_name(name)} [{unit}]" if unit else display_name(name)
 
 

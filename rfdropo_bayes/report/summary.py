@@ -35,6 +35,7 @@ class ParameterRow:
 
     Attributes:
         name, unit, description: facts of the parameter.
+        parameter, owner: name without the owner, and the recording or group that has it; see `Scope`.
         mean, sd, q05, median, q95: statistics of the draws.
         at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
         bound: "low", "high" or None.
@@ -63,6 +64,8 @@ class ParameterRow:
     mcse_mean: float
     r_hat: float
     derived: bool
+    parameter: str
+    owner: str
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the name, for summary.json."""
@@ -99,6 +102,8 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
                 diagnostics[info.name]["mcse_mean"],
                 diagnostics[info.name]["r_hat"],
                 info.name not in free,
+                info.parameter,
+                info.scope.owner,
             )
         )
     return rows
@@ -133,6 +138,8 @@ class ParameterSummary(_Open):
     q95: float
     unit: str
     at_bound: bool
+    parameter: str
+    owner: str
 
 
 class Evidence(_Open):
@@ -165,7 +172,7 @@ class Summary(_Open):
 def effective_draws(record: PosteriorRecord, details: Mapping[str, Any]) -> float | None:
     """Number of independent draws that a posterior is worth; None for draws that are no posterior.
 
-    At most as many as there are distinct draws: a sampler that ran out of its budget repeats a few.
+    At most the number of distinct draws: a sampler without budget repeats a few.
     """
     if record.log_likelihood is None:
         return None

@@ -110,8 +110,8 @@ class Calibration:
         """Draw every pair of parameters with their 50 % and 90 % regions.
 
         Args:
-            names: of the parameters; the most correlated six by default.
-            ax: that they are drawn on; a figure of their own by default.
+            names: names of the parameters; the most correlated six by default.
+            ax: axes to draw on; a new figure by default.
         """
         chosen = self._known(names) if names is not None else paired_names(self.record)
         if ax is None:

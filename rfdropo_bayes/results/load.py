@@ -21,7 +21,7 @@ def load(folder: Path | str, model: Model | None = None) -> Calibration | Audit:
 
     Args:
         folder: folder of the run.
-        model: that was calibrated, for predictions; by default rebuilt from the folder's config.toml. No file describes
+        model: calibrated model, for predictions; by default rebuilt from the folder's config.toml. No file describes
             a black box, or a mechanism, that was made in Python.
 
     Raises:

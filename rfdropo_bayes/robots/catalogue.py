@@ -40,7 +40,7 @@ def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", where=str(path), remedy="give a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not valid TOML: {error}", where=str(path), remedy="mend the file") from None
+        raise InputError(f"is not valid TOML: {error}", where=str(path), remedy="correct the file") from None
     if "base" not in table:
         return table
     if path in derived:

@@ -26,6 +26,11 @@ LEAST_GUIDES, GUIDES_PER_SEGMENT = 8, 4
 cables bend a silicone arm by up to 1.5 rad, and .6 % for a body five times softer. A cone with a tip of .6 of its
 base's radius has twice this number (.6 %), and at .3 four times this number (.4 % up to half a radian).
 """
+COMMANDS = ("m", "rad", "N", "N m", "-")
+USUAL_PULL = 0.15
+"""Usual pull of a cable over the body's length."""
+FORCE_LIMIT = 5.0
+"""Ratio of a drive's largest tension to the tension of a usual command."""
 KNOWN, ASSUMED = 0.3, 1.0
 """Standard deviation of the logarithm in the prior of a given value, and of a default."""
 
@@ -47,6 +52,11 @@ class RobotOutline:
         gravity: direction of gravity, such as "+z" for a robot that hangs.
         mass: mass of the body [kg]; None for silicone of its volume.
         young_modulus: Young's modulus [Pa].
+        segment_lengths: lengths of the segments, base to tip; equal by default.
+        segment_azimuths: azimuth of the first cable of each segment [deg]; cables of all segments are spread evenly by
+            default.
+        azimuth_evidence: reason for these azimuths, if they were found from a recording.
+        usual_command: size of usual commands, in their unit.
         assumed: names of attributes that have default values.
     """
 
@@ -63,11 +73,15 @@ class RobotOutline:
     cables: int = 4
     cable_radius: float | None = None
     pairs: bool = False
-    command_unit: Literal["m", "rad"] = "m"
+    command_unit: Literal["m", "rad", "N", "N m", "-"] = "m"
     spool_radius: float = 0.01
     gravity: str = "+z"
     mass: float | None = None
     young_modulus: float = 1e6
+    segment_lengths: tuple[float, ...] | None = None
+    segment_azimuths: tuple[float, ...] | None = None
+    azimuth_evidence: str = ""
+    usual_command: float | None = None
     assumed: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -75,7 +89,7 @@ class RobotOutline:
         if self.gravity not in DIRECTIONS:
             remedy = f"one of {', '.join(DIRECTIONS)}: the direction of gravity, with z away from the clamp"
             raise InputError(f"gravity = {self.gravity!r} is no direction", where=where, remedy=remedy)
-        if self.command_unit not in ("m", "rad"):
+        if self.command_unit not in COMMANDS:
             remedy = '"m" of cable or "rad" of a motor; recordings in mm or deg are converted when they are read'
             raise InputError(f"command_unit = {self.command_unit!r} is no unit of a robot", where=where, remedy=remedy)
         if self.shape not in SHAPES:
@@ -85,6 +99,11 @@ class RobotOutline:
                 raise InputError(f"{key} = {getattr(self, key):g} is not positive", where=where)
         if self.segments < 1 or self.cables < 1:
             raise InputError("an arm has one segment and one cable at least", where=where)
+        given = self.segment_lengths
+        if given is not None and (len(given) != self.segments or abs(sum(given) - self.length) > 1e-3 * self.length):
+            said = ", ".join(f"{1e3 * part:g}" for part in given)
+            remedy = f"give {self.segments} lengths whose sum is {1e3 * self.length:g} mm"
+            raise InputError(f"segments of {said} mm do not make up the body", where=where, remedy=remedy)
         if self.pairs and self.cables % 2:
             raise InputError(f"{self.cables} cables make no pairs", where=where, remedy="give an even number")
         if self.shape == "disks" and self.number_of_disks % self.segments:
@@ -128,9 +147,37 @@ class RobotOutline:
     def guide_heights(self) -> np.ndarray:
         """Heights of the cable guides: in the middle of the disks, or evenly along the body, up to its tip."""
         if self.shape != "disks":
-            return self.length * np.arange(1, self.levels + 1) / self.levels
+            share = np.arange(1, self.levels // self.segments + 1) * self.segments / self.levels
+            starts = [0.0, *self.segment_ends()[:-1]]
+            return np.concatenate(
+                [start + (end - start) * share for start, end in zip(starts, self.segment_ends(), strict=True)]
+            )
         station = np.array(section_profile([self.section]).station_m)
         return 0.5 * (station[1::2] + station[2::2])
+
+    def first_azimuths(self) -> list[float]:
+        """Azimuth of the first cable of each segment [deg]."""
+        even = [360.0 / self.cables * segment / self.segments for segment in range(self.segments)]
+        return list(self.segment_azimuths or even)
+
+    def segment_ends(self) -> list[float]:
+        """Height at which each segment ends [m]."""
+        lengths = self.segment_lengths or (self.length / self.segments,) * self.segments
+        return np.cumsum(lengths).tolist()
+
+    @property
+    def bending_force(self) -> float:
+        """Tension that bends the body by a usual pull [N], see `mechanisms.sizes`."""
+        moment = float(np.mean(section_profile([self.section]).bending_moment_area_m4))
+        arm = CABLES_AT * self.radius if self.cable_radius is None else self.cable_radius
+        return self.young_modulus * moment * USUAL_PULL / arm**2
+
+    @property
+    def newtons(self) -> float:
+        """Tension under a command of one [N], of drives that hold tensions; 1 for others."""
+        if self.command_unit == "N m":
+            return 1.0 / self.spool_radius
+        return self.bending_force / (self.usual_command or 1.0) if self.command_unit == "-" else 1.0
 
     def channel_names(self) -> list[str]:
         """One per cable, or one per pair of cables."""
@@ -154,7 +201,10 @@ class RobotOutline:
 
 def not_given(answers: Mapping[str, Any]) -> frozenset[str]:
     """Names of the answers of a `RobotOutline` that are taken as defaults, and that its shape needs."""
-    needless = {"assumed"} if answers.get("shape") == "disks" else {"assumed", "disks"}
+    needless = {"assumed", "usual_command", "azimuth_evidence"} | (
+        {"disks"} if answers.get("shape") != "disks" else set()
+    )
+    needless |= {"segment_lengths", "segment_azimuths"} if answers.get("segments", 1) == 1 else set()
     return frozenset(field.name for field in fields(RobotOutline) if field.name not in answers) - needless
 
 
@@ -191,6 +241,7 @@ def _head(o: RobotOutline) -> list[str]:
         f'unit = "{o.command_unit}"' + _mark(o, "command_unit"),
         "ramp_s = 0.0                   # a change of command is carried out linearly over this time",
         "dead_time_s = 0.0              # and begins so much later",
+        *([] if o.usual_command is None else [f"usual = {o.usual_command:.3g}  # size of the recorded commands"]),
         "",
         "# Shapes one after the other from the clamp to the tip: cylinder, cone, tube, disks. In their place six lists",
         "# of areas and moments may stand, for sections of any form.",
@@ -208,8 +259,15 @@ def _channels(o: RobotOutline) -> list[str]:
         half = o.cables // 2
         column = segment * half + cable % half if o.pairs else row
         gain[row, column] = -1.0 if o.pairs and cable >= half else 1.0
+    gain *= o.newtons
+    words = {
+        "rad": "# Cable displacement = gain @ command, times the spool's radius; pull > 0.",
+        "N m": "# Tension = gain @ command: one over the spool's radius." + _mark(o, "spool_radius"),
+        "-": "# Tension = gain @ command. ASSUMED: the usual command bends the body by a usual pull; "
+        "the inferred stiffness is relative to it.",
+    }
     lines = [
-        "# Cable displacement = gain @ command, times the spool's radius if commands are angles; pull > 0.",
+        words.get(o.command_unit, "# Cable displacement, or tension, = gain @ command; pull > 0."),
         "[channels]",
         f"names = {_toml(names)}",
         "gain = [",
@@ -226,13 +284,16 @@ def _cables(o: RobotOutline) -> list[str]:
     radius = at_base * (1.0 + (tip / o.radius - 1.0) * heights / o.length)
     lines = [
         "# Cables at their azimuth, from +x towards +y, through guides up to their ends."
-        + _mark(o, "cables", "cable_radius")
+        + _mark(o, "cables", "cable_radius", "segment_lengths", "segment_azimuths"),
+        *([f"# ASSUMED azimuths: {o.azimuth_evidence}."] if o.azimuth_evidence else []),
     ]
     names = o.cable_names()
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
-        azimuth = 360.0 / o.cables * (cable + segment / o.segments)
-        end = o.length * (segment + 1) / o.segments
+        azimuth = 360.0 / o.cables * cable + o.first_azimuths()[segment]
+        end = o.segment_ends()[segment]
+        if o.shape == "disks":  # cables are tied to the disk that is nearest to the end of their segment
+            end = heights[np.argmin(np.abs(heights - end))]
         inside = heights <= end + 1e-9
         lines += [
             "[[cables]]",
@@ -242,10 +303,18 @@ def _cables(o: RobotOutline) -> list[str]:
             f"anchor_radius_m = {at_base:.6g}",
             f"guide_z_m = {_toml([round(float(z), 6) for z in heights[inside]])}",
             f"guide_radius_m = {_toml([round(float(r), 6) for r in radius[inside]])}",
-            f"displacement_limit_m = [{-o.length:.6g}, {0.5 * o.length:.6g}]",
+            *_limits(o),
             "",
         ]
     return lines
+
+
+def _limits(o: RobotOutline) -> list[str]:
+    """How the drive of a cable works, and its limits."""
+    if o.command_unit in ("m", "rad"):
+        return [f"displacement_limit_m = [{-o.length:.6g}, {0.5 * o.length:.6g}]"]
+    usual = o.bending_force if o.usual_command is None else o.newtons * o.usual_command
+    return ['drive = "tension"', f"tension_limit_n = [0.0, {FORCE_LIMIT * usual:.6g}]  # ASSUMED"]
 
 
 def _markers(o: RobotOutline) -> list[str]:
@@ -292,9 +361,10 @@ def _parameters(o: RobotOutline) -> list[str]:
         prior = log_normal("spool_radius", o.spool_radius)
         bounds = (o.spool_radius / 10.0, o.spool_radius * 10.0)
         add("spool_radius", "m", o.spool_radius, bounds, prior, "cable wound up per angle of the motor")
-    prior = f'distribution = "Normal", loc = 0.0, scale = {0.005 * o.length:.6g}'
-    half = 0.5 * o.length
-    add("initial_displacement", "m", 0.0, (-half, half), prior, "cable displacement at zero command")
+    if o.command_unit in ("m", "rad"):
+        prior = f'distribution = "Normal", loc = 0.0, scale = {0.005 * o.length:.6g}'
+        half = 0.5 * o.length
+        add("initial_displacement", "m", 0.0, (-half, half), prior, "cable displacement at zero command")
     prior = f'distribution = "Normal", loc = 0.0, scale = {0.025 * o.length:.6g}'
     for axis in "xyz":
         words = f"shift of the measured positions along {axis}"

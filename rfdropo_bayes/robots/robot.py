@@ -39,14 +39,24 @@ ZEROS = "initial_displacement"
 """Parameter of every cable that is driven by a displacement."""
 
 
+USUAL_SHARE = 0.4
+"""Usual commands over the largest command: recordings seldom use the whole travel."""
+
+
 class CommandTiming(RobotTable):
     """Timing of commands."""
 
-    unit: Literal["m", "rad", "N"] = Field(
-        description='of the commands: "m" of cable, "rad" of a motor, or "N" of tension',
+    unit: Literal["m", "rad", "N", "N m", "-"] = Field(
+        description='of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, or "-" of '
+        "drives that are sent volts or a share of their supply; channels.gain has the newtons of the last two",
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
+    usual: Positive | None = Field(
+        default=None,
+        description="size of usual commands, in their unit: mechanisms have priors in this size; by default "
+        f"{USUAL_SHARE} of the largest command",
+    )
 
 
 class Marker(RobotTable):
@@ -129,7 +139,7 @@ class Robot(RobotTable):
         if len(self.channels.gain) != len(self.cables):
             raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.cables)} cables")
         for cable in self.cables:
-            if cable.unit != ("m" if self.command.unit == "rad" else self.command.unit):
+            if cable.unit != ("m" if self.command.unit in ("m", "rad") else "N"):
                 raise ValueError(f"{cable.name} is driven in {cable.unit}, and commands are in {self.command.unit}")
         if (self.command.unit == "rad") != (self.channels.radius_parameter is not None):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and allowed only for them")
@@ -179,7 +189,8 @@ class Robot(RobotTable):
         for name, place in points.items():
             width = np.stack([np.interp(place[:, 2], station, half[:, axis]) for axis in (0, 1)], axis=1)
             outside = (place[:, 2] < station[0] - 1e-9) | (place[:, 2] > station[-1] + 1e-9)
-            outside |= np.any(np.abs(place[:, :2]) > width + 1e-9, axis=1)
+            if not name.startswith("marker"):  # markers may stand on stalks
+                outside |= np.any(np.abs(place[:, :2]) > width + 1e-9, axis=1)
             if np.any(outside):
                 row = int(np.argmax(outside))
                 x, y, z = place[row]
@@ -218,10 +229,12 @@ class Robot(RobotTable):
             answers: ``name``; ``length`` and ``radius`` (at the base) of the body; ``markers``, heights along the axis
                 by name. These four are required. ``shape``: "cylinder", "cone" (with ``tip_radius``), "tube" (with
                 ``inner_radius``), or "disks" on a backbone of ``inner_radius`` (``disks`` of ``disk_thickness``).
-                ``segments``, each with its own ``cables`` evenly around it, at ``cable_radius`` from the axis at the
-                base; with ``pairs`` opposite cables share a motor. ``command_unit``: "m" of cable or "rad" of a motor
-                with ``spool_radius``. ``gravity``: its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone
-                by default; ``young_modulus`` [Pa].
+                ``segments`` of ``segment_lengths`` (equal by default), each with its own ``cables`` evenly around it,
+                from ``segment_azimuths`` [deg] on (``azimuth_evidence`` says why), at ``cable_radius`` from the axis at
+                the base; with ``pairs`` opposite cables share a motor. ``command_unit``: "m" of cable, "rad" or "N m"
+                of a motor with ``spool_radius``, "N" of tension, or "-" of other drives; ``usual_command``: the size of
+                usual commands. ``gravity``: its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone by
+                default; ``young_modulus`` [Pa].
 
         Raises:
             InputError: an unknown answer, a missing answer, or answers that make no robot.
@@ -238,7 +251,8 @@ class Robot(RobotTable):
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""
-        return self.with_changes(command=CommandTiming(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0))
+        timing = CommandTiming(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0, usual=self.command.usual)
+        return self.with_changes(command=timing)
 
     def with_changes(self, **values: Any) -> Robot:
         """The same robot with other values of some fields, validated anew.
@@ -285,6 +299,16 @@ class Robot(RobotTable):
     def stroke(self) -> float:
         """Largest command of any channel at nominal parameters, in its unit."""
         return float(np.max(np.abs(self.command_limits())))
+
+    @property
+    def held_by_force(self) -> bool:
+        """Whether the drives hold tensions of cables, and not their lengths."""
+        return self.command_unit not in ("m", "rad")
+
+    @property
+    def usual_command(self) -> float:
+        """Size of usual commands, in their unit."""
+        return self.command.usual or USUAL_SHARE * self.stroke
 
     @property
     def channel_names(self) -> tuple[str, ...]:

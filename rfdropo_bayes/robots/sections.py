@@ -26,10 +26,10 @@ class Profile(NamedTuple):
     """Sections of the layers of one shape.
 
     Attributes:
-        thickness: of each layer [m].
+        thickness: thickness of each layer [m].
         outer: radius that encloses the shape at each of the layers' ends [m].
-        area, second_moment: of the stiffness, each layer's harmonic mean [m2, m4].
-        mass_area, mass_second_moment: of the mass, each layer's mean [m2, m4].
+        area, second_moment: each layer's harmonic mean for the stiffness [m2, m4].
+        mass_area, mass_second_moment: each layer's mean for the mass [m2, m4].
     """
 
     thickness: Float[np.ndarray, " layer"]
@@ -181,7 +181,7 @@ class SectionedBody(RobotTable):
 
 
 def section_profile(sections: Sequence[Cylinder | Cone | Tube | Disks]) -> Body:
-    """The body that shapes make up, one after the other from the clamp to the tip.
+    """The body of consecutive shapes from the clamp to the tip.
 
     Args:
         sections: e.g. ``[Cone(length_m=0.2, layers=10, radius_m=(0.014, 0.009))]``.

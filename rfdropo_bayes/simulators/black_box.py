@@ -56,7 +56,8 @@ class BlackBox:
 
     Args:
         function: function that simulates.
-        parameters: by name, each a `Parameter` or its fields. ``low`` and ``high`` must be there; ``unit`` is "-",
+        parameters: parameters by name, each a `Parameter` or its fields. ``low`` and ``high`` must be there; ``unit``
+            is "-",
             ``nominal`` the middle and ``prior`` uniform between the bounds by default.
         markers, channels, cables: names of the markers, of the command channels, and of the cables with a tension.
         time_step: time between rows of the command [s].
@@ -67,7 +68,7 @@ class BlackBox:
         one_shape: whether a batched function always gets arrays of the same shape: ``lanes`` sets, padded by repeats,
             and whole commands. JAX then compiles it once for recordings of equal length.
         difference: relative step of derivatives; larger if the motion is rough on small scales.
-        stroke: size of usual commands, in their unit; known for cables and motors.
+        usual_command: size of usual commands, in their unit; by default a usual trunk's.
         limits: least and greatest command of each channel for policies; none by default.
         families: parameters that are not inferred unless they have a prior, each with the quantity of which it is a
             local value; an audit tests whether they differ from their nominal values.
@@ -88,7 +89,7 @@ class BlackBox:
     lanes: int = 64
     one_shape: bool = False
     difference: float | None = None
-    stroke: float | None = None
+    usual_command: float | None = None
     families: Mapping[str, str] = field(default_factory=dict)
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -136,7 +137,7 @@ class BlackBox:
 
     @property
     def body(self) -> None:
-        """Nobody knows it."""
+        """Unknown."""
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
         """The pull [m] itself if commands are lengths, else `ACTION` of each range.
@@ -148,7 +149,7 @@ class BlackBox:
         return np.full(len(low), pull) if self.command_unit == "m" else ACTION * (high - low)
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
-        """All markers: nobody knows its undeformed body."""
+        """All markers: its undeformed body is unknown."""
         return tuple(range(len(self.markers)))
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
@@ -341,7 +342,7 @@ class BlackBoxSimulator(ExtendedSimulator):
             if not callable(self.box.function):
                 found = self.box.simulate(columns, command[None])[0]
             elif self.box.batched:
-                # On the device of callbacks: what JAX compiles now serves them, too.
+                # On the device of callbacks, which also runs the programs compiled now.
                 with jax.default_device(jax.local_devices(backend="cpu")[0]):
                     found = self.box.answers(columns, command[None], np.zeros(1, int))[0]
             else:
@@ -407,7 +408,7 @@ class BlackBoxSimulator(ExtendedSimulator):
             spec.name: SMALLEST_SHARE * (spec.high - spec.low) if np.isfinite(spec.high - spec.low) else 1e-12
             for spec in self.box.specs
         }
-        stroke = self.box.stroke or STROKES[self.command_unit]
+        stroke = self.box.usual_command or STROKES[self.command_unit]
 
         def size(inputs: tuple[dict[str, Array], Array]) -> tuple[dict[str, Array], Array]:
             own, command = inputs

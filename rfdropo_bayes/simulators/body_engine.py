@@ -135,7 +135,7 @@ class Engine:
         backend: backend of the arithmetic.
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of a rod.
         scene: geometry on which the body pushes a cube; None for a body that touches nothing.
-        integrator: how a time step is taken, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
+        integrator: scheme of a time step, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
             row, an equilibrium found from the row before.
     """
 
@@ -190,7 +190,7 @@ class Engine:
 
     @property
     def lanes(self) -> int:
-        """How many rollouts it likes to be given at once."""
+        """Preferred number of rollouts per call."""
         if self.backend.name == "jax":
             return 64
         return 512 if self.is_rod else 64
@@ -217,7 +217,7 @@ class Engine:
         cube: CubeInputs | None = None,
         loads: BodySignals | None = None,
     ) -> Motion:
-        """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning. At rest a
+        """Roll out from the initial state; ``steps`` limits the steps computed; later rows are meaningless. At rest a
         step is an equilibrium.
 
         Derivatives of the compiled backend are differences along each tangent.

@@ -29,7 +29,7 @@ class Commands(NamedTuple):
         step: command reached at the end of each time step [m or rad].
         sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
             comes later if earlier commands are known.
-        sample_fraction: how far into the following step the observation lies, in [0, 1).
+        sample_fraction: position of the observation within the following step, in [0, 1).
         signals: further signals at the ports of the simulator (`ports.PortSignals`); None without signals.
     """
 

@@ -97,7 +97,7 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
             where="[simulator] body",
             remedy='use body = "rod", or a robot with initial_state = "rest"',
         )
-    if robot.command_unit == "N":
+    if robot.held_by_force:
         words = f"robot {robot.name!r} is driven by forces, a body of tetrahedra by displacements of cables"
         raise InputError(words, where="[simulator] body", remedy='use body = "rod"')
     _check_cables(robot, table)

@@ -14,7 +14,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Result(IntEnum):
-    """How a rollout ended. Everything but OK is counted and reported, and gets no weight in any inference."""
+    """Result code of a rollout. Everything but OK is counted and reported, and gets no weight in any inference."""
 
     OK = 0
     DIVERGED = 1
@@ -48,9 +48,10 @@ class Observation(NamedTuple):
         status: a `Result` value.
         motor_angle: drive positions: the command after all effects inside the drives, such as delay and lag, before the
             transmission to the cables, in the unit of the commands [rad or m]; None if unknown.
-        orientation: of the robot's `orientations`, unit quaternions (x, y, z, w) from the base's axes to the section's;
+        orientation: orientations of the robot's `orientations`, unit quaternions (x, y, z, w) from the base's axes to
+            the section's;
             None if unknown.
-        peak: of a session, the largest tension of each cable at the time steps of the last control period [N]; None if
+        peak: largest tension of each cable at the time steps of a session's last control period [N]; None if
             unknown. In 64 pushes of models/policies/push it was up to 3.3 times the tension at the periods' ends.
     """
 
@@ -93,7 +94,7 @@ class Simulator(Protocol):
 
     @property
     def lanes(self) -> int:
-        """How many rollouts it likes to be given at once."""
+        """Preferred number of rollouts per call."""
 
     def commands(
         self,

@@ -142,7 +142,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def discretised(self) -> dict[str, object]:
-        """How the body is cut, for the record."""
+        """Discretisation of the body, for records."""
         raise NotImplementedError
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Any, Array, Array]:
@@ -164,7 +164,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def unsolved(self) -> Result:
-        """How a rollout ends whose constraints were not all solved."""
+        """Result code of a rollout with unsolved constraints."""
         return Result.CONTACT_NOT_CONVERGED if self.pushes else Result.CABLE_LIMIT
 
     @property
@@ -341,7 +341,7 @@ class RobotSimulator(ExtendedSimulator):
             stiffness_scale=stiffness_scale,
             point_mass=point_mass,
         )
-        if self.robot.command_unit == "N":
+        if self.robot.held_by_force:
             material = material._replace(effects=material.effects._replace(cable_compliance=jnp.asarray(SOFT)))
         for mechanism in self.mechanisms:
             if self.at_rest and QUASI_STATIC not in motions_of(mechanism):
@@ -360,7 +360,7 @@ class RobotSimulator(ExtendedSimulator):
         """Values with the cube at its measured pose, less the offset of the measuring frame, standing on the plate.
 
         Args:
-            values: of one rollout, or of many (arrays of one shape); missing values are nominal.
+            values: values of one rollout, or of many (arrays of one shape); missing values are nominal.
             pose: measured centre [m] and unit quaternion (x, y, z, w).
         """
         known = {spec.name: spec.nominal for spec in self.parameters} | dict(values)
@@ -405,7 +405,7 @@ class RobotSimulator(ExtendedSimulator):
     def exerted(self, values: Values, level: Float[Array, " cable"]) -> Float[Array, " cable"]:
         """Displacements of the cables [m] at levels of their drives [m or N]: a drive that holds a tension winds a
         spring that is so soft that the cable's own length does not count."""
-        return SOFT * level if self.robot.command_unit == "N" else level + self.pretension(values)
+        return SOFT * level if self.robot.held_by_force else level + self.pretension(values)
 
     def wound(
         self, values: Values, commands: Commands, time_step: float

@@ -1,4 +1,4 @@
-"""Another day: one short recording moves what a day changes, and the body stays: ``adapt``, and ``rfdropo adapt``."""
+"""Adaptation to another session by one short recording, with a fixed body: ``adapt``, and ``rfdropo adapt``."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ import jax
 import numpy as np
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.channels.markers import noise_of_markers
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace, deviations, spread_of
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import DataSpec, RecordingEntry, Trajectory, load_recordings, one_at_a_time
@@ -33,7 +31,7 @@ from rfdropo_bayes.model.experiment import NoiseTable
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day import DayFit, fit_day
 from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, reach_of, recorded_day_error
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, ModelError, recorded_model_error
@@ -50,70 +48,74 @@ from rfdropo_bayes.prediction.predictive import (
     with_repeats_marked,
     without_cautions,
 )
-from rfdropo_bayes.report import build_summary
+from rfdropo_bayes.report import BaselineErrors, build_summary
 from rfdropo_bayes.report.coverage import predictive_bands
+from rfdropo_bayes.report.day_baselines import day_baselines
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
+from rfdropo_bayes.report.scores import MeasuredPath
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
-from rfdropo_bayes.verbs.predict import fitted_parts, model_of
+from rfdropo_bayes.verbs.left_out_days import OPENINGS
+from rfdropo_bayes.verbs.predict import fitted_scopes, model_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
 DRAWS = 100
-MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
+MUCH_WORSE = 2.0**0.5  # above this, more than half of the squared error exceeds the residuals of the fitted sessions
 
 
 def adapt(
     fit: Calibration,
-    recording: Trajectory,
+    recording: Trajectory | RecordingEntry,
     *,
     seconds: float | None = None,
     group: str | None = None,
     test: Sequence[Trajectory] = (),
     draws: int = DRAWS,
-    seed: int = 0,
+    seed: int | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
-    """Move what a day changes to one short recording of it; the body keeps its posterior.
+    """Fit the parameters of a new session to one short recording; the body keeps its posterior.
 
-    What moves are the deviations of the parameters in [model.per_group], and those in [model.per_recording]. A
-    parameter may be put into [model.per_group] now that was shared in the fit. The noise is what the fitted recordings
-    showed the model to leave, for as long as it lasted.
+    The fitted parameters are deviations of [model.per_group] and parameters of [model.per_recording]. A parameter that
+    was shared in the fit may be added to [model.per_group]. The noise has the size and the correlation time of the
+    residuals of the fitted recordings.
 
     Args:
         fit: a calibration, with its model.
-        recording: of the new day.
-        seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
-            rest is predicted.
-        group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
-        test: other recordings of the day, of which nothing but the first row is looked at; the report says how well
-            they are predicted.
-        draws: of the posterior.
-        seed: of all that is random.
-        out: folder that gets what a calibration writes; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
+        recording: a recording of the new session, or its entry in [data].
+        seconds: length of the beginning that is used; all by default. The report then shows the prediction of the rest.
+        group: name of the session; by default the recording's group in [model.groups], or else its name.
+        test: other recordings of the session, of which only the first row is used; the report scores their predictions.
+        draws: number of posterior draws.
+        seed: seed of all random numbers; by default from the model's experiment.
+        out: folder for the files of a calibration; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
         show: whether to show progress, see `Progress`.
 
     Raises:
-        InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
+        InputError: no parameter varies between sessions, or the fit has no residuals.
     """
-    model = model_of(given_fit(fit, "adapt"))
+    fit = given_fit(fit, "adapt")
+    if isinstance(recording, RecordingEntry):
+        fit, recording = _recorded(fit, recording)
+    model = model_of(fit)
     recording, test = given_recording(recording, "adapt"), given_recordings(test, "adapt, test")
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.spec.groups) if group is None else group
     left = model_error_of(fit.record)
     moved = _adapted(model, left, recording, group)
     say_step(f"adapting to {day}: {len(head.time)} rows of {recording.name}", show=show)
-    space = day_space(fitted_parts(fit)[1], moved, [head.name], day, fit.record.attrs[FITTED])
-    own = _own_of_day(fit.record, space, recording.name, day)
+    scopes = day_scopes(fit, moved, [head.name], day)
+    own = _own_of_day(fit.record, scopes, recording.name, day)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
-    asked = Day(fit, moved, space, own, head, tested, "" if rest is None else rest.name, day, left)
-    run = partial(_adapt, asked, draws, seed, show)
+    asked = Day(fit, moved, scopes, own, head, tested, "" if rest is None else rest.name, day, left)
+    run = partial(_adapt, asked, draws, model.settings.seed if seed is None else seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -124,20 +126,20 @@ def adapt(
 
 
 class Day(NamedTuple):
-    """A day that a calibration is adapted to.
+    """A session to which a calibration is adapted.
 
     Attributes:
-        fit: the calibration; model: that of the adapted run.
-        space: parameters of the body, the day and its recordings; own: those of the day.
-        head: the recording, as far as it is looked at; tested: what is predicted.
-        rest: name of what is left of the recording, among those; empty without.
-        name: of the day.
-        left: what the model leaves of the recordings that were fitted.
+        fit: the calibration; model: model of the adapted run.
+        scopes: parameters of the body, the session and its recordings; own: parameters of the session.
+        head: the used part of the recording; tested: predicted recordings.
+        rest: name of the unused part of the recording among ``tested``; empty without it.
+        name: name of the session.
+        left: residuals of the model on the fitted recordings.
     """
 
     fit: Calibration
     model: Model
-    space: ParameterSpace
+    scopes: Scopes
     own: Sequence[InferredParameter]
     head: Trajectory
     tested: Sequence[Trajectory]
@@ -156,7 +158,7 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     adapted = _fitted(asked, draws, fit_key, show)
     checks = _checks(before, adapted.predictions)
     known = gather_groups(asked.fit.record.attrs[FITTED], model_of(asked.fit).spec.groups)
-    cautions = without_cautions(fitted_parts(asked.fit)[1], [asked.name], known)
+    cautions = without_cautions(fitted_scopes(asked.fit), [asked.name], known)
     check = checks.get(asked.rest)
     if check and check["adapted"]["error_mm"] > check["from_first_row"]["error_mm"]:
         cautions.append(_kept_caution(check))
@@ -173,7 +175,7 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
         seconds=time.monotonic() - began,
         details={**_details(found, asked.name, asked.own), "checks": checks, "compared": check_sentences(checks)},
     )
-    prior = _prior(asked.space, asked.own, adapted.body, seed)
+    prior = _prior(asked.scopes, asked.own, adapted.body, seed)
     record = _record(
         asked, adapted, result, {p.name: d for p, d in zip(asked.own, prior, strict=True)} | adapted.body, seed
     )
@@ -185,20 +187,28 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
         [asked.head],
         asked.tested,
         record,
+        baselines=_without_a_model(asked),
     )
     return Calibration(record, build_summary(record, facts), text, asked.model, out)
 
 
+def _without_a_model(asked: Day) -> dict[str, BaselineErrors]:
+    """Errors of predictions from the first row and from copies of the fitted recordings."""
+    record = asked.fit.record
+    earlier = [MeasuredPath.of_prediction(each) for each in record.recordings if each.split == "fit"]
+    return day_baselines(asked.head, asked.tested, earlier, record.attrs.get(OPENINGS, {}))
+
+
 class Adapted(NamedTuple):
-    """A day as it was fitted.
+    """A fitted session.
 
     Attributes:
-        found: draws of body and day; body: those of the body before.
-        problem: of the recording, under the noise that was found.
-        predictions: of the recording, and of what was not looked at.
-        cautions: what speaks against them.
-        rollouts: that it took.
-        slow: the error left on the day where it goes beyond what was shown.
+        found: draws of body and session; body: earlier draws of the body.
+        problem: problem of the recording, with the fitted noise.
+        predictions: predictions of the recording and of the unused data.
+        cautions: reasons to doubt them.
+        rollouts: number of rollouts.
+        slow: remaining error of the session for motion beyond the used recording.
     """
 
     found: DayFit
@@ -211,17 +221,15 @@ class Adapted(NamedTuple):
 
 
 def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
-    """Fit the day to as much of the recording as is looked at, and predict the rest."""
-    fit, _, space, own, head, _, _, day, left = asked
-    simulator, rows = asked.model.simulator, len(head.time)
-    recordings = gather_recordings(simulator, [head])
-    noise = noise_of_markers(left.lasting(sample_time(head.time), rows), left.markers, recordings)
+    """Fit the session to the used part of the recording, and predict the rest."""
+    fit, _, scopes, own, head, _, _, day, left = asked
+    simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
     posterior = fit.record.posterior
-    body = thin({p.name: posterior[p.name] for p in space.parameters if p.name in posterior}, draws)
-    body |= _drawn_spreads(space, body, spread_key)
-    channel = Markers.gather(recordings, STATED, noise)
-    program = TrajectoryModel(simulator, space, fitted_parts(fit)[0], recordings, (channel,))
+    body = thin({name: posterior[name] for name in scopes.names if name in posterior}, draws)
+    body |= _drawn_spreads(scopes, body, spread_key)
+    noise = left.lasting(sample_time(head.time), len(head.time))
+    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
     evaluations: list[float] = []
     problem = CalibrationProblem(program, chunk=simulator.lanes).telling(evaluations.append)
     with Progress("adapt", show=show) as progress:
@@ -235,7 +243,8 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
             share=left.share,
         )
     noise = replace(noise, scale=found.excess * noise.scale)
-    problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
+    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
+    problem = CalibrationProblem(program, chunk=simulator.lanes)
     say_step(f"the day is fitted: predicting {_named([head, *asked.tested])}", show=show)
     predictions = predict_fitted(problem, found.values, fitted_key)
     cautions = _cautions(found)
@@ -256,7 +265,7 @@ def _named(recordings: Sequence[Trajectory]) -> str:
 
 
 def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayError | None:
-    """The slow error of the day, where markers go farther than they did in the recording that was shown."""
+    """The slow error of the session, for markers that move farther than in the used recording."""
     slow = recorded_day_error(record)
     if slow is None:
         return None
@@ -265,20 +274,16 @@ def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayErr
 
 
 def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPrediction]:
-    """What the fit says of the recordings that are tested from their commands and first rows alone."""
+    """Predictions of the tested recordings by the original fit, from their commands and first rows alone."""
     record, model, names = asked.fit.record, model_of(asked.fit), [run.name for run in asked.tested]
     if not names:
         return []
     rest = [run if run.position_mask[0].any() else _with_first_row(run, asked.head) for run in asked.tested]
-    fixed, space = fitted_parts(asked.fit)
-    recordings = gather_recordings(asked.model.simulator, rest)
-    noise = noise_of_markers(asked.left.every(sample_time(rest[0].time)), asked.left.markers, recordings)
-    noise = noise.at(recordings.steps)
-    channel = Markers.gather(recordings, STATED, noise)
+    simulator, noise = asked.model.simulator, asked.left.every(sample_time(rest[0].time))
     slow = recorded_day_error(record)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     return predict_new(
-        TrajectoryModel(asked.model.simulator, space, fixed, recordings, (channel,)),
+        TrajectoryModel.of_positions(simulator, fitted_scopes(asked.fit), rest, STATED, noise, asked.left.markers),
         rest,
         values,
         key,
@@ -291,7 +296,7 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
 
 
 def _first_row(head: Trajectory) -> Trajectory:
-    """Two rows, the fewest that a recording has, of which the first alone counts where it was measured."""
+    """Two rows, the fewest that a recording has, of which only the measured first row counts."""
     rows = head.slice_rows(0, 1).with_attributes(name=head.name)
     mask = rows.position_mask.copy()
     mask[1] &= not mask[0].any()
@@ -299,7 +304,7 @@ def _first_row(head: Trajectory) -> Trajectory:
 
 
 def _with_first_row(rest: Trajectory, head: Trajectory) -> Trajectory:
-    """The rest of a recording with the first row of what was looked at."""
+    """The unused part of a recording with the first row of the used part."""
     mask = rest.position_mask.copy()
     mask[0] = head.position_mask[0]
     return _masked(rest, mask)
@@ -311,14 +316,14 @@ def _masked(recording: Trajectory, mask: np.ndarray) -> Trajectory:
     return Trajectory(dataset)
 
 
-def _own_of_day(fit: PosteriorRecord, space: ParameterSpace, recording: str, day: str) -> list[InferredParameter]:
+def _own_of_day(fit: PosteriorRecord, scopes: Scopes, recording: str, day: str) -> list[InferredParameter]:
     """The parameters that are the day's.
 
     Raises:
         InputError: nothing is the day's.
     """
-    own = [p for p in space.parameters if p.name not in fit.posterior and p.name not in space.scales]
-    if not own and day in {info.name.partition(SEPARATOR)[2] for info in fit.free}:
+    own = [p for p in scopes.parameters if p.name not in fit.posterior and p.name not in scopes.scales]
+    if not own and day in {info.scope.owner for info in fit.free}:
         raise InputError(
             f"{recording} belongs to {day}, which was fitted",
             where="adapt",
@@ -328,53 +333,36 @@ def _own_of_day(fit: PosteriorRecord, space: ParameterSpace, recording: str, day
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
-            remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
+            remedy=(
+                "name the parameters that do, e.g. --set model.per_group.initial_displacement=0.002, and a new --group"
+            ),
         )
     return own
 
 
-def run_adaptation(
-    run: Path,
-    model: Model,
-    entry: RecordingEntry,
-    out: Path,
-    *,
-    seconds: float | None = None,
-    group: str | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
-    show: bool | None = None,
-) -> Calibration:
-    """`adapt` a run's folder to a recording in the format of its experiment; lost markers are left out.
-
-    Args:
-        run: folder of a calibration, or of an earlier adaptation.
-        model: that was fitted, with the [data] of its experiment, see `fitted_model`.
-        entry: names the file of observations, that of the commands where the format has one, and the episode.
-        out, seconds, group, seed, overwrite, show: see `adapt`.
+def _recorded(fit: Calibration, entry: RecordingEntry) -> tuple[Calibration, Trajectory]:
+    """The recording of a file in the format of the fit's experiment, without lost markers, and the fit with it as data.
 
     Raises:
-        InputError: bad input.
+        InputError: an experiment without [data], or several recordings.
     """
+    model = model_of(fit)
     read = model.settings
     if read.data is None:
         where = model.name if model.file is None else str(model.file.path)
-        raise InputError("the experiment has no [data]", where=where, remedy="say in which format recordings are")
-    found = load_recordings(_alone(read.data, entry), model.folder)
+        raise InputError("the experiment has no [data]", where=where, remedy="name the format of the recordings")
+    data = _alone(read.data, entry)
+    found = load_recordings(data, model.folder)
     if len(found) > 1:
         raise one_at_a_time(read.data, entry.observations, len(found), "adapt to")
-    fit = Calibration.of_posterior(run, model)
-    fit = replace(fit, model=Model.of(model.spec, replace(read, data=_alone(read.data, entry))))
-    chosen = read.seed if seed is None else seed
-    options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
-    return adapt(fit, found[0], out=out, **options)
+    return replace(fit, model=Model.of(model.spec, replace(read, data=data))), found[0]
 
 
 def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
     """The model of a run's folder.
 
     Raises:
-        InputError: no file says which model.
+        InputError: no file describes the model.
     """
     if not (run / CONFIG).is_file():
         raise InputError(f"holds no {CONFIG}", where=str(run), remedy="name the folder of a calibration")
@@ -382,7 +370,7 @@ def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
 
 
 def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:
-    """The first seconds, and the whole recording with their measurements taken out; None where none is left.
+    """The first seconds, and the whole recording without their measurements; None if nothing is left.
 
     Raises:
         InputError: less than two rows.
@@ -404,7 +392,7 @@ def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, T
 
 
 def model_error_of(record: PosteriorRecord) -> ModelError:
-    """What the fit's model leaves: as the fit says, or as its predictions of the fitted recordings show.
+    """Residuals of the fit's model, from its file or from its predictions of the fitted recordings.
 
     Raises:
         InputError: it holds neither.
@@ -412,7 +400,7 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
     found = recorded_model_error(record)
     if found is None:
         raise InputError(
-            "the posterior does not say what its model leaves of the fitted recordings",
+            "the posterior has no residuals of the fitted recordings",
             where=POSTERIOR,
             remedy="calibrate again: it was written by an earlier version",
         )
@@ -433,53 +421,26 @@ def _alone(data: DataSpec, entry: RecordingEntry) -> DataSpec:
     return changed(data, where="[data]", fit=[entry], test=[], missing="mask")
 
 
-def day_space(
-    space: ParameterSpace, model: Model, recordings: Sequence[str], day: str, fitted: Sequence[str]
-) -> ParameterSpace:
-    """The body's parameters, and those of the day and of its recordings, whether they have draws or not."""
+def day_scopes(fit: Calibration, model: Model, recordings: Sequence[str], day: str) -> Scopes:
+    """The body's parameters without the noise of the fit, and the parameters of a session, with or without draws."""
     noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
-    shared = [p for p in space.parameters if not p.recording and p.spec.name not in noise]
-    kinds = {p.spec.name: p for p in space.parameters if p.added_to}
-    added = [replace(p, recording=day, members=tuple(recordings)) for p in kinds.values()]
-    spreads: list[InferredParameter] = []
-    for name, pooled in pooling(model.spec, model.simulator.parameters, recordings).items():
-        if any(p.added_to == name for p in added):
-            continue
-        spec = next((p.spec for p in shared if p.spec.name == name), None)
-        if spec is None:
-            raise InputError(
-                f"{name} differs between groups about a value that all share, and has none",
-                where="[model.per_group]",
-                remedy="give it a prior, and calibrate again",
-            )
-        known = [p.name for p in [*shared, *spreads]]
-        spreads += [p for p in spread_of(spec, pooled) if p.name not in known]
-        added += deviations(spec, replace(pooled, groups={day: tuple(recordings)}))
-    added += [replace(p, members=tuple(recordings)) for p in space.parameters if p.scoped and p.recording == day]
-    families: dict[str, list[InferredParameter]] = {}
-    for p in space.parameters:
-        if p.of_recordings_alone and p.recording in fitted:
-            families.setdefault(p.spec.name, []).append(p)
-    # A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
-    every = [ps[0] for ps in families.values() if len(ps) == len(fitted)]
-    own = [replace(p, recording=recordings[0], members=tuple(recordings)) for p in every]
-    return ParameterSpace((*shared, *spreads, *added, *own))
+    pooled = pooling(model.spec, model.simulator.parameters, recordings)
+    found = fitted_scopes(fit).of_day(day, recordings, fit.record.attrs[FITTED], pooled)
+    return replace(found, parameters=tuple(p for p in found.parameters if p.spec.name not in noise))
 
 
-def _drawn_spreads(space: ParameterSpace, body: Batch, key: jax.Array) -> Batch:
+def _drawn_spreads(scopes: Scopes, body: Batch, key: jax.Array) -> Batch:
     """Draws from the prior of spreads that the fit did not have."""
     count, drawn = len(next(iter(body.values()))), {}
-    for i, name in enumerate(space.scales):
+    for i, name in enumerate(scopes.scales):
         if name not in body:
-            drawn[name] = np.asarray(space[name].prior.sample(jax.random.fold_in(key, i), (count,)))
+            drawn[name] = np.asarray(scopes[name].prior.sample(jax.random.fold_in(key, i), (count,)))
     return drawn
 
 
-def _prior(
-    space: ParameterSpace, own: Sequence[InferredParameter], body: Mapping[str, np.ndarray], seed: int
-) -> list[Any]:
+def _prior(scopes: Scopes, own: Sequence[InferredParameter], body: Mapping[str, np.ndarray], seed: int) -> list[Any]:
     """Draws of the day's parameters from their priors."""
-    drawn = space.sample(jax.random.key(seed), len(next(iter(body.values()))))
+    drawn = scopes.sample(jax.random.key(seed), len(next(iter(body.values()))))
     return [drawn[p.name] for p in own]
 
 
@@ -505,8 +466,9 @@ def _cautions(found: DayFit) -> list[Caution]:
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence, grave=found.unconverged > len(found.chosen) // 2))
     if found.power < 1.0:
         sentence = (
-            f"few of the body's draws explain the recording: their evidences were raised to the power "
-            f"{found.power:.2g}, so that a tenth of the draws is left; the model lacks what this day shows"
+            "few of the body's draws explain the recording: their evidences were raised to the power "
+            f"{found.power:.2g}, so that a tenth of the draws is left; the model lacks an effect of this "
+            "session"
         )
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
     return cautions
@@ -515,14 +477,11 @@ def _cautions(found: DayFit) -> list[Caution]:
 def _record(
     asked: Day, adapted: Adapted, result: InferenceResult, prior: Mapping[str, np.ndarray], seed: int
 ) -> PosteriorRecord:
-    """The draws, with what predictions of further recordings need."""
+    """The draws, with the data needed to predict further recordings."""
     problem, attrs = adapted.problem, asked.fit.record.attrs
     recordings, noise = problem.model.recordings, problem.model.markers.known
     elsewhere, drawn = _of_other_groups(asked, len(adapted.found.chosen))
-    infos = tuple(
-        ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
-        for p in (*problem.model.space.parameters, *elsewhere)
-    )
+    infos = (*problem.model.scopes.infos, *(p.info for p in elsewhere))
     draws = result.draws | {name: column[adapted.found.chosen][None] for name, column in drawn.items()}
     known: dict[str, Any] = (
         {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
@@ -537,16 +496,17 @@ def _record(
 
 def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:
     """Parameters that other groups and recordings have of their own, and their values under each draw of the body
-    before: the folder of a day predicts recordings of the other days, too."""
-    known = asked.space.names
-    others = [p for p in fitted_parts(asked.fit)[1].parameters if p.recording and p.name not in known]
+    before: the folder of a session also predicts recordings of other sessions.
+    """
+    known = asked.scopes.names
+    others = [p for p in fitted_scopes(asked.fit).parameters if p.scope.owner and p.name not in known]
     return others, thin({p.name: asked.fit.record.posterior[p.name] for p in others}, draws) if others else {}
 
 
 def _checks(
     before: Sequence[RecordingPrediction], after: Sequence[RecordingPrediction]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """How well recordings that were not looked at are predicted before and after, by recording."""
+    """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
         p.name: {
@@ -571,7 +531,7 @@ def _fared(prediction: RecordingPrediction) -> dict[str, float]:
 
 
 def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    """Before and after an adaptation in the same words, of each recording that it did not look at."""
+    """Sentence on each unused recording: its prediction error before and after the adaptation."""
     found = []
     for name, check in checks.items():
         words = [
@@ -584,7 +544,8 @@ def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
 def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
     before, after = check["from_first_row"]["error_mm"], check["adapted"]["error_mm"]
     sentence = (
-        f"what was shown of the day makes the rest of the recording worse: {after:.3g} mm off, from the first row "
-        f"alone {before:.3g} mm; the day has what its first row says of it, and the rest has served to see that"
+        f"the session's data worsen the prediction of the rest of the recording: {after:.3g} mm, but "
+        f"{before:.3g} mm from the first row alone; the result therefore uses the first row alone, a "
+        "choice made on the rest"
     )
     return Caution(Code.DAY_UNMATCHED, sentence)

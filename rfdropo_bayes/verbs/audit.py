@@ -1,4 +1,4 @@
-"""What a simulator lacks, by name: ``audit``."""
+"""The effects that a simulator lacks, by name: ``audit``."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from pydantic import field_validator
 
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
+from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
@@ -39,12 +40,10 @@ from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import source_of
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
+    build_model,
     build_simulator,
     expand_groups,
-    fixed_values,
-    gather_channels,
     measurement_specs,
-    model_space,
     stated_noise,
 )
 from rfdropo_bayes.model.experiment import AuditTable, NoiseTable
@@ -60,7 +59,7 @@ from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import as_options, stated
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
@@ -78,10 +77,20 @@ JOURNAL = "checkpoints/audit"
 FINER = 2
 
 
-@with_keys_of(AuditTable)
+@as_options
+class AuditOptions(AuditTable):
+    """Options of `rb.audit`: keys of an experiment file's [audit]. Candidates may be classes of one's own."""
+
+    @field_validator("candidates", mode="before")
+    @classmethod
+    def _sources(cls, given: Sequence[Any]) -> list[str]:
+        return [source_of(candidate) for candidate in given]
+
+
 def audit(
     model: Model,
     runs: Sequence[Trajectory] | None = None,
+    options: AuditOptions | None = None,
     *,
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
@@ -93,34 +102,32 @@ def audit(
     workshop: Workshop | None = None,
     show: bool | None = None,
     between: Between | None = None,
-    **keys: Any,
 ) -> Audit:
-    """Say what a model lacks, by name, and measure what it gains with that. What is not given is as the experiment file
-    of the model has it.
+    """Name the effects that a model lacks, and measure the gain of adding them. Missing arguments are taken from the
+    model's experiment file.
 
     Args:
-        model: what is simulated and inferred.
-        runs: recordings that are fitted and screened.
-        test: unseen recordings, which measure the gain.
-        seed: of all that is random, 0 where no file says. The same seed gives the same answer.
+        model: simulator and inferred parameters.
+        runs: recordings to fit and test candidates on.
+        options: keys of [audit], which override the model's own file.
+        test: unseen recordings that measure the gain.
+        seed: seed of all random numbers; 0 without a file. The same seed gives the same answer.
         fit: an earlier calibration, or its folder, from whose posterior means the base model starts.
-        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
+        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it is used if
             nothing was repeated.
-        out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
-        resume: go on from what an interrupted audit has left in ``out``.
-        overwrite: start anew whatever ``out`` holds.
+        out: folder for audit.json, extended.toml and report.html; None writes nothing.
+        resume: continue an interrupted audit in ``out``.
+        overwrite: replace an earlier run in ``out``.
         workshop: see `build_problem`.
-        show: whether to say now and then what is done, as in `calibrate`.
-        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
-            Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
-            What both lack is named, too.
-        keys: of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
-            ``bootstraps``, ``minutes``.
+        show: whether to show progress, as in `calibrate`.
+        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared. Two
+            names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
+            Effects that both lack are also named.
 
     Raises:
         InputError: bad input, before anything long has started.
     """
-    model = _asked(given_model(model, "audit"), noise, keys)
+    model = _asked(given_model(model, "audit"), noise, stated(options, AuditOptions))
     runs, test = model.runs(runs, test)
     chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)
@@ -153,11 +160,11 @@ def audit(
 
 
 def nominal_paths(problem: AuditProblem) -> list[Paths]:
-    """The fitted recordings beside the nominal model; empty where an object is pushed, or a rollout ends badly."""
+    """The fitted recordings beside the nominal model; empty if an object is pushed, or a rollout fails."""
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
-    values = {**problem.coordinates.nominal, **problem.coordinates.fixed}
+    values = problem.coordinates.nominal
     theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
     found, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
     valid = np.asarray(recordings.line.valid)
@@ -173,7 +180,7 @@ def _audited(
     out: Path | None,
     doubts: Sequence[Caution],
 ) -> Audit:
-    """What an audit found as an object, with its page; ``doubts`` are those of its recordings."""
+    """Result of an audit as an object, with its page; ``doubts`` are cautions on its recordings."""
     versions, following = software_versions(), next_experiment(answer)
     given: dict[str, Any] = {"versions": versions, "data_sha256": data_sha256, "next_experiment": following}
     content = record(answer, **given, doubts=doubts)
@@ -192,8 +199,6 @@ def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str
     spec, settings = model.spec, model.settings
     if options:
         chosen = {**settings.audit.model_dump(exclude_unset=True), **options}
-        if "candidates" in chosen:
-            chosen["candidates"] = [source_of(candidate) for candidate in chosen["candidates"]]
         settings = replace(settings, audit=parse_table(AuditTable, chosen, where="audit"))
     if noise is not None:
         spec = replace(spec, stated=parse_table(NoiseTable, noise, where="audit, noise"))
@@ -215,13 +220,13 @@ def build_problem(
     """The base model with every candidate of the library in it, at its null value.
 
     ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
-    are the candidates, where it is not all; ``groups`` of recordings are compared, or have candidates of their own.
+    are the candidates, all by default; ``groups`` of recordings are compared, or have candidates of their own.
 
     Raises:
-        InputError: [audit] leaves nothing to ask.
+        InputError: [audit] leaves no candidate.
     """
     spreads, robot = spec.per_group, spec.robot
-    if groups is not None and groups.compared:  # what the groups do not share is to be found
+    if groups is not None and groups.compared:  # the difference between the groups is to be found
         spec = replace(spec, per_group={})
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
@@ -241,8 +246,7 @@ def build_problem(
         plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
         candidates = [c for c in candidates if c.name not in table.exclude]
-    nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
-    coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
+    coordinates = Coordinates(model.scopes, base, tuple(spec.name for spec in specs))
     workshop = {} if workshop is None else workshop
     lanes = partial(_lanes, names=names, model=model, coordinates=coordinates, workshop=workshop)
 
@@ -270,18 +274,18 @@ def build_problem(
 
 
 def _something_asked(table: AuditTable, groups: Groups | None) -> None:
-    """Refuse an audit without the library that has no laws at ports or candidates of one's own to ask for either."""
+    """Refuse an audit without the library, laws at ports or user candidates."""
     ports = table.ports and (groups is None or not groups.compared)
     if not (ports or table.candidates):
         raise InputError(
-            "nothing is asked: the library is left out, and laws at ports are, too",
+            "no candidates: the library and laws at ports are both excluded",
             where="[audit] library",
             remedy="set library = true, or ports = true without --between",
         )
 
 
 def _rules(table: AuditTable) -> Rules:
-    """What [audit] says of the rules."""
+    """The rules of an audit from its table [audit]."""
     matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
     return Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters)
 
@@ -289,8 +293,8 @@ def _rules(table: AuditTable) -> Rules:
 def _named(
     table: AuditTable, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
 ) -> list[Candidate]:
-    """Mechanisms as candidates, less those that [audit] excludes."""
-    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
+    """Mechanisms as candidates, without the exclusions of [audit]."""
+    index = {p.spec.name: i for i, p in enumerate(model.scopes.parameters)}
     return [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
         for name, m in zip(names, added, strict=True)
@@ -307,21 +311,21 @@ def _with_own(
     spreads: Mapping[str, float],
 ) -> tuple[TrajectoryModel, list[Candidate]]:
     """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
-    space, own = with_fixed_quantities(model.space, plain, tuple(model.fixed))
+    space, own = with_fixed_quantities(model.scopes, plain, tuple(model.scopes.fixed))
     if groups is not None:
         space, candidates = with_differences(
-            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
+            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.scopes.fixed)
         )
-    return replace(model, space=space), [*candidates, *own]
+    return replace(model, scopes=space), [*candidates, *own]
 
 
 def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
-    """What may be in the model: the registry, if it is asked, and the experiment's own, less what is in its base model.
+    """Names of candidates: the registry, if requested, and the experiment's own, without mechanisms of the base model.
 
-    Excluded ones are among them, so that what is compiled does not depend on what is excluded.
+    Excluded candidates are included, so that the compiled program does not depend on exclusions.
 
     Raises:
-        InputError: a name to exclude that is not there.
+        InputError: an unknown name to exclude.
     """
     known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
     own = spec.robot.parameter_table() if isinstance(spec.robot, Robot) else {}
@@ -335,7 +339,7 @@ def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
 def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> dict[str, str]:
     """Which of the candidates cannot run on the experiment's body and engine, and why.
 
-    A mechanism of the library says where it runs; one of a user's own is tried, too.
+    A mechanism of the library states its requirements; a user's mechanism is tried.
     """
     simulator = build_simulator(spec)
     engine = str(simulator.description["engine"])
@@ -353,7 +357,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
 
 
 def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
-    """What a simulator says against rollouts of its mechanisms, before anything is computed."""
+    """Reason why a simulator cannot run its mechanisms, found before any computation."""
     try:
         jax.eval_shape(jax.vmap(lambda given: simulator.rollout({}, given)), commands)
     except InputError as error:
@@ -370,11 +374,12 @@ def _lanes(
     coordinates: Coordinates,
     workshop: Workshop,
 ) -> Lanes:
-    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own. Lanes
-    that the workshop has are not made again."""
+    """The simulator with all candidates; expensive candidates get a simulator of their own. Lanes in the workshop are
+    reused.
+    """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
-    key = repr((*made, markers.tolist(), coordinates.fixed, fields))
+    key = repr((*made, markers.tolist(), coordinates.space.fixed, fields))
     if key not in workshop:
         every = _brisk(whole, markers, fields)
         slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
@@ -382,14 +387,14 @@ def _lanes(
         kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
         if len(kept) < len(names):
             fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), markers, fields)
-            null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
+            null = coordinates.nominal | coordinates.named(coordinates.null)
             every = RoutedLanes(fast, every, null)
         workshop[key] = every
     return workshop[key]
 
 
 def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
-    """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
+    """Lanes with one-sided differences if available: they are exact enough for optimisation and score tests."""
     if isinstance(simulator, TrunkSimulator) and not simulator.pushes and simulator.engine.backend.name == "numba":
         quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
         return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
@@ -426,15 +431,15 @@ def _model(
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and how many of its parameters are of the base model, which come
     first. The noise of its channels is known, so that its parameters are not among them."""
-    recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
+    added = simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
-    specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
-    space = model_space(spec, simulator, specs, *groups, later=added)
-    space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
+    model = build_model(
+        spec, simulator, trajectories, specs=(*simulator.parameters, *gains), fitted=fitted, later=added
+    )
+    # Evidences are compared at one spread between groups.
+    model = replace(model, scopes=model.scopes.holding(model.scopes.typical_scales))
     of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
-    base = sum(p.spec.name not in of_candidates for p in space.parameters)
-    channels = gather_channels(spec, simulator, trajectories, recordings, space.names, fitted)
-    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels), base
+    return model, sum(p.spec.name not in of_candidates for p in model.scopes.parameters)
 
 
 def _fields(model: TrajectoryModel) -> list[str]:
@@ -444,17 +449,18 @@ def _fields(model: TrajectoryModel) -> list[str]:
 
 
 def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
-    """The noise that the experiment states, for recordings without repeats: that of the positions under [noise],
-    that of other channels under [model.fixed]; None where that of any channel is not stated."""
+    """The noise that the experiment states, for recordings without repeats: of the positions under [noise], of other
+    channels under [model.fixed]; None if a channel lacks it.
+    """
     if spec.stated is None or spec.stated.standard_deviation == 0.0:
         return None
     parts = [stated_noise(spec, model.recordings, first)]
     for channel in model.channels[1:]:
         if isinstance(channel, Series):
-            known = [model.fixed.get(each.name) for each in channel.noise_specs]
+            known = [model.scopes.fixed.get(each.name) for each in channel.noise_specs]
             if any(value is None for value in known):
                 return None
-            parts.append(channel.stated(model.fixed, float(first.dataset.attrs["sample_time"])))
+            parts.append(channel.stated(model.scopes.fixed, float(first.dataset.attrs["sample_time"])))
     return Stacked(tuple(parts))
 
 
@@ -519,10 +525,10 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
         parameter = coordinates.space.parameters[index]
         if parameter.spec.name != parameter.physical:  # how far one group's value is off, of which no file has a prior
             continue
-        table = dict(parameter.table or parameter.spec.prior)
+        table = dict(parameter.table)
         for key in ("loc", "low", "high"):  # a size in one group is measured from null
-            if key in table and parameter.added_to:
-                table[key] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
+            if key in table and parameter.scope.added_to:
+                table[key] += coordinates.space.specs[parameter.physical].nominal - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
         found[parameter.spec.name] = table

@@ -1,4 +1,4 @@
-"""Groups of recordings of an audit: which recordings they are, and how a model says what differs between them."""
+"""Groups of recordings in an audit: their recordings, and the model's description of their difference."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def find_groups(
     Args:
         between: the two.
         patterns: [model.groups].
-        fitted: recordings that are fitted; tested: unseen ones.
+        fitted: fitted recordings; tested: unseen recordings.
 
     Raises:
-        InputError: not two groups, an unknown one, one without a fitted recording, or a recording in both.
+        InputError: not two groups, an unknown group, a group without a fitted recording, or a recording in both.
     """
     if len(set(between)) != 2 or len(between) != 2 or isinstance(between, str):
         raise InputError(f"{len(set(between))} groups are named", where=WHERE, remedy="name two that differ")
@@ -60,12 +60,12 @@ def find_groups(
 
 
 def groups_at_hand(patterns: Patterns, fitted: Sequence[Trajectory], tested: Sequence[Trajectory]) -> Groups | None:
-    """The groups of [model.groups], in each of which a candidate may be by itself; None where these recordings do not
-    tell one group from others.
+    """The groups of [model.groups], each of which may have its own candidates; None if the recordings contain a single
+    group.
 
     Args:
         patterns: [model.groups].
-        fitted: recordings that are fitted; tested: unseen ones.
+        fitted: fitted recordings; tested: unseen recordings.
     """
     names, own = [t.name for t in [*fitted, *tested]], {t.name for t in fitted}
     found = gather_groups(names, patterns)
@@ -96,7 +96,7 @@ def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> 
 def _matching(
     group: str, given: Sequence[str | Trajectory] | str | Trajectory, names: Sequence[str]
 ) -> tuple[str, ...]:
-    """Recordings that names, wildcards or recordings themselves stand for."""
+    """Recordings of names, wildcards or recordings."""
     chosen: list[str] = []
     for entry in [given] if isinstance(given, str | Trajectory) else given:
         pattern = entry.name if isinstance(entry, Trajectory) else entry
@@ -112,21 +112,22 @@ def _matching(
 
 
 def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -> None:
-    """Say in the table [model] of an experiment file what differs between groups.
+    """Write the difference between groups into the table [model] of an experiment file.
 
-    A mechanism that was named in one scope alone, a group or all groups but one, is in these groups, with a value for
-    each, and absent in all others. A mechanism that was named in several scopes is pooled.
+    A mechanism named in a single scope (a group, or all groups but one) is added to these groups only, with a value for
+    each. A mechanism named in several scopes is pooled.
     """
     coordinates, groups = answer.problem.coordinates, answer.problem.groups
     assert groups is not None
     factor = widening(answer.extended, coordinates)
-    scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
+    named = [answer.problem.candidate(step.name) for step in answer.adopted]
+    scopes = {each.name for each in named if each is not None and each.title == candidate.title}
     alone = len(scopes) == 1 and not isinstance(candidate.mechanism, OwnParameter)
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
-        if not parameter.added_to:
+        name = parameter.scope.added_to
+        if not name:
             continue
-        name = parameter.added_to
         if groups.compared:
             model["groups"] = _naming(groups.members, model.get("groups", {}))
         if alone:
@@ -134,8 +135,7 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
             model["groups"] = _naming(own, model.get("groups", {}))
             model.setdefault("only_in", {})[name] = list(own)
             continue
-        table = parameter.table or {}
-        spread = float(table["scale"]) * float(factor[index]) / np.sqrt(2.0)
+        spread = float(parameter.table["scale"]) * float(factor[index]) / np.sqrt(2.0)
         model.setdefault("per_group", {})[name] = float(f"{spread:.3g}")
         if name not in coordinates.names:
             model.setdefault("priors", {}).setdefault(name, {})
@@ -152,7 +152,7 @@ def confine_laws(model: dict[str, Any], answer: Answer) -> None:
 
 
 def _groups_of(scope: str, groups: Groups, patterns: Patterns) -> dict[str, tuple[str, ...]]:
-    """A group alone, or the groups that all recordings but those of one belong to."""
+    """A single group, or all groups except one."""
     recordings = groups.recordings(scope)
     return {scope: recordings} if scope in groups.members else gather_groups(recordings, patterns)
 

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
@@ -29,10 +28,12 @@ from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
-    ParameterInfo,
+    HELD,
+    DrawsByOwner,
     PosteriorRecord,
     ProductOfPowers,
     RecordingPrediction,
+    by_owner,
     central_interval,
 )
 from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, left_out_sentence, recorded_day_error
@@ -40,17 +41,22 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
-    HELD,
     KNOWN_NOISE,
     NOISE,
-    Batch,
     match_cautions,
     predict_fitted,
     predict_new,
     thin,
     with_repeats_marked,
 )
-from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report import (
+    BaselineErrors,
+    RecordingFacts,
+    RunFacts,
+    baseline_errors,
+    build_summary,
+    software_versions,
+)
 from rfdropo_bayes.report.baselines import with_fitted_commands
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
@@ -69,7 +75,7 @@ PRIOR_DRAWS = 2000
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves
-CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
+CLIMBING = ("laplace", "bridge", "smc")  # smc if it starts at the optima
 
 
 def calibrate(
@@ -85,19 +91,19 @@ def calibrate(
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
-    """Fit a model to recordings. What is not given is as the experiment file of the model has it.
+    """Fit a model to recordings. Missing arguments are taken from the model's experiment file.
 
     Args:
-        model: what is simulated, inferred and measured.
-        runs: recordings that are fitted.
-        method: options of a method, such as ``SMC(rollouts=5000)``; SMC with 20000 rollouts where no file says.
-        test: recordings that no fit sees; the report says how well they are predicted.
-        seed: of all that is random, 0 where no file says. The same seed gives the same draws.
-        out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
-        fit: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
-            recordings: climbs start from its optimum and draws. What is inferred, and from which data, does not change.
-        resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
-        overwrite: start anew whatever ``out`` holds.
+        model: simulator, inferred parameters and data channels.
+        runs: recordings to fit.
+        method: options of a method, such as ``SMC(rollouts=5000)``; SMC with 20000 rollouts without a file.
+        test: unseen recordings; the report scores their predictions.
+        seed: seed of all random numbers; 0 without a file. The same seed gives the same draws.
+        out: folder for posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
+        fit: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other recordings:
+            optimisations start from its optimum and draws. Parameters and data of the fit do not change.
+        resume: continue from the checkpoint of an interrupted run of the same experiment in ``out``.
+        overwrite: replace an earlier run in ``out``.
         show: whether to show progress, see `Progress`.
 
     Raises:
@@ -132,7 +138,7 @@ def calibrate(
 
 
 class Fitting(NamedTuple):
-    """What is fitted to what, by which method; see `calibrate`."""
+    """Model, recordings and method of a fit; see `calibrate`."""
 
     model: Model
     problem: CalibrationProblem
@@ -160,14 +166,14 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
-def earlier_draws(fit: Calibration | Path | None, method: str) -> Batch | None:
-    """What an earlier calibration, or its folder, says of where climbs may start; None without one.
+def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner | None:
+    """Starts of optimisations from an earlier calibration or its folder; None without it.
 
-    Its optimum where it has one, the first of the rows, and as often its draws: of many parameters that rollouts do not
-    take linearly a draw may fit far worse than the optimum that it was drawn around.
+    The first row is its optimum, if known, which is repeated as often as there are draws: in nonlinear problems with
+    many parameters a draw may fit far worse than the optimum.
 
     Raises:
-        InputError: a folder that holds no posterior, or a method that does not climb.
+        InputError: a folder without a posterior, or a method without optimisation.
     """
     if fit is None:
         return None
@@ -184,13 +190,13 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> Batch | None:
         content = read_summary(Path(fit) / SUMMARY) if (Path(fit) / SUMMARY).is_file() else {}
     draws = thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
     optimum = content.get("optimum") or {}
-    if not set(draws) <= set(optimum):
-        return draws
-    return {name: np.concatenate([np.full(len(column), optimum[name]), column]) for name, column in draws.items()}
+    if set(draws) <= set(optimum):
+        draws = {name: np.concatenate([np.full(len(own), optimum[name]), own]) for name, own in draws.items()}
+    return by_owner(record.free, draws)
 
 
 def inference_options(table: InferenceTable) -> dict[str, Any]:
-    """Options of the method; the budget is among them where the method takes one."""
+    """Options of the method; the budget is among them if the method takes a budget."""
     options = table.options
     fields = {field.name for field in dataclasses.fields(method_named(table.method).config)}
     return {**options, "rollouts": table.rollouts or ROLLOUTS} if "rollouts" in fields else options
@@ -205,8 +211,9 @@ def record_posterior(
     *,
     show: bool | None = None,
 ) -> tuple[PosteriorRecord, list[Caution]]:
-    """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see, and
-    what speaks against the predictions."""
+    """Draws, prior draws and predictions of every recording, with the parameter combinations that rollouts depend on,
+    and cautions on the predictions.
+    """
     model, tested = asked.model, asked.test
     prior_key, fit_key, test_key = jax.random.split(key, 3)
     say_step(f"the fit is done: predicting the fitted recordings ({len(asked.runs)})", show=show)
@@ -215,10 +222,10 @@ def record_posterior(
     values = thin(result.draws, asked.draws)
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
-    fitted = list(problem.model.recordings.names)
+    fitted, scopes = list(problem.model.recordings.names), problem.model.scopes
     lasting = result.details.get("lasting", {}).get(problem.model.markers.name)
     left = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
-    slow = _unseen_days(asked, result, predictions, left, jax.random.fold_in(key, 3), show=show)
+    slow = _unseen_days(asked, problem, result, predictions, left, jax.random.fold_in(key, 3), show=show)
     cautions: list[Caution] = []
     if tested:
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
@@ -231,10 +238,7 @@ def record_posterior(
         predictions += found.recordings
         cautions = match_cautions(found)
     record = PosteriorRecord(
-        tuple(
-            ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
-            for p in problem.model.space.parameters
-        ),
+        scopes.infos,
         result.draws,
         prior,
         tuple(with_repeats_marked(predictions, [*asked.runs, *tested])),
@@ -245,18 +249,19 @@ def record_posterior(
             **attributes,
             NOISE: problem.model.noise,
             FITTED: fitted,
-            HELD: result.held,
+            HELD: [{"parameter": p.info.as_dict(), "value": result.held[p.name]} for p in scopes.known],
             MODEL_ERROR: None if left is None else left._asdict(),
             DAY_ERROR: None if slow is None else slow.as_dict(),
             OPENINGS: openings_of(asked.runs),
             **known_noise(problem),
         },
     )
-    return with_ratios(record, problem.names), cautions
+    return with_ratios(record, scopes.names), cautions
 
 
 def _unseen_days(
     asked: Fitting,
+    problem: CalibrationProblem,
     result: InferenceResult,
     predictions: Sequence[RecordingPrediction],
     left: ModelError | None,
@@ -272,15 +277,16 @@ def _unseen_days(
     optimum = result.optimum or {}
     if set(draws) <= set(optimum):
         draws = {name: np.full(2, optimum[name]) for name in draws}
-    return error_of_unseen_days(Days(asked.model, asked.runs, draws, predictions, left), key, show=show)
+    start = by_owner(problem.model.scopes.infos, draws)
+    return error_of_unseen_days(Days(asked.model, asked.runs, start, predictions, left), key, show=show)
 
 
 def row_log_likelihood(
     problem: CalibrationProblem, result: InferenceResult
 ) -> Float[np.ndarray, "chain draw row"] | None:
-    """Log density of each row given the rows before it, at every draw; None where the draws are no posterior.
+    """Log density of each row given the rows before it, at every draw; None if the draws are no posterior.
 
-    Draws that the method kept without their rows are simulated once more, as predictions are: outside the budget.
+    Draws that the method stored without row densities are simulated again, outside the budget.
     """
     if not method_named(result.method).posterior or result.log_likelihood is not None:
         return result.log_likelihood
@@ -290,7 +296,7 @@ def row_log_likelihood(
 
 
 def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: bool) -> dict[str, ResidualCheck]:
-    """Whether the residuals at the most likely draw are what the noise model says; empty without a likelihood."""
+    """Comparison of the residuals at the most likely draw with the noise model; empty without a likelihood."""
     if record.log_likelihood is None:
         return {}
     best = int(np.argmax(record.log_likelihood.sum(axis=-1).ravel()))
@@ -299,23 +305,22 @@ def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: boo
 
 
 def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecord:
-    """The record with ratios that motion determines where single stiffnesses and masses are not: cables that impose
-    lengths leave the common scale of all stiffnesses and masses free.
+    """The record with ratios of stiffnesses and masses. Length-driven cables determine these ratios, but not the common
+    scale of stiffnesses and masses.
 
-    Stiffness over mass, and each payload over both; a payload that is zero in some draw has none.
+    Stiffness over mass, and each payload over both; a payload that is zero in some draw is skipped.
     """
     scales = [(name, unit) for name, unit in (("young_modulus", "kg/Pa"), ("trunk_mass", "-")) if name in names]
     found = []
     if len(scales) == 2:
         powers = {"young_modulus": 1.0, "trunk_mass": -1.0}
-        words = "stiffness over mass: what the motion of a trunk with length-driven cables determines"
+        words = "stiffness over mass: determined by the motion of a trunk with length-driven cables"
         found.append(ProductOfPowers("young_modulus_over_trunk_mass", "Pa/kg", powers, words))
-    for payload in (name for name in names if name.partition(SEPARATOR)[0] == PAYLOAD):
-        own = payload.removeprefix(PAYLOAD)
+    for payload in (info for info in record.free if info.name in names and info.parameter == PAYLOAD):
         for name, unit in scales:
-            powers = {payload: 1.0, name: -1.0}
-            words = f"payload over {name.replace('_', ' ')}: what motion determines, whatever their common scale is"
-            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}{own}", unit, powers, words))
+            powers = {payload.name: 1.0, name: -1.0}
+            words = f"payload over {name.replace('_', ' ')}: determined by motion, independent of the common scale"
+            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}", unit, powers, words, payload.scope.owner))
     drawn = [draws for draws in (record.posterior, record.prior) if draws]
     return record.with_derived([p for p in found if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
 
@@ -329,8 +334,9 @@ def gather_facts(
     tested: Sequence[Trajectory],
     record: PosteriorRecord,
     unmatched: Sequence[Caution] = (),
+    baselines: Mapping[str, BaselineErrors] | None = None,
 ) -> RunFacts:
-    """What the report says beside the posterior."""
+    """Contents of the report beside the posterior; ``baselines`` are those of `baseline_errors` by default."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
     simulator = problem.model.simulator
@@ -342,7 +348,7 @@ def gather_facts(
     strange = recorded_doubts(record)
     if robot is not None:
         strange += robot.unstated(run.name for run in (*fitted, *tested))
-        strange += implausible_fit(robot, problem.model.fixed, record)
+        strange += implausible_fit(robot, problem.model.scopes.fixed, record)
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -364,11 +370,11 @@ def gather_facts(
         model={
             "noise": problem.model.noise,
             "mechanisms": ", ".join(added) or "none",
-            "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.fixed.items())
+            "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.scopes.fixed.items())
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
-        baselines=baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
+        baselines=baselines or baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
         fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,
@@ -382,14 +388,14 @@ def gather_facts(
 
 
 def implausible_fit(robot: Robot, fixed: Mapping[str, float], record: PosteriorRecord) -> list[Caution]:
-    """A caution where nine tenths of the draws, or a fixed value, are a mass or stiffness that no soft robot has."""
-    drawn = {info.name.partition(SEPARATOR)[0]: central_interval(record.flat(info.name)) for info in record.free}
+    """A caution if 90 % of the draws, or a fixed value, are an implausible mass or stiffness."""
+    drawn = {info.parameter: central_interval(record.flat(info.name)) for info in record.free}
     found = implausible_values(robot, {**{name: (value, value) for name, value in fixed.items()}, **drawn})
     return [] if found is None else [Caution(Code.IMPLAUSIBLE, found)]
 
 
 def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
-    """The noise of the positions as an attribute of the posterior, where it is not among the parameters."""
+    """The noise of the positions as an attribute of the posterior, if it is not a parameter."""
     known, markers = problem.model.markers.known, problem.model.recordings.markers
     return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
 

@@ -1,8 +1,8 @@
-"""``rfdropo check``: what an experiment's robot, recordings and model are, in words and as pictures."""
+"""``rfdropo check``: description of an experiment's robot, recordings and model, in words and pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.posteriors import central_interval
+from rfdropo_bayes.report.rest_figure import rest_figure
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
@@ -42,32 +43,34 @@ from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
+from rfdropo_bayes.verbs.command_lag import lag_words
 from rfdropo_bayes.verbs.motion_check import measure_motion
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 from rfdropo_bayes.verbs.recording_doubts import asked_pulls, cables_beyond, recording_cautions, shortened
+from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
 LONG = 60.0
 """Recordings of more seconds make whoever checks them wait for minutes."""
 IRREGULAR = 1.5
-"""A gap longer than so many median sample times is said."""
+"""Gaps longer than this multiple of the median sample time are reported."""
 
 Result = TypeVar("Result")
 
 
 @dataclass
 class Check:
-    """What was read.
+    """Result of `run_check`.
 
     Attributes:
-        lines: what there is, as pairs of a label and a text; an empty label goes on with the one before.
-        notes: what is allowed, and worth knowing.
-        doubts: what is allowed, and probably not meant: the recordings or their description look wrong.
-        problems: what keeps the experiment from running.
+        lines: facts, as pairs of a label and a text; an empty label continues the previous pair.
+        notes: valid facts worth knowing.
+        doubts: valid but suspicious facts: the recordings or their description look wrong.
+        problems: faults that keep the experiment from running.
         files: pictures, one per recording.
-        ahead: what a fit could determine; None where that was not asked, or nothing can be fitted.
+        ahead: combinations that a fit can determine; None if not requested, or if nothing can be fitted.
     """
 
     lines: list[tuple[str, str]] = field(default_factory=list)
@@ -79,13 +82,13 @@ class Check:
 
 
 def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflight:
-    """Say before a fit which combinations of parameters recordings cannot determine, what else would have to be
-    measured, whether commands excite what is asked, and what the fit costs; see `preflight`.
+    """Find, before a fit, the parameter combinations that recordings cannot determine, measurements that would,
+    unexcited channels, and the cost of the fit; see `preflight`.
 
     Args:
-        model: what would be fitted.
-        runs: recordings.
-        seed: of the draws of the prior at which derivatives are taken.
+        model: model to fit.
+        runs: recordings to fit.
+        seed: seed of the prior draws at which derivatives are taken.
 
     Raises:
         InputError: bad input, or a model that cannot be simulated.
@@ -95,16 +98,16 @@ def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflig
 
 
 def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bool = False) -> Check:
-    """Read everything that an experiment names, and say what was read.
+    """Read everything that an experiment names, and describe it.
 
     Args:
         path: the experiment file.
         out: folder for the pictures, ``NAME.png`` for each recording, and check.json.
         overrides: assignments that replace entries of the file.
-        ahead: also say what time step and mesh move the markers by, and what a fit could determine, see `check`.
+        ahead: also measure errors of time step and mesh, and the combinations that a fit can determine, see `check`.
 
     Raises:
-        InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
+        InputError: the experiment file or the robot cannot be read; other faults are among the problems.
     """
     experiment, _ = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
@@ -129,8 +132,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     if experiment.data is not None and experiment.data.fit and not experiment.data.test:
         found.notes.append(
-            "no recording is kept for a test: nothing will say how well a fit predicts motions that it has not seen; "
-            "name one under test in [data]"
+            "no recording is kept for a test: predictions of unseen motions will not be scored; name one "
+            "under test in [data]"
         )
     found.doubts += [
         f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {shortened(named)}"
@@ -143,7 +146,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     if ahead and recordings["fit"] and not found.problems:
         fewer = [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
-            _say_motion(found, experiment, folder, fewer)
+            _say_motion(found, experiment, folder, recordings, fewer, output_folder(out))
         _say_ahead(found, experiment, folder, fewer)
     if any(recordings.values()):
         out = output_folder(out)
@@ -159,23 +162,47 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     return found
 
 
-def _say_motion(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What the nominal model shows: errors of time step, elements and motion, and motions in another direction."""
-    say_step(f"simulating {runs[0].name} with a finer time step, more elements, and the other kind of motion")
-    spec = spec_of(experiment, folder)
-    found.lines += _try(found, partial(numerical_error_lines, spec, runs[0])) or []
+def _say_motion(
+    found: Check,
+    experiment: Experiment,
+    folder: Path,
+    recordings: Mapping[str, Sequence[Trajectory]],
+    fewer: Sequence[Trajectory],
+    out: Path,
+) -> None:
+    """Report on the nominal model: numerical errors, another arrangement of the commands, and a fit at rest.
+
+    ``fewer`` are the recordings to fit, thinned to the rows that their motion needs.
+    """
+    say_step(f"simulating {fewer[0].name} with a finer time step, more elements, and the other kind of motion")
+    spec, runs = spec_of(experiment, folder), recordings["fit"]
+    found.lines += _try(found, partial(numerical_error_lines, spec, fewer[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
+    rests = spec.simulator.motion == QUASI_STATIC
+    if rests:
+        lag = lag_words(runs, columns)
+        found.lines.append(("row and pose", lag.words))
+        found.doubts += [] if lag.doubt is None else [lag.doubt]
     compared = _try(found, partial(measure_motion, spec, runs, columns))
-    if compared is not None:
-        found.lines.append(("motion", compared.words))
-        found.doubts += [caution.sentence for caution in compared.cautions]
+    if compared is None:
+        return
+    found.lines.append(("motion", compared.words))
+    found.doubts += [caution.sentence for caution in compared.cautions]
+    if compared.arrangement is not None:
+        shown = (runs, recordings["test"]) if rests else (fewer, [looked_at(run) for run in recordings["test"]])
+        fit = _try(found, partial(first_answer, spec, *shown, compared.arrangement))
+        if fit is not None:
+            found.lines += rest_lines(fit)
+            found.notes += rest_notes(fit) if rests else []
+            found.files.append(out / "at_rest.png")
+            rest_figure(fit).savefig(found.files[-1])
 
 
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
-    """What a fit could determine; a model that cannot be simulated is no problem of its description."""
+    """Report on combinations that a fit can determine; a failed simulation is not counted as a problem."""
     seconds = sum(float(run.time[-1]) for run in runs)
     patience = "; this takes minutes, and --quick leaves it out" if seconds > LONG else ""
-    say_step(f"simulating {seconds:.3g} s under draws of the prior, to say what a fit could determine{patience}")
+    say_step(f"simulating {seconds:.3g} s under draws of the prior, to estimate the result of a fit{patience}")
     try:
         found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
     except InputError as error:
@@ -185,7 +212,7 @@ def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequenc
 
 
 def _try(found: Check, action: Callable[[], Result]) -> Result | None:
-    """What an action returns; what keeps it from that is a problem."""
+    """Result of an action; its InputError is added to the problems."""
     try:
         return action()
     except InputError as error:
@@ -202,7 +229,7 @@ def _say_robot(found: Check, robot: Workpiece) -> None:
 
 
 def _read(found: Check, experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
-    """The recordings of one role; those that can be read where one of them is a problem."""
+    """The recordings of one role; if some are faulty, only the others."""
     spec = experiment.data
     if spec is None:
         if role == "fit":
@@ -220,7 +247,7 @@ def _read(found: Check, experiment: Experiment, folder: Path, role: Literal["fit
 
 
 def _unlike(lines: list[tuple[str, str]], first: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    """The lines of a recording that are not those of the first one."""
+    """The lines of a recording that differ from the first recording's."""
     if not first:
         return lines
     known = {text for _, text in first}
@@ -229,7 +256,7 @@ def _unlike(lines: list[tuple[str, str]], first: list[tuple[str, str]]) -> list[
 
 
 def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> list[tuple[str, str]]:
-    """Lines of one recording: rows, markers, masks and commands, beside those of the robot."""
+    """Lines of one recording: rows, markers, masks and commands, compared with the robot's."""
     gaps = np.diff(trajectory.time)
     step = sample_time(trajectory.time)
     rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
@@ -316,7 +343,7 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
 
 
 def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
-    """What is stated of the drives in one recording, channels alike together."""
+    """Lines on the stated limits of drives in one recording; channels with equal limits share a line."""
     alike: dict[str, list[str]] = {}
     for name, low, high, lost, kept in zip(robot.channel_names, *astuple(travel), strict=True):
         word = "lost" if lost else "kept" if kept else "clipped"
@@ -335,7 +362,7 @@ def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
         words = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in floor.items())
         found.lines.append(("noise", f"spread of the repeats in mm: {words}"))
     elif trajectories:
-        found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
+        found.notes.append("no recording was repeated: noise cannot be distinguished from errors of the simulator")
 
 
 def _budget(table: InferenceTable) -> str:
@@ -346,7 +373,7 @@ def _budget(table: InferenceTable) -> str:
 
 
 def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
-    """What is inferred, and how; a model that cannot be built is a problem."""
+    """Report on inferred parameters and method; a model that cannot be built is a problem."""
     method, named = experiment.inference.method, experiment.model.mechanisms
     _try(found, lambda: make_config(method, inference_options(experiment.inference)))
     found.lines.append(("method", f"{method}, {_budget(experiment.inference)}, seed {experiment.seed}"))
@@ -364,8 +391,8 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
         found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
     model = _try(found, lambda: build_model(spec, simulator, fitted))
     if model is not None:
-        for index, parameter in enumerate(model.space.parameters):
-            table = parameter.table or {}
+        for index, parameter in enumerate(model.scopes.parameters):
+            table = parameter.table
             words = ", ".join(f"{k} {v:g}" for k, v in table.items() if k != "distribution")
             text = f"{parameter.name} [{parameter.spec.unit}] ~ {table.get('distribution')}({words})"
             found.lines.append(("inferred" if index == 0 else "", text))
@@ -384,10 +411,10 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
 
 
 def _ranges(model: TrajectoryModel) -> dict[str, tuple[float, float]]:
-    """Where the prior has nine tenths of every parameter, and values that are fixed."""
-    drawn = model.space.sample(jax.random.key(0), PRIOR_DRAWS)
-    known = {name: (value, value) for name, value in model.fixed.items()}
-    return known | {p.spec.name: central_interval(np.asarray(drawn[p.name])) for p in model.space.parameters}
+    """Central 90 % range of every parameter under the prior, and fixed values."""
+    drawn = model.scopes.sample(jax.random.key(0), PRIOR_DRAWS)
+    known = {name: (value, value) for name, value in model.scopes.fixed.items()}
+    return known | {p.spec.name: central_interval(np.asarray(drawn[p.name])) for p in model.scopes.parameters}
 
 
 def _see_candidates(spec: ModelSpec, table: AuditTable) -> None:

@@ -66,7 +66,7 @@ class Unit(NamedTuple):
     """A unit of columns.
 
     Attributes:
-        unit: of most of them.
+        unit: unit of most of them.
         others: columns in other units, which convert to it.
         evidence: why it was guessed; empty if the names or a line of units tell it.
     """
@@ -184,9 +184,9 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
     """The unit of times that a name or a line of units tells, or else their size and the motion between rows.
 
     Args:
-        table: that has them.
+        table: table with these columns.
         time: their column; None without times.
-        places: of the markers in any unit, a row of coordinates for each time; None if they are not known.
+        places: positions of the markers in any unit, a row of coordinates for each time; None if unknown.
     """
     if time is None or len(table) < 2:
         return Unit("s")

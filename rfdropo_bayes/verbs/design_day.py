@@ -11,10 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, actions
 from rfdropo_bayes.data.sample_times import sample_time
@@ -25,14 +22,14 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.prediction.day import physical_of_normal
 from rfdropo_bayes.prediction.own_fit import STEP
-from rfdropo_bayes.prediction.predictive import FITTED, Batch
+from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.designed import COMMANDS, Design
 from rfdropo_bayes.tables import nearest
-from rfdropo_bayes.verbs.adapt import day_space, model_error_of
+from rfdropo_bayes.verbs.adapt import day_scopes, model_error_of
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.design import command_table, proposals, units_said
-from rfdropo_bayes.verbs.predict import fitted_parts, model_of
+from rfdropo_bayes.verbs.predict import model_of
 
 LONGEST = 10.0  # [s] of a proposal, unless more is asked for
 DAY = "another day"
@@ -40,11 +37,12 @@ PER_ACTION = "displacement_per_action"  # among the settings of a recording whos
 
 
 class DayOutlook(NamedTuple):
-    """What a command sequence leaves unknown.
+    """Remaining uncertainty after a command sequence.
 
     Attributes:
-        seconds: after which the day adds less to the error of the last marker than the model; infinite if never.
-        left: deviation [m] of the last marker, in the recordings at hand, by what is then not known of the day.
+        seconds: time after which the session's uncertainty is less than the model error at the last marker; infinite if
+            never.
+        left: deviation [m] of the last marker in the given recordings, from the remaining uncertainty of the session.
     """
 
     seconds: float
@@ -69,26 +67,26 @@ def design_day(
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Design:
-    """Propose the shortest commands whose recording determines what a day changes.
+    """Propose the shortest commands whose recording determines the parameters of a session.
 
-    Of random walks, holds, slow loops and chirps that the drives follow, each is looked at from its beginning. It is
-    long enough where the last marker, under the commands of the recordings at hand, is as uncertain by the day as it is
-    by what the model misses. The noise is that of `adapt`, and so are the day's parameters. Proposals stay within what
-    the drives did in the recordings at hand and what is stated of them; where commands are actions, which pull or
-    release one cable, proposals are made of these.
+    Proposals are random walks, holds, slow loops and chirps within the drives' limits, each evaluated for all lengths.
+    A length suffices if the session's uncertainty at the last marker, under the given recordings' commands, is no
+    larger than the model error. Noise and session parameters are as in `adapt`. Proposals stay within the commands of
+    the given recordings and the stated limits. If commands are actions that pull or release one cable, proposals
+    consist of actions.
 
     Args:
         fit: a calibration, with its model.
-        runs: recordings at hand; those of the model's experiment by default.
-        seconds: no proposal is longer.
-        group: among the recordings at hand, whose drives and commands the day is to have; that of the last by default.
-        seed: of the proposals; that of the model's experiment by default.
-        out: folder that gets design.json and next_commands.csv; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
-        show: whether to say now and then what is done, as in `calibrate`.
+        runs: given recordings; by default from the model's experiment.
+        seconds: longest proposal.
+        group: group whose drives and commands the session shares; by default the last recording's.
+        seed: seed of the proposals; by default from the model's experiment.
+        out: folder for design.json and next_commands.csv; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
+        show: whether to show progress, as in `calibrate`.
 
     Raises:
-        InputError: nothing of the model differs between days, or no recording is of the group.
+        InputError: no parameter varies between sessions, or the group has no recording.
     """
     model = model_of(given_fit(fit, "design_day"))
     runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
@@ -162,28 +160,25 @@ def _design_day(
 
 
 def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationProblem, list[str], Batch]:
-    """Recordings of one day, the names of its parameters, and values a step up and a step down along each of these from
-    the middle of its prior, at the body's mean."""
+    """Problem of one session's recordings, names of its parameters, and values one step up and down along each, from
+    the centre of its prior at the body's mean.
+    """
     model, left = model_of(fit), model_error_of(fit.record)
-    fixed, space = fitted_parts(fit)
-    recordings = gather_recordings(model.simulator, runs)
-    noise = noise_of_markers(left.every(sample_time(runs[0].time)), left.markers, recordings)
-    noise = noise.at(recordings.steps)
-    space = day_space(space, model, recordings.names, DAY, fit.record.attrs[FITTED])
+    scopes, noise = day_scopes(fit, model, [run.name for run in runs], DAY), left.every(sample_time(runs[0].time))
     drawn = fit.record.posterior
-    body = {name: value for name, value in space.typical_scales.items() if name not in drawn}
-    body |= {p.name: float(np.mean(drawn[p.name])) for p in space.parameters if p.name in drawn}
-    own = [p for p in space.parameters if p.name not in body]
+    body = {name: value for name, value in scopes.typical_scales.items() if name not in drawn}
+    body |= {p.name: float(np.mean(drawn[p.name])) for p in scopes.parameters if p.name in drawn}
+    own = [p for p in scopes.parameters if p.name not in body]
     if not own:
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
-            remedy="name what does, and calibrate",
+            remedy="name the parameters that do, and calibrate",
         )
     points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
     values = {name: np.full(len(points), value) for name, value in body.items()}
     values |= {p.name: physical_of_normal(p, x, values) for p, x in zip(own, points.T, strict=True)}
-    program = TrajectoryModel(model.simulator, space, fixed, recordings, (Markers.gather(recordings, STATED, noise),))
+    program = TrajectoryModel.of_positions(model.simulator, scopes, runs, STATED, noise, left.markers)
     return CalibrationProblem(program, chunk=max(1, model.simulator.lanes // len(runs))), [p.name for p in own], values
 
 
@@ -222,7 +217,7 @@ def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -
 
 
 def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
-    """A recording of so many seconds that begins as another one, is observed as often, by all of its markers."""
+    """A recording of length ``seconds`` with the start, rate and markers of another."""
     step = sample_time(run.time)
     time = step * np.arange(max(2, int(seconds / step + 1e-6) + 1))
     return _as_recording(run, whole(run.name), np.zeros(1), run.initial_command[None], time)
@@ -231,8 +226,9 @@ def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
 def _followed_proposals(
     model: Model, begun: Trajectory, like: Trajectory, runs: Sequence[Trajectory], rng: np.random.Generator
 ) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Proposals, in the order of their kinds, that the drives follow: within what they did in the recordings at hand,
-    and made of actions where the commands of ``like`` are."""
+    """Proposals, in the order of their kinds, that the drives follow: within the commands of the given recordings, and
+    made of actions if the commands of ``like`` are.
+    """
     simulator = model.simulator
 
     def taken(run: Trajectory, value: np.ndarray) -> np.ndarray:
@@ -264,7 +260,7 @@ def _as_actions(begun: Trajectory, period: float, time: np.ndarray, value: np.nd
 def _as_recording(
     like: Trajectory, name: str, time: np.ndarray, value: np.ndarray, seen: np.ndarray | None = None
 ) -> Trajectory:
-    """Commands as a recording that begins as another one and is observed when that was, by all of its markers."""
+    """Commands as a recording with the start, observation times and markers of another."""
     observed = like.time if seen is None else seen
     return Trajectory.build(
         Origin(name=name, robot=like.robot, format="memory", settings={"unseen": True}),
@@ -285,7 +281,7 @@ def _sentence(kind: str, outlook: DayOutlook, length: float, before: float, erro
     what = f"Record the first {length:.3g} s of the {kind} in {COMMANDS}"
     if length == 0.0:
         what = "The first row of a recording is enough, before anything moves"
-    change = f"what is not known of the day then moves the last marker by {1e3 * outlook.left:.2g} mm"
+    change = f"the remaining uncertainty of the session then moves the last marker by {1e3 * outlook.left:.2g} mm"
     change = f"{change}, and by {1e3 * before:.2g} mm without it"
     if np.isfinite(outlook.seconds):
         return f"{what}: {change}. The model's own error is {1e3 * error:.2g} mm."

@@ -36,11 +36,11 @@ from rfdropo_bayes.policies.randomisation import (
 )
 from rfdropo_bayes.policies.rendering import frames_of
 from rfdropo_bayes.policies.tasks import Task, observed_of
-from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import stated
 from rfdropo_bayes.verbs.make_vec import randomisation_of, steps_of, training_of, with_training
 from rfdropo_bayes.verbs.train import POLICY
 
@@ -50,11 +50,11 @@ OF_EPISODES = ("task", "goals", "start", "actions", "observation", "period", "no
 """Keys of [training] that define an episode, for any simulator."""
 
 
-@with_keys_of(TrainingTable)
 def evaluate(
     model: Model,
     policies: Sequence[Path],
     out: Path | str,
+    options: TrainingOptions | None = None,
     *,
     fit: Calibration | Path | None = None,
     episodes: int = 200,
@@ -62,12 +62,13 @@ def evaluate(
     seed: int = 0,
     film: bool = True,
     overwrite: bool = False,
-    **keys: Any,
 ) -> dict[str, Any]:
     """Play exported policies on the same episodes of a model.
 
     Args:
         model: simulated model.
+        options: keys of [training], such as the task. Without that table they are taken from the first policy's
+            training.
         fit: a calibration, or its folder, whose posterior provides the episodes' parameters.
         policies: policy.onnx, or folders that hold one; named after their folders, with parent folders if two names are
             equal.
@@ -78,8 +79,6 @@ def evaluate(
         seed: seed of the cases.
         film: whether to draw the animations.
         overwrite: replace an earlier run in ``out``.
-        keys: keys of an experiment file's [training], such as the task. Without that table they are taken from the
-            first policy's training.
 
     Returns:
         the content of evaluation.json.
@@ -89,6 +88,7 @@ def evaluate(
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for one at least")
+    keys = stated(options, TrainingOptions)
     opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
     inherited = _task_of(policies) if model.settings.training is None else {}
     unwatched = _drop_limit(inherited) if not model.robot.cable_names and "tension_limit" not in keys else []

@@ -16,7 +16,6 @@ from rfdropo_bayes.model.assembly import physical_values
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.simulators.black_box import BlackBox
@@ -29,7 +28,7 @@ LENGTH_POWER = {"m": 1, "N": 1, "Pa": -1, "J": 2, "W": 2}
 
 
 def millimetre_factor(unit: str) -> float:
-    """What a value in an SI unit is multiplied by in a system of mm, kg and s, as SOFA scenes often use.
+    """Factor from an SI unit to a system of mm, kg and s, as SOFA scenes often use.
 
     Pa/kg is (kg/(m s2))/kg: 1e-3. Angles, times and pure numbers stay.
     """
@@ -44,9 +43,9 @@ def millimetre_factor(unit: str) -> float:
 def export_phi(folder: Path, out: Path | None = None, *, overwrite: bool = False) -> list[Path]:
     """Write phi of a run: a table (CSV and JSON) with units, and joint draws.
 
-    RF-DROPO's phi is written as found: independent normals before truncation, with their limits. Of any other method
-    the table holds mean, deviation and the central 99 % of each parameter; their correlations are in the JSON file and
-    in the draws, which are what to use where parameters are correlated.
+    RF-DROPO's phi is written as found: independent normals before truncation, with their limits. For other methods the
+    table has mean, deviation and central 99 % of each parameter. Correlations are in the JSON file and in the draws:
+    use the draws if parameters are correlated.
 
     Returns:
         the files written, to ``out``, or to the run's folder.
@@ -83,7 +82,7 @@ def export_phi(folder: Path, out: Path | None = None, *, overwrite: bool = False
 
 
 def export_posterior(folder: Path, out: Path | None, *, overwrite: bool = False) -> Path:
-    """Write posterior.nc with `KEPT_DRAWS` draws and no predictions: enough to predict with, or to start climbs from.
+    """Write posterior.nc with `KEPT_DRAWS` draws and no predictions: enough to predict with, or to start optimisations.
 
     Returns:
         the file written.
@@ -108,7 +107,7 @@ def export_posterior(folder: Path, out: Path | None, *, overwrite: bool = False)
 def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:
     """Write the model of a simulator of another kind with posterior means in it, and 90 % ranges in its head.
 
-    What mechanisms of actuation and sensing add is in no such file.
+    Effects of actuation and sensing mechanisms are not in such a file.
 
     Returns:
         the file written, ``calibrated`` with the suffix of such files, to ``out``, or to the run's folder.
@@ -124,7 +123,7 @@ def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = Fal
     known = {spec.name: spec for spec in model.robot.specs} if isinstance(model.robot, BlackBox) else {}
     draws = {info.name: record.flat(info.name) for info in record.free if info.name in known}
     values = {name: float(own.mean()) for name, own in draws.items()}
-    held = physical_values(model.spec, model.simulator) | record.attrs.get(HELD, {})
+    held = physical_values(model.spec, model.simulator) | {info.name: value for info, value in record.held}
     values |= {name: value for name, value in held.items() if name in known}
     lines = ["Calibrated by rfdropo_bayes: posterior means; in brackets the 90 % range to randomise over."]
     for name, value in values.items():
@@ -141,7 +140,7 @@ def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = Fal
 
 
 def _check_absent(paths: Sequence[Path], overwrite: bool) -> None:
-    """Raise InputError where an earlier export would be replaced."""
+    """Raise InputError if an earlier export would be replaced."""
     there = [path for path in paths if path.exists()]
     if there and not overwrite:
         raise InputError(
@@ -170,7 +169,7 @@ def _rows(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[dict[str,
 
 
 def _correlation(names: list[str], stack: np.ndarray) -> dict[str, dict[str, float]]:
-    """Of the draws; a parameter that does not vary correlates with itself only."""
+    """Correlations of the draws; a constant parameter correlates with itself only."""
     spread = stack.std(axis=1)
     scaled = (stack - stack.mean(axis=1, keepdims=True)) / np.where(spread > 0.0, spread, 1.0)[:, None]
     matrix = scaled @ scaled.T / stack.shape[1]

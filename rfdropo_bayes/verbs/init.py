@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
@@ -15,19 +18,24 @@ from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_text
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, rows_to_fit
-from rfdropo_bayes.verbs.placement import frame_lines
+from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
+from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
 from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
+NO_MOTION = "rows have no times, so each is taken for a robot at rest"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
 """Formats that come from motion capture, which loses markers now and then."""
+FAR_ORIGIN = 0.1
+"""Share of the body's length: a frame whose origin lies farther from the base is moved there."""
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
 
@@ -76,7 +84,7 @@ def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]
 
 
 def with_given(guess: Guess, **given: Any) -> Guess:
-    """A guess in which what is given takes the place of what was guessed: units, and the time from row to row [s]."""
+    """A guess with given values in place of guessed values: units, and the time from row to row [s]."""
     given = {key: value for key, value in given.items() if value is not None}
     evidence = {key: words for key, words in guess.evidence.items() if key not in given}
     of_others = {"command_unit": guess.commands, "position_unit": names_of(guess.positions)}
@@ -103,8 +111,7 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
-    """A guess with what the robot says of it: units of positions and commands, and no tensions of motors that move two
-    cables."""
+    """A guess refined by the robot: units of positions and commands, and no tensions of motors with two cables."""
     if outline.pairs and guess.tensions:
         guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
     if "markers" in outline.assumed:
@@ -134,10 +141,10 @@ def write_first_files(
     Args:
         folder: to write to; it is made.
         outline: the robot.
-        recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset, and the
-            last third of the rows of one that stands alone.
-        commands: the file of commands of each, where they have any.
-        guess: what their columns are, see `of_robot`; None without recordings, when random commands are simulated.
+        recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
+            third of the rows of a single recording.
+        commands: the file of commands of each, if they have any.
+        guess: guess of their columns, see `of_robot`; None without recordings, when random commands are simulated.
 
     Raises:
         InputError: files of these names are there already, or the folder cannot be written to.
@@ -150,9 +157,11 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
 
-    def write(data: list[str], slow: str | None = None, first: Trajectory | None = None) -> Experiment:
-        rests = slow is not None
-        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(made, guess, first, rests=rests)]
+    def write(
+        data: list[str], slow: str | None = None, first: Trajectory | None = None, seen: Frame | None = None
+    ) -> Experiment:
+        model = _model(made, outline, guess, first, seen, rests=slow is not None)
+        lines = [*_head(outline.name), *data, *_simulator(slow), *model]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
@@ -165,15 +174,41 @@ def write_first_files(
         outline.markers,
         recordings,
         commands,
-        guess,
-        outline.gravity,
+        guess=guess,
+        gravity=outline.gravity,
         cables=outline.cable_names(),
     )
     plain = write(tables())
     first = _first_recording(plain, folder)
-    if first is not None:
-        slow, rows = slow_motion(made, first), rows_to_fit(first) if len(recordings) == 1 else None
-        write(tables(frame=_frame(plain, made, guess), rows=rows), slow, first)
+    if first is None:
+        return robot, experiment
+    usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
+    outline = replace(outline, usual_command=usual or None)
+    robot.write_text(robot_text(outline), encoding="utf-8")
+    made = Robot.load(robot)
+    timed = guess.time is not None or guess.sample_time is not None
+    frame, slow = _frame(plain, made, guess), slow_motion(made, first) if timed else NO_MOTION
+    rows = rows_to_fit(first) if len(recordings) == 1 else None
+    placed = write(tables(frame=frame, rows=rows), slow, first)
+    seen = _first_recording(placed, folder)
+    columns = None if placed.data is None else placed.data.columns
+    if seen is None or columns is None or not usual:
+        return robot, experiment
+    found = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed)
+    ordered = guess
+    if found.arrangement is not None:
+        turns = np.degrees(found.arrangement.turns)
+        azimuths = tuple(round(float(a + t), 1) % 360.0 for a, t in zip(outline.first_azimuths(), turns, strict=True))
+        outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=found.evidence)
+        robot.write_text(robot_text(outline), encoding="utf-8")
+        made = Robot.load(robot)
+        ordered = guess._replace(commands=[guess.commands[column] for column in found.arrangement.columns])
+    if found.frame is not None:
+        turned = found.frame.quarter.T
+        if not np.allclose(turned, np.eye(3)) or np.linalg.norm(found.frame.shift) > FAR_ORIGIN * made.length:
+            frame = moved_frame(columns, turned, -turned @ found.frame.shift)
+            found = found._replace(frame=found.frame._replace(shift=np.zeros(3)))
+    write(tables(guess=ordered, frame=frame, rows=rows), slow, first, found.frame)
     return robot, experiment
 
 
@@ -188,9 +223,9 @@ def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
-    """Lines of [data.columns] that bring the first row to the robot; none where it is there, or nothing brings it.
+    """Lines of [data.columns] that bring the first row to the robot; empty if it is there already, or if no frame fits.
 
-    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is looked for.
+    Motive's y axis points up: with the direction of gravity its axes are known, and only the origin is searched.
     """
     if experiment.data is None or experiment.data.columns is None:
         return []
@@ -232,7 +267,7 @@ def _entries(
 
 
 def assumed_of_columns(guess: Guess) -> list[str]:
-    """What the tables of `data_tables` assume or leave out, and a recording does not tell; a sentence each."""
+    """Assumptions and omissions of `data_tables` that no recording can settle; a sentence each."""
     said = [f'{key} = "{getattr(guess, key)}": {words}' for key, words in guess.evidence.items()]
     if guess.time is None and guess.sample_time is None:
         said.append(f'time = "{ROWS}": {NO_TIMES}')
@@ -256,8 +291,8 @@ def data_tables(
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
-    ``frame`` are the lines of axes and origin, where the first row tells them; ``cables`` the robot's, one for each
-    command, if tensions of them were measured; ``rows`` those to fit and to test of a recording that stands alone.
+    ``frame`` are the lines of axes and origin, if the first row determines them; ``cables`` the robot's, one for each
+    command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single recording.
     """
     entries = _entries(folder, recordings, commands, guess, rows)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
@@ -279,7 +314,7 @@ def data_tables(
         "[data]",
         f'format = "{guess.format}"',
         f"fit = [{', '.join(fit)}]",
-        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they say how good the fit is",
+        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they score the fit",
         *masked,
         "",
         "# Guessed from the names and sizes of the columns: look them over.",
@@ -325,7 +360,7 @@ def _clock(guess: Guess) -> list[str]:
     if guess.time is None:
         return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:
-        return ['time = "header"  # stamps where messages have them; "log": the times at which they were received']
+        return ['time = "header"  # stamps if messages have them; "log": the times at which they were received']
     return [f"time = {quoted(guess.time)}", _unit_line(guess, "time_unit")]
 
 
@@ -336,7 +371,8 @@ def _command_clock(guess: Guess) -> list[str]:
     return [
         f"command_time = {quoted(guess.command_time)}",
         _unit_line(guess, "command_time_unit"),
-        "# ASSUMED: both clocks begin together. Else: what the observations' clock shows [s] when this one shows zero.",
+        "# ASSUMED: both clocks begin together. Else: reading of the observations' clock [s] when the "
+        "commands' clock shows zero.",
         "command_offset = 0.0",
     ]
 
@@ -370,11 +406,19 @@ def _simulator(slow: str | None) -> list[str]:
     ]
 
 
-def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests: bool) -> list[str]:
-    """The tables [model] and [inference]."""
-    mechanisms, tensions = installed_mechanisms(robot), guess is not None and bool(guess.tensions)
+def _model(
+    robot: Robot,
+    outline: RobotOutline,
+    guess: Guess | None,
+    first: Trajectory | None,
+    seen: Frame | None,
+    *,
+    rests: bool,
+) -> list[str]:
+    """The tables [model] and [inference]; ``seen`` is the frame in which a rod at rest explains the recording."""
+    mechanisms, tensions = installed_mechanisms(robot, outline.assumed), guess is not None and bool(guess.tensions)
     wanted = ["young_modulus = {}  # over the body's weight: how stiff it is"]
-    if tensions:
+    if tensions or robot.command_unit in ("N", "N m"):
         wanted.append("trunk_mass = {}  # weigh it, and state it under [[model.weighed]]")
     if robot.command_unit == "rad":
         wanted.append("spool_radius = {}  # cable wound up per angle")
@@ -392,11 +436,11 @@ def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests
         "",
         "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
         *wanted,
-        *installed_priors(robot, first),
+        *installed_priors(robot, first, seen, outline.assumed),
         "",
         "[inference]",
         'method = "laplace"      # rfdropo methods lists them',
         *(["blocks = 1              # rows at rest do not depend on the rows before them"] if rests else []),
-        "minutes = 3             # that calibrate may take on the machine where it runs, its report included",
+        "minutes = 3             # time limit of calibrate on its machine, report included",
         "",
     ]

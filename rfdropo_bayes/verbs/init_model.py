@@ -32,7 +32,7 @@ def write_model_experiment(
 
     Args:
         model: file of the model, which is not moved.
-        folder: to write to; it is made.
+        folder: folder to write to; it is created.
         recordings: files to fit; the last of several is for testing.
         commands: the file of commands of each, if they have any.
         guess: guess of their columns; None without recordings.
@@ -90,7 +90,7 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
     table = {"format": guess.format, "fit": [entry], "columns": columns, "missing": "mask"}
     try:
         run = load_recordings(parse_table(DataSpec, table, where="--recording"), Path(), role="fit")[0]
-    except InputError:  # what is wrong with it is said by check, which the user runs next
+    except InputError:  # check, the user's next command, reports the fault
         return dict.fromkeys(guess.markers)
     return {marker: run.position[0, k] for k, marker in enumerate(run.marker_names)}
 
@@ -115,7 +115,7 @@ def _adapter(tables: dict[str, Any], assumed: list[str]) -> list[str]:
 
 
 def _random(box: Any) -> list[str]:
-    step = 0.2 * (box.stroke or 1.0)
+    step = 0.2 * (box.usual_command or 1.0)
     return [
         "# No recording was given: simulate makes one from random commands. Put [data] in the place of this table.",
         "[commands]",

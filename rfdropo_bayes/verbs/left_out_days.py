@@ -16,10 +16,10 @@ from rfdropo_bayes.inference.methods import run
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.posteriors import DrawsByOwner, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_error, prior_day_error
 from rfdropo_bayes.prediction.model_error import ModelError
-from rfdropo_bayes.prediction.predictive import Batch, predict_new, thin
+from rfdropo_bayes.prediction.predictive import predict_new, thin
 
 CLIMB = LaplaceConfig(starts=1, screen=8, blocks=1, max_steps=10, draws=200)  # from the optimum of all days
 DRAWS = 100
@@ -27,32 +27,32 @@ OPENINGS = "command_openings"  # of each fitted recording, among the attributes 
 
 
 class Days(NamedTuple):
-    """The days of a fit.
+    """The sessions of a fit.
 
     Attributes:
-        model: what was fitted; ``runs``: the recordings.
-        start: values that climbs start from, the optimum first.
-        predictions: of the fitted recordings.
-        left: what the model left of them.
+        model: fitted model; ``runs``: the recordings.
+        start: starts of optimisations, the optimum first.
+        predictions: predictions of the fitted recordings.
+        left: residuals of the fitted recordings.
     """
 
     model: Model
     runs: Sequence[Trajectory]
-    start: Batch
+    start: DrawsByOwner
     predictions: Sequence[RecordingPrediction]
     left: ModelError
 
 
 def error_of_unseen_days(days: Days, key: jax.Array, *, show: bool | None = None) -> DayError | None:
-    """The slow error of a day that no fit has seen; None for a model without days.
+    """The slow error of an unseen session; None for a model without sessions.
 
-    Each day's recordings are left out of the fit once. The parameters climb anew, from where all days put them, and
-    predict the day from its commands and first rows. With one day alone it is the prior (`prior_day_error`); a day
-    that the others cannot be fitted without is named as missed.
+    Each session is left out of the fit once. The parameters are optimised again from the fit to all sessions, and
+    predict the session from its commands and first rows. With a single session the result is the prior
+    (`prior_day_error`). A session without which the others cannot be fitted is listed as missed.
 
     Args:
-        days: of the fit.
-        key: of the draws.
+        days: sessions of the fit.
+        key: random key of the draws.
         show: whether to show progress, see `Progress`.
     """
     spec = days.model.spec
@@ -94,7 +94,7 @@ def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[Recordi
 
 
 def openings_of(runs: Sequence[Trajectory]) -> dict[str, dict[str, str]]:
-    """How the commands of each recording begin, by name; see `command_openings`."""
+    """First commands of each recording, by name; see `command_openings`."""
     return {recording.name: command_openings(recording) for recording in runs}
 
 
@@ -104,14 +104,14 @@ def of_unseen_days(
     fitted: Sequence[str],
     openings: Mapping[str, Mapping[str, str]] | None,
 ) -> list[str]:
-    """Names of recordings of days that no fit has seen, and of those that show a fitted day under commands that begin
-    otherwise than its own: what parameters could follow there, they did not follow.
+    """Names of recordings of unseen sessions, and of fitted sessions under commands with another beginning, to which
+    parameters were not fitted.
 
     Args:
-        recordings: to be predicted.
-        groups: patterns of the days.
-        fitted: days that were fitted.
-        openings: see `openings_of`; of a posterior that does not say, the days alone count.
+        recordings: recordings to predict.
+        groups: patterns of the sessions.
+        fitted: fitted sessions.
+        openings: see `openings_of`; without them, only sessions are compared.
     """
     known = {whole(name) for name in openings or {}}
     found = []

@@ -1,4 +1,4 @@
-"""The tasks of an experiment as environments: ``make_vec``, and what training and evaluation set up alike."""
+"""The tasks of an experiment as environments: ``make_vec``, and the common set-up of training and evaluation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
@@ -35,42 +34,46 @@ from rfdropo_bayes.policies.randomisation import (
     spread_out,
 )
 from rfdropo_bayes.policies.tasks import Task, task_named
-from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
-from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord
+from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.prediction.day_spread import day_deviations
-from rfdropo_bayes.prediction.predictive import HELD
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import stated
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
 
 LONGER = 0.15
-"""Of a task's robot, how much longer or shorter one may be that takes its goals: these are 115 to 150 mm from the base
-of a trunk whose tip rests at 184 mm, so that an arm of 166 to 224 mm ends 7 to 100 mm beyond them."""
+"""Largest relative difference in length from a task's robot that keeps its goals. The goals are 115 to 150 mm from the
+base of a trunk whose tip rests at 184 mm.
+"""
 
 
-@with_keys_of(TrainingTable)
 def make_vec(
-    task: str, model: Model, *, fit: Calibration | Path | None = None, n: int = 64, **keys: Any
+    task: str,
+    model: Model,
+    options: TrainingOptions | None = None,
+    *,
+    fit: Calibration | Path | None = None,
+    n: int = 64,
 ) -> TrunkVecEnv:
     """Environments of a task, side by side, for Stable-Baselines3.
 
     Args:
         task: "TrunkReach-v0" or "TrunkPush-v0".
         model: that is simulated; its fixed values hold.
+        options: further keys of [training], such as ``observation`` or ``period``.
         fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws;
             nominal values without.
-        n: how many environments.
-        keys: further keys of an experiment file's [training], such as ``observation`` or ``period``.
+        n: number of environments.
 
     Raises:
         InputError: an unknown task or key, or a posterior of another robot.
     """
-    model = with_training(model, {"task": task, **keys})
+    model = with_training(model, {**stated(options, TrainingOptions), "task": task})
     table, chosen, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, fit)
     return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, episode_settings(table)))
@@ -88,10 +91,10 @@ def with_training(model: Model, options: Mapping[str, Any]) -> Model:
 
 
 def training_of(model: Model) -> tuple[TrainingTable, Task, AnySimulator]:
-    """What [training] says, the task, and the simulator that it is played on.
+    """The table [training], the task, and its simulator.
 
     Raises:
-        InputError: no such table, or no box of goals for a black box or a robot that is not as long as the task's.
+        InputError: no such table, or no box of goals for a black box or a robot of another length than the task's.
     """
     table = model.settings.training
     if table is None:
@@ -110,22 +113,22 @@ def training_of(model: Model) -> tuple[TrainingTable, Task, AnySimulator]:
 
 
 def _check_length(task: Task, robot: Robot | BlackBox) -> None:
-    """See that a task's own goals are within the reach of a robot: those of the paper's trunk, which ends in front of
-    them, are no places for an arm that is much longer or shorter.
+    """Check that a robot is about as long as a task's own, so that the task's goals are within reach.
 
     Raises:
-        InputError: they are not.
+        InputError: the lengths differ too much.
     """
     remedy = "give goals = [[x, y, z], [x, y, z]] [m] under [training], the corners of a box; or --goal X,Y,Z"
     if isinstance(robot, BlackBox):
-        raise InputError("nobody knows where its goals are", where="[training]", remedy=remedy)
+        raise InputError("the task has no goals for this robot", where="[training]", remedy=remedy)
     wanted, own = (float(each.body.station_m[-1]) for each in (Robot.load(task.robot), robot))
     if abs(own - wanted) > LONGER * wanted:
-        lengths = f"those of a trunk of {1e3 * wanted:.0f} mm, and {robot.name} has {1e3 * own:.0f} mm"
+        lengths = f"for a trunk of {1e3 * wanted:.0f} mm, but {robot.name} has {1e3 * own:.0f} mm"
         raise InputError(f"the goals of {task.name} are {lengths}", where="[training]", remedy=remedy)
 
 
 def episode_settings(table: TrainingTable) -> Settings:
+    """Settings of episodes in [training]."""
     return Settings(
         table.actions,
         table.observation,
@@ -138,7 +141,7 @@ def episode_settings(table: TrainingTable) -> Settings:
 
 
 def steps_of(simulator: AnySimulator) -> str:
-    """How time steps are taken: the integrator, or the engine of a black box."""
+    """Integrator of time steps: the integrator, or the engine of a black box."""
     return simulator.integrator or str(simulator.description["engine"])
 
 
@@ -148,13 +151,13 @@ def randomisation_of(
     simulator: AnySimulator,
     fit: Calibration | Path | None = None,
 ) -> Randomisation:
-    """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
+    """Sources of parameters: fixed values, randomised parameters, and parameters that differ between episodes.
 
-    A task without a cube has no use for what the experiment says of one.
+    A task without a cube ignores the experiment's cube parameters.
 
     Raises:
-        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant; a fixed
-            value of a parameter that is randomised; or a posterior that was fitted with another integrator.
+        InputError: a posterior together with another ``randomisation`` of [training]; a fixed value of a parameter that
+            is randomised; or a posterior that was fitted with another integrator.
     """
     stated = table.randomisation if "randomisation" in table.model_fields_set else None
     if fit is not None and stated not in (None, "posterior"):
@@ -171,7 +174,7 @@ def randomisation_of(
         check_fitted_integrator(fitted, simulator.integrator, where="fit")
         rows = drawn_rows(fit.record, simulator.parameters, robot=simulator.robot)
         _check_parameters(fit.record, simulator, where="fit")
-        parts.append(_beside_held(_on_its_day(rows, fit.record, simulator), fit.record.attrs, simulator))
+        parts.append(_beside_held(_on_its_day(rows, fit.record, simulator), fit.record, simulator))
     elif fit is not None:
         parts.append(_of_run(Path(fit), simulator))
     elif table.randomisation != "none":
@@ -191,7 +194,7 @@ def randomisation_of(
 
 
 def _randomised(table: TrainingTable, simulator: AnySimulator, folder: Path) -> Randomisation:
-    """What [training] randomises over."""
+    """The randomisation of [training]."""
     if table.randomisation == "uniform":
         if not table.ranges:
             raise InputError(
@@ -234,18 +237,18 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     attributes = {} if record is None else record.attrs
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
-    return _beside_held(found, attributes, simulator)
+    return _beside_held(found, record, simulator)
 
 
 def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where: str) -> None:
-    """See that the simulator has what a posterior is of, laws and mechanisms of the user's own among it: noise is none,
-    nor what belongs to one recording, nor a cube that the task lacks.
+    """Check that the simulator has the parameters of a posterior, including user laws and mechanisms. Noise, parameters
+    of single recordings and an absent cube are ignored.
 
     Raises:
         InputError: a parameter that the simulator lacks.
     """
     known = {spec.name for spec in simulator.parameters} | measured_parameters() | set(OBJECT)
-    of_all = [info.name for info in record.free if SEPARATOR not in info.name and not info.name.endswith(SPREAD)]
+    of_all = [info.name for info in record.free if not info.scope.owner and not info.scope.spread]
     lacking = [name for name in of_all if name not in known]
     if lacking:
         raise InputError(
@@ -272,8 +275,8 @@ def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -
     return Days(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
 
 
-def _beside_held(found: Randomisation, attributes: Mapping[str, Any], simulator: AnySimulator) -> Randomisation:
-    """What a run found, beside the values of the simulator's parameters that it held: what it found holds with them."""
+def _beside_held(found: Randomisation, record: PosteriorRecord | None, simulator: AnySimulator) -> Randomisation:
+    """A run's posterior, together with its fixed values of the simulator's parameters."""
     known = {spec.name for spec in simulator.parameters}
-    held = {name: value for name, value in attributes.get(HELD, {}).items() if name in known}
+    held = {} if record is None else {info.name: value for info, value in record.held if info.name in known}
     return Layers((Point(held), found), found.kind) if held else found

@@ -11,17 +11,18 @@ from jaxtyping import Bool, Float
 from rfdropo_bayes.data.named_columns import axes_matrix, axes_words
 
 AGREEING = 0.8
-"""Least agreement of a turn that is said. Nominal models of the arm, SOFA's trunk and the paper's trunk agree with
-their recordings to 0.88 to 0.96, and the turn between them is at most 6 degrees. Of 632 recordings of 3 s that five
-robots made in the right frame, under parameters of the prior, 2 are said to be turned and none to be mirrored
-(`benchmarks/frame_check.py`); 25 agree less."""
+"""Least agreement of a reported turn. Nominal models of the arm, SOFA's trunk and the paper's trunk agree with their
+recordings to 0.88 to 0.96, and the turn between them is at most 6 degrees. With prior parameters, 2 of 632 recordings
+of 3 s by five robots in the right frame are reported as turned and none as mirrored (`benchmarks/frame_check.py`); 25
+agree less.
+"""
 TURNED = np.pi / 4.0
 QUARTER = np.pi / 12.0
 """A turn as near to a number of quarters is written as ``axes``."""
 
 
 class Direction(NamedTuple):
-    """How the measured motion across the body lies to the nominal one.
+    """Direction of the measured motion across the body relative to the nominal motion.
 
     Attributes:
         turn: angle [rad] about +z from the simulated motion to the measured one.
@@ -42,7 +43,7 @@ class Direction(NamedTuple):
 
 
 class Paths(NamedTuple):
-    """Markers in one recording [m], where the nominal model has them, and which of them were seen."""
+    """Marker positions in one recording [m], in the nominal model [m], and a mask of seen markers."""
 
     nominal: Float[np.ndarray, "time marker 3"]
     measured: Float[np.ndarray, "time marker 3"]
@@ -76,11 +77,11 @@ def _across(position: np.ndarray) -> np.ndarray:
 
 
 def direction_doubt(found: Direction, axes: tuple[str, str, str] | None) -> str | None:
-    """What a direction says against the frame or the order of the cables, in words; None if it says nothing.
+    """Doubt about the frame or the order of the cables from a direction, in words; None without doubt.
 
     Args:
         found: the direction.
-        axes: of [data.columns], under which the recordings were read; None for formats that have none.
+        axes: axes of [data.columns] used to read the recordings; None for formats that have none.
     """
     if found.agreement >= AGREEING and abs(found.turn) > TURNED:
         degrees = np.degrees(found.turn)
@@ -96,14 +97,21 @@ def direction_doubt(found: Direction, axes: tuple[str, str, str] | None) -> str 
     return None
 
 
+def axes_of_mirror(turn: float, axes: tuple[str, str, str] | None) -> str:
+    """The line that corrects a left-handed frame, or the place to check it."""
+    if axes is None or not _by_quarters(turn):
+        return "look at the axes of the positions"
+    c, s = np.round(np.cos(turn)), np.round(np.sin(turn))
+    back = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, 1.0]])
+    return f"axes = {axes_words(back @ axes_matrix(axes))} in [data.columns]"
+
+
 def _mirror_remedy(turn: float, axes: tuple[str, str, str] | None) -> str:
-    """What would undo a mirror: the frame is left-handed, or the commands run the other way round."""
+    """Remedy for a mirrored motion: the frame is left-handed, or the commands run the other way round."""
     order = "look at the order of the commands and at azimuth_deg of the cables, which counts from +x towards +y"
     if axes is None or not _by_quarters(turn):
         return f"the frame is left-handed, or {order}"
-    c, s = np.round(np.cos(turn)), np.round(np.sin(turn))
-    back = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, 1.0]])
-    return f"if the frame is left-handed, axes = {axes_words(back @ axes_matrix(axes))} in [data.columns]; else {order}"
+    return f"if the frame is left-handed, {axes_of_mirror(turn, axes)}; else {order}"
 
 
 def _by_quarters(turn: float) -> bool:
@@ -113,7 +121,7 @@ def _by_quarters(turn: float) -> bool:
 
 
 def _remedy(turn: float, axes: tuple[str, str, str] | None) -> str:
-    """What would turn the motion back."""
+    """Remedy for a turned motion."""
     azimuth = f"add {np.degrees(turn) % 360.0:.0f} to azimuth_deg of every cable"
     if axes is None or not _by_quarters(turn):
         return f"{azimuth}, or turn the recordings' frame"

@@ -1,8 +1,8 @@
-"""What a calibrated simulator expects of commands that were never run: ``predict``, and ``rfdropo predict``."""
+"""Predictions of a calibrated simulator for commands that were never run: ``predict``, and ``rfdropo predict``."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,9 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.pooling import DEVIATION
-from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
-from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import (
     Origin,
@@ -32,30 +28,27 @@ from rfdropo_bayes.data import (
 from rfdropo_bayes.data.given_recordings import given_recording
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_json
 from rfdropo_bayes.groups import Patterns, group_of, in_group
-from rfdropo_bayes.model.assembly import KNOWN, expand_groups, fixed_values, integrator_of, model_specs, with_groups
+from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
-from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
-from rfdropo_bayes.prediction.day_spread import pooled_parameters, spread_families
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
-    HELD,
     KNOWN_NOISE,
     NOISE,
     match_cautions,
     predict_new,
     thin,
 )
-from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
+from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
-from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, of_unseen_days
@@ -68,24 +61,31 @@ POSE_UNITS = "m, m, m, and unit quaternion x, y, z, w"
 
 def predict(
     fit: Calibration,
-    commands: Trajectory | tuple[Any, Any],
+    commands: Trajectory | tuple[Any, Any] | Path | str,
     *,
     start: Any = None,
+    episode: int | None = None,
     draws: int = DRAWS,
-    seed: int = 0,
+    seed: int | None = None,
     group: str | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
 ) -> Prediction:
-    """Predict what the markers will do under given commands, from at most the start pose.
+    """Predict the motion of the markers under given commands, from at most the start pose.
 
     Args:
         fit: a calibration, with its model.
-        commands: a recording, of which nothing but the commands and the first row is looked at; or a pair of times [s]
-            and commands (time, channel), in the robot's unit.
-        start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
-        draws: of the posterior that are rolled out.
-        seed: of what is random.
-        group: the day, robot or other group that they belong to; by default the day that `adapt` has taken the fit to,
-            or else as [model.groups] has it.
+        commands: a recording, of which only the commands and the first row are used; the name of a file in the format
+            of the model's experiment; or a pair of times [s] and commands (time, channel), in the robot's unit.
+        start: positions of the markers in the first row [m], (marker, 3), for such a pair; for a file, the file of
+            observations, if it is another file (see `load_unseen`); unknown by default.
+        episode: number of the episode, if the file is a LeRobotDataset.
+        draws: number of posterior draws to simulate.
+        seed: seed of random numbers; by default from the model's experiment.
+        group: session, robot or other group of the commands; by default the session of `adapt`, or else from
+            [model.groups].
+        out: folder for prediction.nc, prediction.csv and prediction.json, see `Prediction.save`; None writes nothing.
+        overwrite: replace earlier files in ``out``.
 
     Raises:
         InputError: a calibration without its model, or commands of another robot.
@@ -96,27 +96,25 @@ def predict(
     _check_noise(record, spec.noise)
     if isinstance(commands, tuple) and len(commands) == 2 and not isinstance(commands[0], Trajectory):
         unseen = _commanded(model, commands[0], commands[1], start)
+    elif isinstance(commands, str | Path):
+        unseen = _unseen(model, str(commands), start, record.attrs.get(BEGUN), episode)
     else:
         unseen = first_row_only(given_recording(commands, "predict"))
+    asked = {"group": group, "seed": seed, "episode": episode}
     group = record.attrs.get(ADAPTED_TO) if group is None else group
     groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
     simulator = with_groups(model.simulator, groups)
-    fixed, space = fitted_parts(fit)
-    recordings = gather_recordings(simulator, [unseen])
-    stated, step = spec.stated, sample_time(unseen.time)
-    lasts = stated.correlation_time if stated is not None and spec.noise == STATED else None
-    memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
-    channels = (_markers(recordings, spec.noise, record.attrs.get(KNOWN_NOISE), memory),)
-    program = TrajectoryModel(simulator, space, fixed, recordings, channels)
+    scopes = fitted_scopes(fit)
+    noise = _known_noise(spec, record.attrs.get(KNOWN_NOISE), sample_time(unseen.time))
+    program = TrajectoryModel.of_positions(simulator, scopes, [unseen], spec.noise, *noise)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
-    belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
-    fitted = record.attrs.get(FITTED, belonging)
-    slow = _slow_error(record, unseen, groups, space)
+    fitted = record.attrs.get(FITTED, sorted({info.scope.owner for info in record.free if info.scope.owner}))
+    slow = _slow_error(record, unseen, groups, scopes)
     found = predict_new(
         program,
         [unseen],
         values,
-        jax.random.key(seed),
+        jax.random.key(model.settings.seed if seed is None else seed),
         chunk=simulator.lanes,
         fitted=fitted,
         left=recorded_model_error(record),
@@ -128,19 +126,47 @@ def predict(
     bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
     bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
     group = bands.attrs["group"] = group_of(unseen.name, groups)
-    known = {p.recording for p in space.parameters if p.added_to}
+    known = {p.scope.owner for p in scopes.deviating}
     cautions = cautions_after(record, model, [unseen]) + match_cautions(found)
     if isinstance(simulator, RobotSimulator):
         cautions += simulator.robot.unstated([unseen.name])
     said = [day_sentence(error) for error in slow.values() if not error.shown and group not in known]
-    return Prediction(bands, predicted, group, group in known if known else None, cautions, "".join(said))
+    named = str(commands) if isinstance(commands, str | Path) else unseen.name
+    facts = {
+        "schema_version": SCHEMA_VERSION,
+        "experiment": _path(model),
+        "posterior": None if fit.folder is None else str(fit.folder),
+        "commands": named,
+        "episode": episode,
+        "start_pose_known": start_is_known(unseen),
+        "first_command": unseen.first_command,
+        "simulator": model.simulator.description,
+    }
+    prediction = Prediction(bands, predicted, group, group in known if known else None, cautions, "".join(said), facts)
+    if out is None:
+        return prediction
+    options = {"posterior": fit.folder, "commands": named, "start": start, **asked}
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes([unseen])}
+    with run_folder(Path(out), "predict", **settings, options=options, overwrite=overwrite) as folder:
+        prediction.save(folder)
+    return prediction
 
 
-def _slow_error(
-    record: PosteriorRecord, unseen: Trajectory, groups: Patterns, space: ParameterSpace
-) -> dict[str, DayError]:
-    """The slow error of the day of a recording, by its name; empty where the fit has seen the day, or has no days."""
-    days = {p.recording for p in space.parameters if p.added_to}
+def _path(model: Model) -> str:
+    return model.name if model.file is None else str(model.file.path)
+
+
+def _unseen(model: Model, commands: str, start: Any, begun: str | None, episode: int | None) -> Trajectory:
+    """The commands of a file in the format of the model's experiment."""
+    data = model.settings.data
+    if data is None:
+        raise InputError("the experiment has no [data]", where=_path(model), remedy="name the format of the commands")
+    return load_unseen(data, model.folder, commands, start, begun=begun, episode=episode)
+
+
+def _slow_error(record: PosteriorRecord, unseen: Trajectory, groups: Patterns, scopes: Scopes) -> dict[str, DayError]:
+    """The slow error of a recording's session, by name; empty if the fit has seen the session, or has no sessions."""
+    days = {p.scope.owner for p in scopes.deviating}
     error = recorded_day_error(record) if days else None
     if error is None:
         return {}
@@ -156,13 +182,13 @@ def model_of(fit: Calibration) -> Model:
     """The model of a calibration.
 
     Raises:
-        InputError: it was read from files that do not say which, or the model has another integrator than the fit.
+        InputError: its files do not describe the model, or the model has another integrator than the fit.
     """
     if fit.model is not None:
         fitted = fitted_integrator(fit.record.attrs, fit.folder)
         check_fitted_integrator(fitted, integrator_of(fit.model.spec), where=f"posterior of {fit.model.name}")
         return fit.model
-    why = "no config.toml says which"
+    why = "no config.toml describes it"
     if fit.folder is not None and (fit.folder / CONFIG).is_file():
         try:
             return Model.read(fit.folder / CONFIG)
@@ -171,16 +197,15 @@ def model_of(fit: Calibration) -> Model:
     raise InputError(
         f"the calibration has no model: {why}",
         where=str(fit.folder or "predict"),
-        remedy="give the one that was calibrated: rb.load(folder, model=model)",
+        remedy="give the calibrated model: rb.load(folder, model=model)",
     )
 
 
-def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
-    """Values that a calibration took for known, and the parameters that it inferred."""
-    model = model_of(fit)
-    fixed = {**fixed_values(model.spec, model.simulator), **fit.record.attrs.get(HELD, {})}
-    scoped = expand_groups(model.spec.only_in, model.simulator.parameters)
-    return fixed, _fitted_space(fit.record, model_specs(model.spec, model.simulator), scoped)
+def fitted_scopes(fit: Calibration) -> Scopes:
+    """Inferred and fixed parameters of a calibration."""
+    model, record = model_of(fit), fit.record
+    fixed = fixed_values(model.spec, model.simulator)
+    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.held)
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
@@ -195,80 +220,8 @@ def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
     )
 
 
-def run_prediction(
-    model: Model,
-    posterior: Path,
-    commands: str,
-    out: Path,
-    *,
-    start: str | None = None,
-    episode: int | None = None,
-    seed: int | None = None,
-    group: str | None = None,
-    overwrite: bool = False,
-) -> dict[str, Any]:
-    """Predict what the markers will do under the commands of a file, from at most the start pose.
-
-    Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of what would be measured, in metres, in the
-    robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. Where the robot pushes
-    an object, it starts from its measured pose; its centre is in both files, every draw of its pose in the first.
-
-    Args:
-        model: of the experiment file that was calibrated.
-        posterior: folder of its calibration.
-        commands, start: see `data.load_unseen`.
-        out: folder to write to.
-        episode: of a LeRobotDataset.
-        seed: of the draws; that of the experiment by default.
-        group: see `predict`.
-        overwrite: write whatever ``out`` holds.
-
-    Raises:
-        InputError: bad input, or a posterior that does not belong to the experiment.
-    """
-    read, folder = model.settings, model.folder
-    path = model.name if model.file is None else str(model.file.path)
-    if read.data is None:
-        raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
-    record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(read.data, folder, commands, start, begun=record.attrs.get(BEGUN), episode=episode)
-    fit = Calibration(record, {}, "", model, Path(posterior))
-    found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
-    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "seed": seed}
-    options |= {"group": group, "episode": episode}
-    settings: dict[str, Any] = {
-        "tables": model.tables(),
-        "folder": folder,
-        "options": options,
-        "data": hashes([unseen]),
-    }
-    with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
-        facts = {
-            "schema_version": SCHEMA_VERSION,
-            "experiment": path,
-            "posterior": str(posterior),
-            "commands": commands,
-            "episode": episode,
-            "start_pose_known": start_is_known(unseen),
-            "first_command": unseen.first_command,
-            "group": found.group,
-            "group_fitted": found.group_fitted,
-            "unseen_day": found.unseen or None,
-            "rows": len(found.drawn.time),
-            "draws": int(found.drawn.predicted.shape[0]),
-            "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
-            "cautions": [caution.as_dict() for caution in found.cautions],
-            "unit": "m",
-            "frame": unseen.dataset.attrs["frame"],
-            "simulator": model.simulator.description,
-            "files": [str(file) for file in found.save(out)],
-        }
-        write_json(out / "prediction.json", facts)
-    return facts
-
-
 def _check_noise(record: PosteriorRecord, noise: str) -> None:
-    """Raise an InputError where an experiment's noise model is not the one that a posterior was fitted with."""
+    """Raise an InputError if an experiment's noise model differs from a posterior's."""
     fitted = record.attrs.get(NOISE, noise)  # earlier posteriors do not say
     if noise != fitted:
         raise InputError(
@@ -278,17 +231,18 @@ def _check_noise(record: PosteriorRecord, noise: str) -> None:
         )
 
 
-def _markers(
-    recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None, memory: Float[np.ndarray, " lag"] | None
-) -> Markers:
-    """The positions to predict, under the noise that was inferred, or that the posterior knows: with the memory that
-    these rows have, where it is given.
+def _known_noise(spec: ModelSpec, known: Mapping[str, Any] | None, step: float) -> tuple[Autoregression | None, Any]:
+    """The noise stored in the posterior, and its markers; None for an inferred noise.
+
+    Args:
+        spec: the model; known: the noise as the posterior stores it.
+        step: seconds between the rows to predict. A correlation time in [noise] replaces the stored autocorrelation.
 
     Raises:
-        InputError: a noise that is not inferred, and a posterior that does not hold it.
+        InputError: a noise that is neither inferred nor stored in the posterior.
     """
-    if noise not in KNOWN:
-        return Markers.gather(recordings, noise)
+    if spec.noise not in KNOWN:
+        return None, ()
     if known is None:
         raise InputError(
             "the posterior does not hold the noise of the positions",
@@ -296,48 +250,10 @@ def _markers(
             remedy="predict with the experiment that was calibrated",
         )
     recalled = Autoregression.from_dict(known)
-    if memory is not None:
-        recalled = replace(recalled, autocorrelation=memory, step=None)
-    own = noise_of_markers(recalled, known["markers"], recordings).at(recordings.steps)
-    return Markers.gather(recordings, noise, own)
-
-
-def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec], of_groups: Container[str]) -> ParameterSpace:
-    """The parameters a posterior holds, with the recordings, or groups of them, that they belong to.
-
-    Args:
-        record: the posterior.
-        specs: every parameter of the model.
-        of_groups: names of those that some groups have and others do not.
-
-    Raises:
-        InputError: a parameter that the experiment's model lacks.
-    """
-    scopes: dict[str, list[str]] = {}
-    scoped: dict[str, dict[str, tuple[str, ...]]] = {}
-    priors: dict[str, dict[str, Any]] = {}
-    known = {spec.name for spec in specs}
-    pooled, families = pooled_parameters(record, specs), spread_families(record, specs)
-    for info in record.free:
-        name, _, recording = info.name.partition(SEPARATOR)
-        if name not in known and name.removesuffix(DEVIATION) in pooled:
-            continue
-        if name.endswith(SPREAD) and name.removesuffix(SPREAD) in families:
-            continue
-        priors[name] = dict(info.prior)
-        if recording and name in of_groups:
-            scoped.setdefault(name, {})[recording] = ()
-        elif recording:
-            scopes.setdefault(name, []).append(recording)
-    missing = [name for name in priors if name not in known]
-    if missing:
-        raise InputError(
-            f"the posterior holds {missing[0]!r}, which the experiment's model lacks",
-            where="--from",
-            remedy="predict with the experiment that was calibrated, mechanisms included",
-        )
-    recordings = sorted({recording for names in scopes.values() for recording in names})
-    return build_space(specs, priors, scopes, recordings, pooled=pooled, scoped=scoped, where="posterior")
+    lasts = spec.stated.correlation_time if spec.stated is not None and spec.noise == STATED else None
+    if lasts is not None:
+        recalled = replace(recalled, autocorrelation=np.array([1.0, np.exp(-step / lasts)]), step=None)
+    return recalled, known["markers"]
 
 
 def summarise(predicted: RecordingPrediction) -> xr.Dataset:
@@ -355,7 +271,7 @@ def summarise(predicted: RecordingPrediction) -> xr.Dataset:
 
 
 def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
-    """Where a pushed object is: mean and quantiles of its centre, and every draw of its pose."""
+    """Position of a pushed object: mean and quantiles of its centre, and every draw of its pose."""
     found = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
     centre = pose[..., :3]
     quantiles = np.quantile(centre, list(LEVELS.values()), axis=0)

@@ -1,10 +1,11 @@
-"""Before a fit: which combinations of parameters recordings cannot determine, what would, and what the fit costs.
+"""Before a fit: parameter combinations that recordings cannot determine, measurements that would, and the cost of the
+fit.
 
-The derivatives of all that is measured, at draws of the prior, give the Fisher information there. In coordinates in
-which the prior is a standard normal distribution (logarithms of what has a scale), with information :math:`F_d` at draw
+The derivatives of the measurements, at draws of the prior, give the Fisher information there. In coordinates in which
+the prior is a standard normal distribution (logarithms of scale parameters), with information :math:`F_d` at draw
 :math:`d`, a direction :math:`v` keeps the share :math:`\\sqrt{\\overline{v^T (1 + F_d)^{-1} v}}` of its prior standard
-deviation. Directions that keep most of it are undetermined. What else could be measured adds its own information. The
-mean is that of posterior variances, not of information: a draw that snaps may hold more than all others together.
+deviation. Directions that keep most of it are undetermined. Further measurements add their own information. Posterior
+variances are averaged, not informations: a draw with a snap-through may have more information than all others together.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.budget import budget_within
 
-# Of a derivative, in prior standard deviations. Of the paper's trunk a draw of four snaps within 2e-3, which hides the
-# scale of its modulus and mass; 2e-4 and 2e-5 give the same slopes to five digits.
+# Step of a derivative, in prior standard deviations. A quarter of the draws of the paper's trunk snap within 2e-3,
+# which hides the scale of its modulus and mass; 2e-4 and 2e-5 give the same slopes to five digits.
 STEP = 2e-4
 SETS = 128  # parameter sets that are rolled out in all, about
 PATIENCE = 10.0  # [s]: no more rollouts are begun after these
@@ -51,10 +52,10 @@ class Direction:
     """A combination of parameters that recordings leave undetermined.
 
     Attributes:
-        together: how the parameters change together: of the logarithm of those with a scale, of the others in their
-            unit; the largest is 1 in prior standard deviations.
+        together: relative changes of the parameters, logarithmic for scale parameters; the largest is 1 in prior
+            standard deviations.
         kept: posterior over prior standard deviation.
-        ended_by: what would determine it, with the share that would be kept then, best first.
+        ended_by: measurements that would determine it, with the remaining share of the deviation, best first.
         sentence: the same in words.
     """
 
@@ -71,19 +72,19 @@ class Direction:
 
 @dataclass(frozen=True)
 class Preflight:
-    """What recordings can say of a model's parameters, before anything is fitted.
+    """Information of recordings on a model's parameters, before a fit.
 
     Attributes:
-        directions: what they cannot determine, the worst first.
-        parameters: for each parameter the share of its prior standard deviation that is kept: ``alone``, were all else
-            known, and ``kept``.
-        channels: for each recording the channels of commands that do not change.
-        noise: what was taken for the noise of the positions, in words.
-        draws: draws of the prior that were looked at; failed: those of them whose rollouts did not end well.
-        rollout_seconds: of one parameter set, all recordings.
-        rollouts: budget of the fit; minutes: that it takes.
-        method: of the fit.
-        seconds: that this took.
+        directions: undetermined combinations, the worst first.
+        parameters: share of the prior standard deviation that remains for each parameter: ``alone`` with all other
+            parameters known, and ``kept``.
+        channels: constant command channels of each recording.
+        noise: assumed noise of the positions, in words.
+        draws: number of prior draws; failed: number of failed rollouts.
+        rollout_seconds: time to simulate one parameter set, all recordings.
+        rollouts: budget of the fit; minutes: its run time.
+        method: method of the fit.
+        seconds: run time of this analysis.
     """
 
     directions: list[Direction]
@@ -100,7 +101,7 @@ class Preflight:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[tuple[str, str]]:
-        """Pairs of a label and a text, an empty label going on with the one before."""
+        """Pairs of a label and a text, an empty label continues the previous pair."""
         found = self._undetermined() or ["every combination, more or less"]
         rows = [("undetermined" if self.directions else "determined", found[0]), *(("", text) for text in found[1:])]
         rows += [("" if index else "excited", text) for index, text in enumerate(self._excitation())]
@@ -156,6 +157,7 @@ class _Coordinates(NamedTuple):
     logarithmic: np.ndarray
     mean: Float[np.ndarray, " parameter"]
     sd: Float[np.ndarray, " parameter"]
+    masses: np.ndarray
 
     def values(self, x: Float[np.ndarray, "n parameter"]) -> dict[str, np.ndarray]:
         scaled = self.mean + self.sd * x
@@ -165,7 +167,7 @@ class _Coordinates(NamedTuple):
 
 
 class _Noise(NamedTuple):
-    """What was taken for the noise of the positions [m], [s]."""
+    """Assumed noise of the positions: deviations [m], correlation time [s]."""
 
     white: float
     lasting: float
@@ -176,13 +178,13 @@ class _Noise(NamedTuple):
 def preflight(
     model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0
 ) -> Preflight:
-    """Say what a fit of these recordings can determine, in seconds.
+    """Estimate within seconds the combinations that a fit of these recordings can determine.
 
     Args:
-        model: what would be fitted.
-        runs: recordings.
-        method: and ``rollouts``: its budget; those of the model's experiment by default.
-        seed: of the draws of the prior.
+        model: model to fit.
+        runs: recordings to fit.
+        method: and ``rollouts``: its budget; by default from the model's experiment.
+        seed: seed of the prior draws.
 
     Raises:
         InputError: no parameter to infer, or no prior draw whose rollouts end well.
@@ -243,11 +245,14 @@ def _coordinates(problem: CalibrationProblem, drawn: Mapping[str, np.ndarray]) -
     names = tuple(name for name in problem.physical_names if np.ptp(drawn[name]) > 0.0)
     logarithmic = np.array([_has_scale(problem, name, drawn[name]) for name in names], dtype=bool)
     columns = [np.log(drawn[n]) if log else drawn[n] for n, log in zip(names, logarithmic, strict=True)]
-    return _Coordinates(names, logarithmic, np.array([c.mean() for c in columns]), np.array([c.std() for c in columns]))
+    own = [problem.model.scopes[name] for name in names]
+    masses = np.array([p.spec.unit == "kg" and not (p.scope.spread or p.scope.added_to) for p in own], dtype=bool)
+    mean, sd = (np.array([getattr(column, of)() for column in columns]) for of in ("mean", "std"))
+    return _Coordinates(names, logarithmic, mean, sd, masses)
 
 
 def _has_scale(problem: CalibrationProblem, name: str, draws: np.ndarray) -> bool:
-    family = (problem.model.space[name].table or {}).get("distribution")
+    family = problem.model.scopes[name].table.get("distribution")
     return bool(
         np.all(draws > 0.0) and (family in ("LogNormal", "LogUniform") or draws.std() < WELL_AWAY * draws.mean())
     )
@@ -266,7 +271,7 @@ def _noise(
         return _Noise(sd, 0.0, 1.0, f"noise of {1e3 * sd:.3g} mm, the spread of the repeats")
 
     def typical(name: str, otherwise: float) -> float:
-        return float(np.median(drawn[name])) if name in drawn else problem.model.fixed.get(name, otherwise)
+        return float(np.median(drawn[name])) if name in drawn else problem.model.scopes.fixed.get(name, otherwise)
 
     white = typical(OBSERVATION_NOISE.name, 1e-3)
     lasting = typical(LASTING_NOISE.name, 0.0) if model.spec.noise == "auto" else 0.0
@@ -323,9 +328,9 @@ def _slopes(
 
 
 def _observed(problem: CalibrationProblem, every: Mapping[str, np.ndarray], whole: int) -> tuple[Observation, float]:
-    """What parameter sets show, and seconds of one, in batches of one size, as each size takes a compilation.
+    """Simulated observations of parameter sets, and seconds per set, in batches of equal size to save compilations.
 
-    When `PATIENCE` is up, what is left is not simulated; what is there is a multiple of ``whole`` sets.
+    Sets beyond the time `PATIENCE` are not simulated; the result is a multiple of ``whole`` sets.
     """
     count = len(next(iter(every.values())))
     size = max(each for each in chunk_sizes(problem.chunk) if each <= max(count, min(chunk_sizes(problem.chunk))))
@@ -348,7 +353,7 @@ def _observed(problem: CalibrationProblem, every: Mapping[str, np.ndarray], whol
 
 
 class _Whitening:
-    """Derivatives over the noise of what they are of."""
+    """Derivatives of measurements divided by their noise."""
 
     def __init__(self, problem: CalibrationProblem, noise: _Noise) -> None:
         self.noise, recordings = noise, problem.model.recordings
@@ -356,7 +361,7 @@ class _Whitening:
         self.valid, self.time = np.asarray(recordings.line.valid), np.asarray(recordings.time)
 
     def positions(self, slope: Float[np.ndarray, "draw parameter recording time marker 3"]) -> np.ndarray:
-        """Over the noise of the positions; masked ones count for nothing."""
+        """Derivatives of positions, whitened by their noise; masked positions count for nothing."""
         parts = []
         for index, rows in enumerate(self.rows):
             own = np.moveaxis(slope[:, :, index, :rows], 2, 0)
@@ -378,8 +383,9 @@ def innovations(
     valid: Bool[np.ndarray, "time marker"],
     noise: _Noise,
 ) -> Float[np.ndarray, "time *many marker 3"]:
-    """Series over a white noise and one that lasts, as independent unit normals: each row less what those before it
-    say of it (Kalman's filter), in as many operations as there are rows; zero where not valid."""
+    """Series whitened by white plus correlated noise: each row less its prediction from earlier rows (Kalman filter),
+    in linear time; zero for invalid rows.
+    """
     found = np.zeros_like(series)
     mean, variance = np.zeros(series.shape[1:]), np.full(valid.shape[1], noise.lasting**2)
     for row, seen in enumerate(valid):
@@ -407,7 +413,7 @@ def _covariance(information: Float[np.ndarray, "draw parameter parameter"]) -> F
 def _weighed(
     model: Model, problem: CalibrationProblem, coordinates: _Coordinates, drawn: Mapping[str, np.ndarray]
 ) -> Float[np.ndarray, "parameter row"]:
-    """Derivatives of what was weighed over its error."""
+    """Derivatives of weighed masses divided by their error."""
     found = np.zeros((len(coordinates.names), len(model.spec.weighed)))
     for column, entry in enumerate(model.spec.weighed):
         for name in set(entry.parameters) & set(coordinates.names):
@@ -418,22 +424,21 @@ def _weighed(
 
 
 def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> dict[str, np.ndarray]:
-    """Information of what could be measured as well, by what it is."""
+    """Information of possible further measurements, by name."""
     found: dict[str, np.ndarray] = {}
     if tension.shape[-1] and not model.spec.channels.tension:
         found[f"tensions of the cables (to {100 * TENSION_ERROR:g} %)"] = _information(tension)
-    units = {spec.name: spec.unit for spec in model.simulator.parameters}
     for k, name in enumerate(coordinates.names):
         weight = np.zeros((1, *(len(coordinates.names),) * 2))
         size = 1.0 if coordinates.logarithmic[k] else max(abs(coordinates.mean[k]), coordinates.sd[k])
         weight[0, k, k] = (coordinates.sd[k] / (KNOWN * size)) ** 2
-        word = "weighed" if units.get(name.partition("@")[0]) == "kg" else BY_ITSELF
+        word = "weighed" if coordinates.masses[k] else BY_ITSELF
         found[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
     return found
 
 
 def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mapping[str, np.ndarray]) -> list[Direction]:
-    """What keeps most of its prior standard deviation."""
+    """Directions that keep most of their prior standard deviation."""
     covariance = _covariance(information)
     with_more = {what: _covariance(information + extra) for what, extra in more.items()}
     values, vectors = np.linalg.eigh(covariance)
@@ -454,8 +459,9 @@ def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mappin
 
 
 def _named(information: np.ndarray, vector: np.ndarray) -> list[int]:
-    """The parameters that a direction is described by: all that take a large part, and more, the largest first, until
-    recordings could not tell how they change together were all others known."""
+    """Parameters that describe a direction: all with a large component, and further parameters in order of size. Enough
+    are named that recordings could not determine the direction with all others known.
+    """
     names: list[int] = []
     for k in np.argsort(-np.abs(vector)):
         part = np.zeros_like(vector)
@@ -489,7 +495,7 @@ _OWN = f"nothing but the parameter {BY_ITSELF} would end it"
 
 
 def _sentence(told: Mapping[str, float], smaller: int, logs: bool, kept: float, ended: Mapping[str, float]) -> str:
-    """A direction in words: its largest parts, and how many smaller ones there are."""
+    """A direction in words: its largest parts, and the number of smaller parts."""
     names = list(told)
     if len(names) == 1:
         subject = names[0]

@@ -18,6 +18,9 @@ def random_walk(
 
     Returns:
         times [s] and cumulative commands [the robot's command unit].
+
+    Raises:
+        InputError: a step larger than the range.
     """
     if table.high - table.low < table.step:
         raise InputError(

@@ -25,7 +25,7 @@ def read(
         files: names and patterns, relative to $RFDROPO_DATA or ``folder``; an entry may also be a dictionary with
             ``observations``, ``commands``, ``rows`` and ``episodes``.
         format: csv, motive-csv, rosbag, lerobot, mat, npz, netcdf, asl-csv, optitrack-csv or sofa-csv.
-        columns: for the first six, meaning of each column, as in an experiment file's [data.columns].
+        columns: meaning of each column, for the first six formats, as in an experiment file's [data.columns].
         folder: base of relative names.
         keys: further keys of [data], such as ``resample``, ``missing`` or ``initial_command``.
 

@@ -1,4 +1,4 @@
-"""What is doubtful of recordings as they were read, said once: by ``check``, and on the page of every later answer."""
+"""Doubts about recordings as read: reported by ``check``, and on the page of every later result."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ DOUBTS = "doubts"
 MILLIMETRES = 1e3
 MOST_NAMES = 12
 FEWEST_DRAWS = 8
-"""Of the prior, whose median stands for the nominal model."""
+"""Least number of prior draws whose median may replace the nominal model."""
 
 
 def recording_cautions(
     robot: Workpiece, recordings: Sequence[Trajectory], columns: CsvColumns | None = None
 ) -> list[Caution]:
-    """What is doubtful of recordings: how they were read, where they begin, and what was asked of the robot.
+    """Doubts about recordings: their reading, their first rows, and their commands.
 
     Args:
-        robot: that they are of.
-        recordings: as they were read.
-        columns: the table by which they were read; None for formats that have none.
+        robot: recorded robot.
+        recordings: recordings as read.
+        columns: table used to read them; None for formats that have none.
     """
     found = [
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
@@ -56,34 +56,35 @@ def recording_cautions(
 def cautions_of_fit(
     model: Model, recordings: Sequence[Trajectory], predictions: Iterable[RecordingPrediction]
 ) -> list[Caution]:
-    """The same of what was fitted and tested, and what the motion under the prior says of frame, size and commands.
+    """The same for fitted and test recordings, with doubts about frame, size and commands from the motion under the
+    prior.
 
     Args:
-        model: that was fitted.
-        recordings: fitted ones first, then test recordings.
-        predictions: of them, with predictions under the prior.
+        model: fitted model.
+        recordings: fitted recordings first, then test recordings.
+        predictions: their predictions, including predictions under the prior.
     """
     paths = [each for prediction in predictions for each in _prior_paths(prediction)]
     return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
 
 
 def cautions_of_audit(model: Model, recordings: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
-    """The same of an audit, whose ``paths`` are those of the nominal model."""
+    """The same for an audit, with ``paths`` of the nominal model."""
     return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
 
 
 def cautions_after(fit: PosteriorRecord, model: Model, recordings: Sequence[Trajectory]) -> list[Caution]:
-    """What is doubtful of recordings that a fit is brought to, and of those that it is from; each once."""
+    """Doubts about new recordings and about the recordings of a fit; each once."""
     return list(dict.fromkeys([*recorded_doubts(fit), *_read(model, recordings)]))
 
 
 def with_doubts(record: PosteriorRecord, cautions: Sequence[Caution]) -> PosteriorRecord:
-    """A posterior that says what is doubtful of its recordings, so that all later answers from it say so."""
+    """A posterior with the doubts about its recordings, which all later results repeat."""
     return replace(record, attrs={**record.attrs, DOUBTS: [caution.as_dict() for caution in cautions]})
 
 
 def recorded_doubts(record: PosteriorRecord) -> list[Caution]:
-    """What a posterior says of its recordings."""
+    """Doubts about recordings stored in a posterior."""
     return read_cautions(record.attrs.get(DOUBTS, []))
 
 
@@ -97,15 +98,15 @@ def columns_of(model: Model) -> CsvColumns | None:
 
 
 def _moved(model: Model, first: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
-    """What motions say; of a robot alone, whose base has a z axis along the body."""
+    """Doubts from motions; only for a robot, whose base has a z axis along the body."""
     if not (isinstance(model.spec.robot, Robot) and paths):
         return []
     motion = Motion(direction_of(paths), size_of(paths))
-    return motion_cautions(motion, columns_of(model), first[0].cable_names, first[0].command_unit)
+    return motion_cautions(motion, columns_of(model), first[0].command_unit)
 
 
 def _prior_paths(prediction: RecordingPrediction) -> list[Paths]:
-    """A fitted recording beside the median of its predictions under the prior; empty where too few were made."""
+    """A fitted recording beside the median of its predictions under the prior; empty if there are too few."""
     drawn = prediction.prior_predicted
     if drawn is None:
         return []
@@ -122,9 +123,9 @@ def _misnamed(recording: Trajectory, markers: Sequence[str]) -> list[Caution]:
     if not (unknown and unseen) or len(unseen) == len(markers):
         return []
     sentence = (
-        f"{recording.name}: {shortened(unknown)} of the recording is no marker of the robot, and {shortened(unseen)} "
-        "of the robot is not in the recording: where both are the same point, give it one name, in markers under "
-        "[data.columns] or in the robot file"
+        f"{recording.name}: {shortened(unknown)} of the recording is no marker of the robot, and "
+        f"{shortened(unseen)} of the robot is not in the recording: if both are the same point, give it "
+        "one name, in markers under [data.columns] or in the robot file"
     )
     return [Caution(Code.RECORDING_DOUBTFUL, sentence)]
 
@@ -163,7 +164,7 @@ def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows 
 
 
 def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
-    """Cables that are asked for more than they are allowed, in words; empty if there are none."""
+    """Cables with commands beyond their limits, in words; empty if there are none."""
     low, high = asked.min(axis=0), asked.max(axis=0)
     least, most = np.array(robot.drive_limits()).T
     factor, unit = SHOWN[robot.cables[0].unit]
@@ -175,7 +176,7 @@ def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
 
 
 def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
-    """Cables that are asked for more than a body has."""
+    """Cables with commands longer than the body."""
     asked = asked_pulls(robot, recording)
     length = robot.length
     if (
@@ -194,7 +195,9 @@ def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
 
 
 def _placements(robot: Robot, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> list[Caution]:
-    """First rows far from the undeformed robot, with a cause; recordings alike share one caution."""
+    """First rows far from the undeformed robot, with a cause; equal doubts about several recordings share one
+    caution.
+    """
     shared: dict[str, list[str]] = {}
     for recording in recordings:
         for hint in placement_hints(robot, recording, columns):

@@ -20,7 +20,7 @@ def write_session_page(folder: Path) -> Path:
     """Write the page of a session.
 
     Args:
-        folder: of the session.
+        folder: folder of the session.
 
     Returns:
         the page.

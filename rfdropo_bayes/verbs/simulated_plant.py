@@ -71,8 +71,11 @@ def true_simulator(
     """The simulator behind `trunk` and the values of its parameters, with the commands' own timing.
 
     Args:
-        robot, experiment, changes: as for `trunk`.
+        robot, experiment, changes: see `trunk`.
         base: instead of the experiment's robot.
+
+    Raises:
+        InputError: channels, markers or the unit of commands differ from the robot's.
     """
     overrides = [f"{name}={tomli_w.dumps({'x': value})[4:].strip()}" for name, value in changes.items()]
     if experiment:

@@ -24,7 +24,7 @@ from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.policy_page import EPISODES, play_policy, render_policy
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training import train as learn
-from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.facts import LEARNING
@@ -37,7 +37,7 @@ from rfdropo_bayes.robots.policy_layout import (
     TENSION_LIMIT,
     PolicyLayout,
 )
-from rfdropo_bayes.signatures import with_keys_of
+from rfdropo_bayes.signatures import stated
 from rfdropo_bayes.verbs.make_vec import (
     episode_settings,
     randomisation_of,
@@ -53,10 +53,10 @@ SCHEMA_VERSION = 1
 PLAYED = 64  # lanes in which the policy that is kept is played
 
 
-@with_keys_of(TrainingTable)
 def train(
     model: Model,
     out: Path | str,
+    options: TrainingOptions | None = None,
     *,
     fit: Calibration | Path | None = None,
     seed: int | None = None,
@@ -64,7 +64,6 @@ def train(
     overwrite: bool = False,
     show: bool | None = None,
     page: bool = True,
-    **keys: Any,
 ) -> dict[str, Any]:
     """Train a policy on a model, and export it.
 
@@ -72,12 +71,12 @@ def train(
         model: simulated model; its fixed values hold.
         out: folder to write to: report.html, policy.onnx, card.md, summary.json, curve.png, episodes.jsonl,
             TensorBoard's files and checkpoints.
+        options: keys of [training] that override the model's own file.
         fit: a calibration, or its folder, whose posterior provides the episodes' parameters.
         seed: seed of all random numbers; by default from the model's experiment.
         resume: continue from the checkpoint of an interrupted run in ``out``; overwrite: replace an earlier run.
         show: progress on the terminal, as in `calibrate`.
         page: whether to play the policy and draw report.html, which takes 20 s of processor time.
-        keys: keys of an experiment file's [training], which override the model's own file.
 
     Returns:
         the content of summary.json.
@@ -87,7 +86,7 @@ def train(
     """
     if resume and command_of(Path(out)) is None:
         raise InputError("holds no run to go on with", where=str(out), remedy="correct --out, or leave out --resume")
-    model = with_training(model, keys)
+    model = with_training(model, stated(options, TrainingOptions))
     tables = model.record({"seed": model.settings.seed}, {"seed": seed})
     seed = model.settings.seed if seed is None else seed
     table, task, simulator = training_of(model)
@@ -190,7 +189,7 @@ def _plain(row: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def learnt(summary: Mapping[str, Any]) -> str:
-    """How the policy that was kept did in its evaluation, in a sentence or two."""
+    """Evaluation of the kept policy, in one or two sentences."""
     best = summary["evaluation"]
     half, most = (best[f"distance_{name}"] for name in ("median", "q95"))
     counts = without_end(best.get("tension_stopped", 0), best.get("failed", 0))

@@ -39,7 +39,7 @@ def run_view(
             prediction is drawn.
         out: .png, .svg or .pdf for several instants in one picture, .gif or .mp4 for an animation, a name that ends in
             .vtk for a folder of surfaces, any other name for a folder of frames.
-        recording: which recording of the experiment, if it has several.
+        recording: name of the recording, if the experiment has several.
         robot: file of the robot, if a NetCDF file has none beside it and the robot is not bundled.
 
     Returns:

@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.noise import Autoregression, noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import deviations, group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.replicas import simulated_data
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
@@ -88,8 +88,8 @@ def problem(*recordings: Trajectory, known: Autoregression | None = None) -> Cal
         channels += [ObjectPose.gather(simulator, recordings, ROWS), WeighedParts((Weighed(("reach",), 0.11, 0.01),))]
     else:
         specs = simulator.parameters
-    space = build_space(specs, {spec.name: {} for spec in specs}, {}, gathered.names)
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, gathered, tuple(channels)))
+    space = build_scopes(specs, {spec.name: {} for spec in specs}, {}, gathered.names)
+    return CalibrationProblem(TrajectoryModel(simulator, space, gathered, tuple(channels)))
 
 
 @pytest.mark.slow
@@ -113,7 +113,7 @@ def test_the_log_likelihood_is_the_sum_of_the_channels_written_down_anew():
     assert chosen.physical_names == ("reach",)
     single = {name: value[0] for name, value in values.items()}
     joint, _ = log_density(chosen.model, (), {}, single)
-    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.space.parameters)
+    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.scopes.parameters)
     assert float(joint) == pytest.approx(rows.sum() + prior, rel=1e-9)
     replica = simulated_data(chosen, {"reach": reach, **SIZES}, jax.random.key(0))
     assert {name: array.shape for name, array in replica.items()} == {
@@ -155,7 +155,7 @@ def test_known_noise_has_the_density_of_its_normal_distribution_and_draws_from_i
     rows, _ = chosen.row_log_likelihood({"reach": jnp.array([0.1])}, ROWS)
     assert rows.sum() == pytest.approx(expected, rel=1e-9)
     joint, _ = log_density(chosen.model, (), {}, {"reach": jnp.asarray(0.1)})
-    prior = float(chosen.model.space.parameters[0].prior.log_prob(0.1))
+    prior = float(chosen.model.scopes.parameters[0].prior.log_prob(0.1))
     assert float(joint) == pytest.approx(expected + prior, rel=1e-9)
     drawn = chosen.draw_noise(jax.random.key(1), {"reach": np.full(4000, 0.1)})[:, 0, -2:, 0].reshape(4000, 6)
     wanted = np.kron(in_time[-2:, -2:], at_once)

@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import CsvColumns, Measured, Origin, SentCommands, Trajectory, read_plain_csv
 from rfdropo_bayes.data.held_readings import hold_time
@@ -92,11 +92,11 @@ def recording(rows: int = 200, hold: int = 1, unit: str = "rad", angles: bool = 
 def problem(trajectory: Trajectory, *, angles: bool = True, simulator: ServoAndBody | None = None):
     simulator = simulator or ServoAndBody()
     specs = simulator.parameters + noise_specs("white") + (MOTOR_ANGLE_NOISE,) * angles
-    space = build_space(specs, {spec.name: {} for spec in specs}, {}, ["r"])
+    space = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ["r"])
     recordings = gather_recordings(simulator, [trajectory])
     channels = [Markers.gather(recordings, "white")]
     channels += [MotorAngle.gather([trajectory], len(trajectory.time))] if angles else []
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, recordings, tuple(channels)))
+    return CalibrationProblem(TrajectoryModel(simulator, space, recordings, tuple(channels)))
 
 
 def batch(**values: float) -> dict[str, jax.Array]:
@@ -123,7 +123,7 @@ def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
     assert with_angles.sum() == pytest.approx(constant - 0.5 * np.sum(residuals**2), rel=1e-9)
     # The numpyro program has the same joint density.
     joint, _ = log_density(chosen.model, (), {}, single)
-    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.space.parameters)
+    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.scopes.parameters)
     assert float(joint) == pytest.approx(with_angles.sum() + prior, rel=1e-9)
     # A prefix holds the rows of the whole, and data put in the model's place count as its own do.
     np.testing.assert_allclose(chosen.row_log_likelihood(values, 20)[0][0], with_angles[:20])
@@ -242,6 +242,7 @@ def test_a_mechanism_of_a_user_is_inside_the_drive_unless_it_says_otherwise():
     Own.inside_drive = False
     assert not inside_drive(Own())
     transmission = {"backlash", "cable_gain", "cable_slack", "spool_growth", "drive_creep", "drive_drift"}
+    transmission |= {"cable_gain_drift", "gain_drift", "guide_azimuth"}
     actuation = {name for name, kind in REGISTRY.items() if kind.stage == "actuation"}
     assert {name for name in actuation if not inside_drive(REGISTRY[name]())} == transmission
 
@@ -273,7 +274,7 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     model = build_model(spec, simulator, [trunk])
     assert model.measured["motor_angle"].shape == (1, 20, 6)
     noise = {spec.name for spec in noise_specs("auto")}
-    assert set(model.space.names) == {"actuator_lag", "motor_angle_noise"} | noise
+    assert set(model.scopes.names) == {"actuator_lag", "motor_angle_noise"} | noise
     calibration = CalibrationProblem(model)
     assert calibration.physical_names == ("actuator_lag",)
     assert calibration.prior_ends.keys() == calibration.bounds.keys()

@@ -13,7 +13,7 @@ from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
@@ -71,10 +71,10 @@ def problem(noise: str) -> CalibrationProblem:
     )
     simulator = LaggingArm()
     specs = simulator.parameters + noise_specs(noise)
-    space = build_space(specs, {spec.name: {} for spec in specs}, {}, ["r"])
+    space = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ["r"])
     recordings = gather_recordings(simulator, [trajectory])
     return CalibrationProblem(
-        TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, noise),)), chunk=64
+        TrajectoryModel(simulator, space, recordings, (Markers.gather(recordings, noise),)), chunk=64
     )
 
 

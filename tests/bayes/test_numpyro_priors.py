@@ -10,7 +10,7 @@ from numpyro.distributions.transforms import AffineTransform, ExpTransform, Sigm
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.priors import log_density, prior_from_table, table_of
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -88,7 +88,7 @@ def test_what_no_table_describes_is_refused_by_name(prior, message):
 
 def test_a_truncated_normal_ends_where_it_says_and_at_the_hard_bounds():
     spec = WIDE._replace(low=0.0)
-    space = build_space([spec], {"size": {**TRUNCATED, "low": -1.0, "high": 1.5}}, {}, [])
+    space = build_scopes([spec], {"size": {**TRUNCATED, "low": -1.0, "high": 1.5}}, {}, [])
     parameter = space["size"]
     assert parameter.ends == (0.0, 1.5)
     assert (parameter.spec.low, parameter.spec.high) == (0.0, 1.5)

@@ -16,7 +16,7 @@ from rfdropo_bayes.bayes.channels.object_pose import LEVER, draw_object_error
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
@@ -97,14 +97,14 @@ def recording(*, pose: bool = True) -> Trajectory:
 def problem(trajectory: Trajectory, *, poses: bool = True, lost: tuple[int, ...] = ()) -> CalibrationProblem:
     simulator = Finger()
     specs = simulator.parameters + noise_specs("white") + (SWITCHED["object_pose"] if poses else ())
-    space = build_space(specs, {s.name: {} for s in specs if s.name != "start_x"}, {}, [trajectory.name])
+    space = build_scopes(specs, {s.name: {} for s in specs if s.name != "start_x"}, {}, [trajectory.name])
     recordings = gather_recordings(simulator, [trajectory])
     channels = [Markers.gather(recordings, "white")]
     if poses:
         data = ObjectPose.gather(simulator, [trajectory], len(trajectory.time))
         seen = ~np.isin(np.arange(len(trajectory.time)), lost)
         channels.append(ObjectPose.of(data.readings, seen[None], data.time))
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, recordings, tuple(channels)))
+    return CalibrationProblem(TrajectoryModel(simulator, space, recordings, tuple(channels)))
 
 
 def test_white_noise_of_poses_has_no_memory_and_the_density_of_independent_errors():
@@ -148,7 +148,7 @@ def test_the_density_of_the_poses_is_that_of_an_ornstein_uhlenbeck_process_about
         before = row
     single = {name: value[0] for name, value in values.items()}
     joint, _ = log_density(chosen.model, (), {}, single)
-    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.space.parameters)
+    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.scopes.parameters)
     assert float(joint) == pytest.approx(rows.sum() + prior, rel=1e-9)  # the numpyro program has the same density
     # Residuals have the same slope as the density; data put in the model's place count as its own do.
     further = {**single, "slip": jnp.asarray(0.5)}

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -60,7 +60,7 @@ def test_an_unusable_table_says_what_is_wrong_and_where(spec, table, message):
 def test_a_log_normal_prior_ends_at_the_hard_bounds(low, high):
     """However far a climb goes in unconstrained coordinates, and with a density that integrates to one there."""
     spec = ParameterSpec("drag", "1/s", low, high, 0.1, {"distribution": "LogNormal", "median": 0.1, "sigma": 1.0}, "")
-    space = build_space([spec], {"drag": {}}, {}, ["a"])
+    space = build_scopes([spec], {"drag": {}}, {}, ["a"])
     u = jnp.linspace(-30.0, 30.0, 60001)[:, None]
     value = np.asarray(space.from_unconstrained(u)["drag"])
     assert low <= value.min() < value.max() <= high

@@ -16,11 +16,12 @@ from rfdropo_bayes.bayes.channels.channel import ABOVE_ZERO
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
+from rfdropo_bayes.posteriors import ParameterInfo, Scope
 from rfdropo_bayes.simulators.commands import commands_on_grid
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
@@ -75,12 +76,12 @@ def problem(*, tension: bool, weighed: Sequence[Weighed] = (), gain: bool = Fals
     simulator, trajectory = HangingMass(), recording()
     specs = simulator.parameters + noise_specs("white") + (TENSION_NOISE, TENSION_GAIN) * tension
     priors = {spec.name: {} for spec in specs if gain or spec.name != "tension_gain"}
-    space = build_space(specs, priors, {}, ["r"])
+    space = build_scopes(specs, priors, {}, ["r"])
     recordings = gather_recordings(simulator, [trajectory])
     channels = [Markers.gather(recordings, "white")]
     channels += [Tension.gather(simulator, [trajectory], 15)] if tension else []
     channels += [WeighedParts(tuple(weighed))] if weighed else []
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, recordings, tuple(channels)))
+    return CalibrationProblem(TrajectoryModel(simulator, space, recordings, tuple(channels)))
 
 
 def spread(result, name: str) -> float:
@@ -157,7 +158,7 @@ def test_what_cannot_be_used_is_refused():
     with pytest.raises(InputError, match="has no cable tensions"):
         Tension.gather(HangingMass(), [recording(tension=False)], 15)
     with pytest.raises(InputError, match="weighed but is not inferred"):
-        WeighedParts((Weighed(("maas",), 0.1, 0.01),)).named(("mass",))
+        WeighedParts((Weighed(("maas",), 0.1, 0.01),)).named([ParameterInfo("mass", "kg")])
     other = HangingMass()
     other.cable_names = ("push",)
     with pytest.raises(InputError, match="no cables of the robot"):
@@ -165,10 +166,11 @@ def test_what_cannot_be_used_is_refused():
 
 
 def test_a_weighed_part_of_one_recording_goes_by_the_name_of_the_whole_where_one_piece_is_fitted():
-    names = ("load@a[0:99]", "load@b[0:9]", "load@b[20:29]", "load")
+    owners = ("a[0:99]", "b[0:9]", "b[20:29]", "")
+    infos = [ParameterInfo("load", "kg", scope=Scope(owner)) for owner in owners]
 
     def named(name: str) -> tuple[str, ...]:
-        return WeighedParts((Weighed((name,), 0.1, 0.01),)).named(names).entries[0].parameters
+        return WeighedParts((Weighed((name,), 0.1, 0.01),)).named(infos).entries[0].parameters
 
     assert named("load@a") == named("load@a[0:99]") == ("load@a[0:99]",)
     assert named("load") == ("load",)
@@ -187,8 +189,8 @@ def test_a_parameter_of_the_second_recording_alone_acts_there_and_is_nominal_in_
         recordings = gather_recordings(simulator, order)
         specs = simulator.parameters + noise_specs("white")
         priors = {"stiffness": {}, "mass": {}, "observation_noise": {}}
-        space = build_space(specs, priors, {"mass": ["s"]}, list(recordings.names))
-        model = TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, "white"),))
+        space = build_scopes(specs, priors, {"mass": ["s"]}, list(recordings.names))
+        model = TrajectoryModel(simulator, space, recordings, (Markers.gather(recordings, "white"),))
         values = {"stiffness": jnp.asarray(200.0), "mass@s": jnp.asarray(0.4), "observation_noise": jnp.asarray(1e-4)}
         position = np.asarray(model.simulate(values).position)
         sag = dict(zip(recordings.names, np.abs(position[:, 0, 0]).max(axis=-1), strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rfdropo_bayes.bayes.space import force_power
+from rfdropo_bayes.discrepancy.audit_record import force_power
 
 POWERS = {
     1: ("kg", "Pa", "N/m", "N m", "Pa s", "kg/m3", "N/m2", "J"),

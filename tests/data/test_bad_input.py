@@ -147,7 +147,7 @@ def test_recordings_and_commands_that_do_not_fit(asl_tables, write, tmp_path):
 
 def test_rows_missing_in_the_middle(asl_tables, optitrack_table, write, tmp_path):
     observations, commands = asl_tables()
-    with fails("row 7, column 'ID': ID 8 where 7 is due"):
+    with fails("row 7, column 'ID': ID 8 instead of 7"):
         read_asl_csv(write(observations.drop(index=7), tmp_path / "o.csv"), write(commands, tmp_path / "c.csv"))
     with fails("row 6, column 'timestamp': 0.2 s pass before this row"):
         read_optitrack_csv(write(optitrack_table().drop(index=6), tmp_path / "run.csv"))
@@ -194,7 +194,7 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
         ),
         ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "-z"]}}, "x, y and z once each"),
         ({"format": "csv", "columns": COLUMNS | {"time": "t"}}, "either time"),
-        ({"format": "csv", "columns": COLUMNS | {"markers": ["a", "b"]}}, "markers has 2 entries where 1 are needed"),
+        ({"format": "csv", "columns": COLUMNS | {"markers": ["a", "b"]}}, "markers has 2 entries instead of 1"),
     ],
 )
 def test_tables_with_a_mistake(change, message):
@@ -297,8 +297,8 @@ def test_a_folder_is_no_recording(tmp_path):
             "has 7 columns, not x, y and z; a marker is a position",
         ),
         ({"positions": [["x", "y"]]}, "the marker x, y has 2 columns, not x, y and z; name its three columns"),
-        ({"tensions": ["f1", "f2"]}, "tensions has 2 entries where 1 are needed, one for each channel in commands"),
-        ({"motor_angles": ["f1", "f2"]}, "motor_angles has 2 entries where 1 are needed"),
+        ({"tensions": ["f1", "f2"]}, "tensions has 2 entries instead of 1, one for each channel in commands"),
+        ({"motor_angles": ["f1", "f2"]}, "motor_angles has 2 entries instead of 1"),
     ],
 )
 def test_columns_that_are_no_positions_say_what_to_do(change, message):

@@ -158,7 +158,7 @@ def test_markers_that_swap_for_good_are_masked_from_there_on_and_noted():
         assert np.flatnonzero(~faults.mask[:, marker]).tolist() == list(range(700, len(time)))
     assert sum(faults.counts["renamed"]) + sum(faults.counts["jump"]) == 2 * 800
     (note,) = faults.notes
-    assert "row 700, where base and tip change names" in note
+    assert "markers change names in row 700: base and tip: " in note
 
 
 def test_names_that_go_round_or_come_back_are_followed():

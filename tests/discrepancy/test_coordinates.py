@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rfdropo_bayes.bayes.pooling import Pooled
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -24,14 +24,14 @@ RECORDINGS = ("a1", "b", "a2", "c")
 def test_a_recording_is_given_the_shared_value_and_its_group_s_deviation():
     """As the calibration gives it, and with the derivatives of that."""
     groups = gather_groups(RECORDINGS[:2], {"a": "a*"}) | {"a": ("a1", "a2")}
-    space = build_space(SPECS, {"modulus": {}, "zero": {}}, {}, RECORDINGS[:2], pooled={"zero": Pooled(0.02, groups)})
-    coordinates = Coordinates(space, len(space.names), ("zero", "modulus"), {"zero": 0.0, "modulus": 1.0}, {})
+    space = build_scopes(SPECS, {"modulus": {}, "zero": {}}, {}, RECORDINGS[:2], pooled={"zero": Pooled(0.02, groups)})
+    coordinates = Coordinates(space, len(space.names), ("zero", "modulus"))
     drawn = {name: np.asarray(v) for name, v in space.sample(jax.random.key(0), 5).items()}
     x = np.stack([coordinates.encode({n: v[k] for n, v in drawn.items()}) for k in range(5)])
     slots = coordinates.slots(RECORDINGS)
     found = coordinates.physical_values(x, slots)
     for index, recording in enumerate(RECORDINGS):
-        known = space.for_recording(drawn, recording)
+        known = space.values_in(recording, drawn)
         np.testing.assert_allclose(found[:, index], np.stack([known["zero"], known["modulus"]], axis=1), rtol=1e-9)
     assert np.ptp(found[0, [0, 2], 0]) == 0.0
     assert np.ptp(found[0, [0, 1], 0]) > 0.0
@@ -45,10 +45,10 @@ def test_the_prior_is_the_calibration_s_own_density_with_its_derivatives():
     """Base parameters as in the unconstrained space of the calibration; a size measured from null by its own density,
     which is half a normal's twice as high."""
     half = ParameterSpec("play", "rad", 0.0, 9.0, 0.0, {"distribution": "HalfNormal", "scale": 0.5}, "")
-    space = build_space((*SPECS, half), {"modulus": {}, "zero": {}, "play": {}}, {}, RECORDINGS)
-    coordinates = Coordinates(space, 2, ("modulus", "zero", "play"), {"modulus": 1.0, "zero": 0.0, "play": 0.0}, {})
+    space = build_scopes((*SPECS, half), {"modulus": {}, "zero": {}, "play": {}}, {}, RECORDINGS)
+    coordinates = Coordinates(space, 2, ("modulus", "zero", "play"))
     x = np.array([0.4, -0.3, 1.2])
-    base = build_space(SPECS, {"modulus": {}, "zero": {}}, {}, RECORDINGS)
+    base = build_scopes(SPECS, {"modulus": {}, "zero": {}}, {}, RECORDINGS)
     expected = float(base.log_prior_unconstrained(jnp.asarray(x[None, :2]))[0])
     found = coordinates.log_prior(x[None])[0]
     assert found[:2].sum() == pytest.approx(expected, rel=1e-9)

@@ -14,7 +14,6 @@ import pytest
 
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
@@ -25,6 +24,7 @@ from rfdropo_bayes.discrepancy.fixed_quantities import families
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.pipeline import Answer, audit
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import Scope
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.between import extend_groups, find_groups, groups_at_hand
 
@@ -48,11 +48,11 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
     )
     nominal = {spec.name: spec.nominal for spec in toy.parameters}
     if repr(groups) not in COORDINATES:
-        COORDINATES[repr(groups)] = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
+        COORDINATES[repr(groups)] = Coordinates(space, len(BASE), tuple(nominal))
     return replace(
         asked,
         coordinates=COORDINATES[repr(groups)],
-        model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
+        model=TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),)),
         trajectories=chosen[:FITTED],
         candidates=candidates,
         groups=groups,
@@ -171,8 +171,8 @@ def test_groups_of_any_number_have_candidates_of_their_own_and_what_differs_alre
     assert {f"{name}@{day}" for name in ("play", "bend") for day in three.names} <= names
     assert "play@all but june" in names
     assert "delay@all but june" not in names  # it has either sign: less of it in June is delay@june
-    pooled = replace(space.parameters[len(BASE) - 1], recording="april", added_to="bend")
-    own = ParameterSpace((*space.parameters[: len(BASE)], pooled, *space.parameters[len(BASE) :]))
+    pooled = replace(space.parameters[len(BASE) - 1], scope=Scope("april", group=True, added_to="bend"))
+    own = replace(space, parameters=(*space.parameters[: len(BASE)], pooled, *space.parameters[len(BASE) :]))
     shifted = [replace(candidate, indices=tuple(i + 1 for i in candidate.indices)) for candidate in asked.candidates]
     found = with_differences(own, len(BASE) + 1, BASE, shifted, three, spreads={})[1]
     assert {each.name for each in found if each.title == "bend"} == set()

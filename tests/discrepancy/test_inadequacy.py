@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.noise.autoregression import MISFIT, REPEATS
-from rfdropo_bayes.discrepancy.base_fit import base_model
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, REPEATS, RESIDUALS
+from rfdropo_bayes.discrepancy.base_fit import base_model, first_target, residual_noise
 from rfdropo_bayes.discrepancy.extension import ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import climb
 from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, far_off, spread
+from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.pipeline import audit
 
 from .toys import NOISE, problem
@@ -72,3 +74,23 @@ def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_
     assert answer.verdict == "explained"
     assert answer.target.noise.source == REPEATS
     assert np.mean(answer.extended.residual**2) < 1.2 < POOR < np.mean(answer.base.residual**2)
+
+
+def test_slow_residuals_are_a_misfit_and_no_autoregression_explains_them():
+    """Without repeats: a wave of 20 deviations over 2 s is no noise, though an autoregression could follow it. Noise
+    with the memory of a measurement stays one."""
+    measured = first_target(replace(problem(TRUTH, 3), trajectories=problem(TRUTH, 3).trajectories[2:]), Journal())
+    rng, shape = np.random.default_rng(0), measured.measurements.count.shape
+    white = NOISE * rng.standard_normal(shape)
+    wave = 20.0 * NOISE * np.sin(np.pi * measured.measurements.time)[..., None]
+    remembered = np.array(white)
+    for row in range(1, shape[1]):
+        remembered[:, row] = 0.6 * remembered[:, row - 1] + 0.8 * white[:, row]
+    found = {}
+    for name, errors in (("slow", wave + white), ("quick", remembered)):
+        target = SimpleNamespace(measured=measured, errors=lambda x, errors=errors: errors)
+        found[name] = residual_noise(target, SimpleNamespace(x=None, free=np.arange(2))).first
+    assert (found["slow"].source, found["slow"].order) == (INNOVATIONS, 0)
+    assert np.mean(found["slow"].scale) < 10.0 * NOISE  # of waves of 14 in the root mean square
+    assert (found["quick"].source, found["quick"].order) == (RESIDUALS, 1)
+    np.testing.assert_allclose(np.mean(found["quick"].scale), NOISE, rtol=0.1)

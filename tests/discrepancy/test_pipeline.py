@@ -39,7 +39,8 @@ from rfdropo_bayes.discrepancy.screen import p_in_words
 from rfdropo_bayes.discrepancy.sentence import _adoption, _named
 from rfdropo_bayes.discrepancy.verdict import decide
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.audit_figures import binned
+from rfdropo_bayes.report.audit_page import class_effects, render_audit, shown
 from rfdropo_bayes.report.page import p_value
 
 from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, problem, recordings
@@ -84,7 +85,7 @@ def test_an_effect_too_small_to_say_how_much_it_explains_is_named_and_not_belitt
     assert content["findings"][0]["mechanism"] == "play"
     assert content["gain"]["explained_fraction"] < 0.2  # by chance: the interval goes from 0 to 100 %
     assert content["verdict"] == "unexplained"
-    assert "do not say how much of the discrepancy" in content["sentence"]
+    assert "do not determine the explained share of the discrepancy" in content["sentence"]
 
 
 def test_effects_that_look_the_same_are_one_class():
@@ -598,7 +599,7 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     assert [step.name for step in answer.causes.steps] == ["play"]
     assert [step.name for step in answer.adopted] == ["play"]
     assert content["unsupported"][0] in ("delay", "lag")
-    assert "unseen ones do not support: not adopted" in content["sentence"]
+    assert "unseen recordings do not support: not adopted" in content["sentence"]
     assert len(content["omnibus"]) == 2
     assert content["gain"]["rmse_extended_mm"] < content["gain"]["rmse_base_mm"]
 
@@ -728,3 +729,27 @@ def test_a_tie_with_the_same_mechanism_in_another_group_is_said():
     alike = ["glue@april", "slip@april", "glue@june", "glue"]
     finding = {"mechanism": "glue", "group": "april", "parameters": {}, "relative": {}, "equivalence_class": alike}
     assert "(not to be told from slip in april, glue in june, glue by these data)" in _named(finding)
+
+
+def test_what_a_class_would_explain_is_shown_by_marker_and_by_recording():
+    """As much of the sum of squares as the score statistic says, the same by rows, markers and recordings."""
+    effect = class_effects(audited((("play", 1.0),), 1, ()))[0]
+    assert effect.names == ("play",)
+    (row,) = [each for each in found({"play": 1.0}, 1)["candidates"] if each["mechanism"] == "play"]
+    assert effect.share == pytest.approx(row["would_explain"])
+    assert set(effect.markers) == set(Toy.marker_names)
+    assert all(after < 0.5 * before for before, after in effect.recordings.values())
+    whole = np.mean([before for before, _ in effect.recordings.values()])  # all of which have as many rows
+    assert np.mean(effect.before) == pytest.approx(whole)
+    assert np.mean(effect.before) == pytest.approx(np.mean([before for before, _ in effect.markers.values()]))
+
+
+def test_means_over_a_cause_are_those_of_its_values_or_of_as_many_rows():
+    values = np.array([[1.0, 3.0, 5.0, 7.0]])
+    centres, means = binned(np.array([-1.0, -1.0, 0.0, 1.0]), values)
+    np.testing.assert_allclose(centres, [-1.0, 0.0, 1.0])
+    np.testing.assert_allclose(means, [[2.0, 5.0, 7.0]])
+    many = np.arange(600.0) ** 2
+    centres, means = binned(many, many[None])
+    assert len(centres) == 12
+    np.testing.assert_allclose(means[0], centres)

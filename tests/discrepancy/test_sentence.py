@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rfdropo_bayes.bayes.space import ParameterSpace
+from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.fixed_quantities import with_fixed_quantities
@@ -76,7 +76,7 @@ def test_the_next_step_is_about_the_largest_share(answer):
 
 def test_what_is_held_at_nominal_values_says_what_to_do_at_the_robot():
     specs = specs_of(Robot.load("asl_trunk").parameter_table())
-    _, candidates = with_fixed_quantities(ParameterSpace(()), specs, ())
+    _, candidates = with_fixed_quantities(Scopes(()), specs, ())
     remedies = {candidate.name: candidate.mechanism.remedy for candidate in candidates}
     assert "turn each until its cable just begins to move the body" in remedies["initial_displacement"]
     assert remedies["disk_mass"].startswith("measure the disk mass at each place (base, middle, tip)")

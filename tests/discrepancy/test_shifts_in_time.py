@@ -26,7 +26,8 @@ def test_a_delay_is_told_from_a_shift_of_the_clock():
     )
     model = rb.Model(arm, priors={"young_modulus": {}, "trunk_mass": {}, "rayleigh_stiffness": {}})
     others = [name for name in REGISTRY if name not in LEFT]
-    found = rb.audit(model, runs[:2], test=runs[2:], seed=0, exclude=others, ports=False, minutes=300.0)
+    options = rb.AuditOptions(exclude=others, ports=False, minutes=300.0)
+    found = rb.audit(model, runs[:2], options, test=runs[2:], seed=0)
     (finding,) = found.content["findings"]
     assert finding["mechanism"] == "command_delay"
     assert finding["parameters"]["command_delay"]["mean"] == pytest.approx(DELAY, abs=1e-4)

@@ -20,7 +20,7 @@ from rfdropo_bayes.bayes.noise.autoregression import (
 )
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.repeat_noise import deviations
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import Rules
 from rfdropo_bayes.discrepancy.gain import (
@@ -266,8 +266,8 @@ PRIORS = (
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior["distribution"])
 def test_coordinates_are_those_of_the_prior_s_own_transform(prior, low, high):
     spec = ParameterSpec("size", "m", low, high, 0.5, prior, "a size")
-    space = build_space([spec], {"size": prior}, {}, ["r"])
-    own = Coordinates(space, 1, ("size",), {"size": 0.5}, {})
+    space = build_scopes([spec], {"size": prior}, {}, ["r"])
+    own = Coordinates(space, 1, ("size",))
     x = np.linspace(-2.0, 2.0, 9)[:, None]
     values = np.asarray(space.parameters[0].transform(x))
     np.testing.assert_allclose(own.values(x), values, rtol=1e-12)

@@ -14,7 +14,7 @@ import numpy as np
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import mean_of, spread
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
@@ -213,14 +213,12 @@ def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProbl
     """A data set of the toy with ``truth`` in it, and a library that lacks ``without``."""
     toy, trajectories = Toy(), recordings(truth, seed)
     gathered = gather_recordings(toy, trajectories)
-    space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
+    space = build_scopes(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     coordinates = COORDINATES.setdefault(
         gathered.names,
-        Coordinates(
-            space, len(BASE), tuple(s.name for s in toy.parameters), {s.name: s.nominal for s in toy.parameters}, {}
-        ),
+        Coordinates(space, len(BASE), tuple(s.name for s in toy.parameters)),
     )
-    model = TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),))
+    model = TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),))
     place = {name: i for i, name in enumerate(space.names)}
     candidates = [
         Candidate(name, tuple(place[s.name] for s in specs), Named(name), name)
@@ -234,8 +232,8 @@ def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProbl
 def with_prior(asked: AuditProblem, name: str, prior: dict) -> AuditProblem:
     """The same data set and library under another prior of one parameter."""
     tables = {spec.name: prior if spec.name == name else {} for spec in Toy.parameters}
-    space = build_space(Toy.parameters, tables, {}, asked.model.recordings.names)
-    return replace(asked, coordinates=replace(asked.coordinates, space=space), model=replace(asked.model, space=space))
+    space = build_scopes(Toy.parameters, tables, {}, asked.model.recordings.names)
+    return replace(asked, coordinates=replace(asked.coordinates, space=space), model=replace(asked.model, scopes=space))
 
 
 def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weighed, ...] = ()) -> AuditProblem:
@@ -243,18 +241,18 @@ def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weig
     toy = Pulling()
     asked, trajectories = problem(TRUTH_OF_CABLES, seed), recordings({**TRUTH_OF_CABLES, **truth}, seed, toy)
     gathered = gather_recordings(toy, trajectories)
-    space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
+    space = build_scopes(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     channels: tuple = (Markers.gather(gathered, "repeats"),)
     channels += (Tension.gather(toy, trajectories, ROWS),) if tension else ()
     channels += (WeighedParts(weighed),) if weighed else ()
     nominal = {s.name: s.nominal for s in toy.parameters}
-    coordinates = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
+    coordinates = Coordinates(space, len(BASE), tuple(nominal))
     drag = Candidate("drag", (len(space.names) - 1,), Named("drag"), "drag")
     return replace(
         asked,
         lanes=Lanes(toy, np.arange(4), fields=("position", "tension") if tension else ("position",)),
         coordinates=coordinates,
-        model=TrajectoryModel(toy, space, {}, gathered, channels),
+        model=TrajectoryModel(toy, space, gathered, channels),
         trajectories=trajectories[:4],
         candidates=[*asked.candidates, drag],
     )
@@ -267,14 +265,14 @@ def problem_of(toy: Opposed | Geared, truth: dict, seed: int, base: int = len(BA
     """A data set of a toy with further candidates, which are all that may be named."""
     asked, trajectories = problem({}, seed), recordings(truth, seed, toy)
     gathered = gather_recordings(toy, trajectories)
-    space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
+    space = build_scopes(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     nominal = {s.name: s.nominal for s in toy.parameters}
     place = {name: i for i, name in enumerate(space.names)}
     return replace(
         asked,
         lanes=Lanes(toy, np.arange(4)),
-        coordinates=Coordinates(space, base, tuple(nominal), nominal, {}),
-        model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
+        coordinates=Coordinates(space, base, tuple(nominal)),
+        model=TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),)),
         trajectories=trajectories[:4],
         candidates=[
             Candidate(name, tuple(place[s.name] for s in specs), Named(name), name) for name, specs in toy.added.items()

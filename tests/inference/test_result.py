@@ -120,7 +120,13 @@ def test_replicates_that_disagree_are_named():
 
 @pytest.mark.parametrize(
     ("replicates", "climbs", "alone"),
-    [(1, None, "one replicate"), (1, 4, "one replicate"), (4, 1, "one climb"), (2, None, None), (2, 2, None)],
+    [
+        (1, None, "one replicate"),
+        (1, 4, "one replicate"),
+        (4, 1, "a single optimisation"),
+        (2, None, None),
+        (2, 2, None),
+    ],
 )
 def test_what_cannot_show_a_lost_mode_says_so(replicates, climbs, alone):
     found = unseen_modes(replicates, climbs)

@@ -9,6 +9,8 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.mechanisms.actuation import GuideAzimuth
+from rfdropo_bayes.robots import Robot
 
 STEP = 0.01
 RAMP = jnp.stack([jnp.linspace(0.1, 5.0, 50), jnp.sin(jnp.arange(50) / 7.0)], axis=1)
@@ -72,3 +74,29 @@ def test_every_mechanism_says_what_it_is():
         assert mechanism.remedy
         for spec in mechanism.parameters:
             assert spec.low <= spec.nominal <= spec.high
+
+
+@pytest.mark.parametrize("cables", [3, 4])
+def test_lengths_at_turned_guides_are_read_as_those_of_the_same_shape_at_the_drawn_ones(cables):
+    """A light body of constant curvature takes up d (k_x cos a + k_y sin a) + s of a cable at azimuth a; opposed cables
+    have lengths that no shape has, which stay."""
+    robot = Robot.outline(name="arm", length=0.1, radius=0.01, markers={"tip": 0.1}, cables=cables)
+    mechanism = GuideAzimuth.for_robot(robot)
+    turn = np.array([0.1, -0.05, 0.2, 0.0])[:cables]
+    values = {spec.name: jnp.asarray(angle) for spec, angle in zip(mechanism.parameters, turn, strict=True)}
+    drawn = np.deg2rad([cable.azimuth_deg for cable in robot.cables])
+    shape = np.array([0.3, -0.2, 0.1])
+
+    def lengths(azimuth):
+        return 0.1 * np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(cables)], axis=1) @ shape
+
+    np.testing.assert_allclose(mechanism.reach(values, lengths(drawn + turn)), lengths(drawn), atol=1e-6)
+    nothing = {name: jnp.zeros(()) for name in values}
+    sent = np.linspace(-0.01, 0.02, cables)
+    np.testing.assert_allclose(mechanism.reach(nothing, sent), sent, atol=1e-9)
+
+
+def test_channels_that_share_cables_have_no_turned_guides():
+    robot = Robot.load("trunk_sofa")
+    shared = robot.with_changes(channels={"names": ["pair"], "gain": [[1.0]] * len(robot.cables)})
+    assert GuideAzimuth.for_robot(shared).parameters == ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,3 +82,27 @@ def test_a_base_tilts_about_the_axes_across_gravity(robot, axes):
         turned = tilt.embody(values, Material(gravity=gravity, **dict.fromkeys(NOTHING)), None).gravity
         assert float(jnp.linalg.norm(turned)) == pytest.approx(9.81)
         assert float(turned @ gravity) == pytest.approx(9.81**2 * np.cos(0.3))
+
+
+def embodied(name, **values):
+    """Factors on the stiffness of the elements of a uniform arm, and the arm."""
+    assembly = assemble(Robot.load("smooth_arm"), Discretisation(0.02))
+    body = assembly.system.body
+    plain = SimpleNamespace(stiffness_scale=jnp.ones(body.elements))
+    plain._replace = lambda **given: SimpleNamespace(**given)
+    material = REGISTRY[name]().embody({key: jnp.asarray(value) for key, value in values.items()}, plain, body)
+    return np.asarray(material.stiffness_scale), body
+
+
+def test_a_base_that_gives_adds_its_compliance_to_that_of_the_body():
+    scale, body = embodied("base_compliance", base_compliance=0.3)
+    compliance = np.diff(body.station) / body.bending_moment_area.mean(axis=1)
+    np.testing.assert_allclose(np.sum(compliance / scale), 1.3 * np.sum(compliance), rtol=1e-6)
+
+
+def test_a_soft_part_is_soft_at_its_place_alone():
+    scale, body = embodied("soft_part", soft_part=-1.0, soft_part_place=0.5)
+    middle = 0.5 * (body.station[1:] + body.station[:-1])
+    s = (middle - body.station[0]) / body.length
+    assert scale[np.argmin(np.abs(s - 0.5))] < 0.5
+    np.testing.assert_allclose(scale[np.abs(s - 0.5) > 0.3], 1.0, atol=1e-3)

@@ -29,13 +29,15 @@ DRIVES = (
     "cable_gain",
     "cable_slack",
     "drive_creep",
+    "cable_gain_drift",
     "drive_drift",
+    "gain_drift",
     "end_stop",
     "travel_stop",
     "rate_limit",
     "spool_growth",
 )
-CAMERAS = ("camera_drift", "camera_offset", "clock_offset", "marker_offset", "sensor_lag")
+CAMERAS = ("camera_drift", "camera_turn", "camera_zoom", "camera_offset", "clock_offset", "marker_offset", "sensor_lag")
 
 
 def applied(name: str, values: dict):
@@ -79,7 +81,8 @@ def test_the_derivative_at_null_is_the_one_sided_difference(name):
         ahead = applied(name, {spec.name: jnp.asarray(spec.nominal + step)})
         difference = (ahead - applied(name, {spec.name: jnp.asarray(spec.nominal)})) / step
         np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=2e-5)
-        channels_beyond = spec.name.startswith("cable_gain_error") and int(spec.name[-1]) > COMMAND.shape[1]
+        channel = spec.name.removesuffix("_rate").removeprefix("cable_gain_error_")
+        channels_beyond = channel.isdigit() and int(channel) > COMMAND.shape[1]
         if not spec.grid and not channels_beyond:
             assert np.abs(slope).max() > 0
 
@@ -254,15 +257,29 @@ def test_markers_beside_their_places_turn_with_the_body():
 
 
 def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
-    """Half a millimetre of play is 25 mrad of a motor with a spool of 20 mm; a limit of 1/m becomes one of 0.02/rad."""
+    """Sizes are shares of usual commands, in their unit; the limit of a stop is in one over it."""
     names = ["backlash", "cable_slack", "end_stop", "travel_stop", "spool_growth", "drive_drift", "rate_limit"]
-    cables, motors = (mechanisms_named(names, Robot.load(robot)) for robot in ("smooth_arm", "asl_trunk"))
+    robots = [Robot.load(robot) for robot in ("smooth_arm", "asl_trunk")]
+    cables, motors = (mechanisms_named(names, robot) for robot in robots)
     units = [spec.unit for mechanism in motors for spec in mechanism.parameters]
     assert units == ["rad", "rad", "1/rad", "1/rad", "1/rad", "1/rad", "rad/s", "s/rad"]
+    ratio = robots[1].usual_command / robots[0].usual_command
     play, turned = cables[0].parameters[0], motors[0].parameters[0]
-    assert (play.unit, play.prior["scale"], play.high) == ("m", 0.0005, 0.1)
-    assert (turned.prior["scale"], turned.high) == pytest.approx((0.025, 5.0))
+    assert play.unit == "m"
+    assert (turned.prior["scale"], turned.high) == pytest.approx((ratio * play.prior["scale"], ratio * play.high))
     stop, turned = cables[2].parameters[0], motors[2].parameters[0]
-    np.testing.assert_allclose(turned.grid, 0.02 * np.array(stop.grid))
+    np.testing.assert_allclose(turned.grid, np.array(stop.grid) / ratio)
     assert turned.prior["distribution"] == "HalfNormal"
-    assert stop.prior["scale"] == pytest.approx(50.0 * turned.prior["scale"])
+    assert stop.prior["scale"] == pytest.approx(ratio * turned.prior["scale"])
+
+
+def test_a_drift_of_actuation_is_the_mechanism_with_the_size_of_each_step():
+    drifted = applied("gain_drift", {"command_gain_error_rate": jnp.asarray(0.2)})
+    elapsed = STEP * np.arange(1, len(COMMAND) + 1)[:, None]
+    np.testing.assert_allclose(drifted, (1.0 + 0.2 * elapsed) * COMMAND, rtol=1e-12)
+
+
+def test_a_drift_of_a_camera_is_the_mechanism_with_the_size_of_each_row():
+    drifted = applied("camera_zoom", {"camera_scale_error_rate": jnp.asarray(0.01)})
+    elapsed = (TIME - TIME[0])[:, None, None]
+    np.testing.assert_allclose(drifted, (1.0 + 0.01 * elapsed) * POSITION, rtol=1e-12)

@@ -232,10 +232,10 @@ def test_a_law_of_the_motion_is_given_the_motion_that_it_makes(without_law, port
     assert np.abs(seen - settled).max() < 0.05 * moved
 
 
-@pytest.mark.parametrize(("unit", "stroke", "size"), [("-", 200.0, 10.0), ("N", None, 0.05), ("m", None, 1e-3)])
-def test_an_effect_on_commands_of_another_unit_is_measured_by_their_size(unit, stroke, size):
+@pytest.mark.parametrize(("unit", "usual", "size"), [("-", 200.0, 10.0), ("N", None, 0.05), ("m", None, 1e-3)])
+def test_an_effect_on_commands_of_another_unit_is_measured_by_their_size(unit, usual, size):
     """A duty cycle of 200 counts is disturbed by counts, not by hundredths of one."""
-    simulator = BlackBoxSimulator(replace(BOX, command_unit=unit, stroke=stroke))
+    simulator = BlackBoxSimulator(replace(BOX, command_unit=unit, usual_command=usual))
     port = port_map(simulator, simulator.marker_names).named("cable pull")
     assert (port.size, port.unit) == (pytest.approx(size), unit)
 

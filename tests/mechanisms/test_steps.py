@@ -15,7 +15,9 @@ from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.simulators.mechanisms import SteppedMechanism
 
 STEP, PERIOD, LANES, STEPS = 0.01, 5, 3, 60
-ACTUATION = tuple(name for name, kind in REGISTRY.items() if kind.stage == "actuation")
+ACTUATION = tuple(  # but for one that needs the geometry of a robot, and looks at the moment alone
+    name for name, kind in REGISTRY.items() if kind.stage == "actuation" and name != "guide_azimuth"
+)
 SENSING = tuple(name for name, kind in REGISTRY.items() if kind.stage == "sensing")
 RNG = np.random.default_rng(4)
 COMMAND = jnp.asarray(0.004 * RNG.normal(size=(LANES, STEPS, 2)).cumsum(axis=1))

@@ -31,7 +31,7 @@ ARM = """
   </actuator>
 </mujoco>"""
 GOALS = [[-0.08, -0.06, -0.19], [0.08, 0.06, -0.15]]
-REACH = {"task": "TrunkReach-v0", "goals": GOALS}
+TASK = "TrunkReach-v0"
 
 
 def model_of(
@@ -44,7 +44,7 @@ def model_of(
 
 
 def test_commands_stay_in_the_range_of_the_actuators_and_move_by_a_share_of_it(tmp_path):
-    venv = rb.make_vec(model=model_of(tmp_path, mechanisms=("actuator_lag",)), n=2, **REACH)
+    venv = rb.make_vec(TASK, model_of(tmp_path, mechanisms=("actuator_lag",)), rb.TrainingOptions(goals=GOALS), n=2)
     layout = venv.layout
     assert (layout.unit, layout.low, layout.high) == ("rad", (-1.0, -0.5), (1.0, 1.5))
     np.testing.assert_allclose(layout.moves, [[2.0 * ACTION, 2.0 * ACTION]])
@@ -64,7 +64,7 @@ def test_commands_stay_in_the_range_of_the_actuators_and_move_by_a_share_of_it(t
 @pytest.mark.parametrize(
     ("text", "changes", "said"),
     [
-        (ARM, {"goals": None}, "nobody knows where its goals are"),
+        (ARM, {"goals": None}, "the task has no goals for this robot"),
         (ARM, {"task": "TrunkPush-v0"}, "has no cube to push"),
         (ARM.replace(' ctrlrange="-1 1"', ""), {}, "nothing limits the command 'a'"),
         (ARM, {"tension_limit": 1.0}, "tells no cable tensions between two actions; name its cables"),
@@ -72,7 +72,9 @@ def test_commands_stay_in_the_range_of_the_actuators_and_move_by_a_share_of_it(t
 )
 def test_what_a_task_needs_is_said(tmp_path, text, changes, said):
     with pytest.raises(InputError, match=said):
-        rb.make_vec(model=model_of(tmp_path, text), n=1, **{**REACH, **changes})
+        rb.make_vec(
+            changes.get("task", TASK), model_of(tmp_path, text), rb.TrainingOptions(**{"goals": GOALS, **changes}), n=1
+        )
 
 
 def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(tmp_path):
@@ -80,7 +82,7 @@ def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(t
     model = model_of(tmp_path, cables={"b": "b"})
     told, commands = {}, []
     for limit in (None, 0.2):
-        venv = rb.make_vec(model=model, n=2, tension_limit=limit, **REACH)
+        venv = rb.make_vec(TASK, model, rb.TrainingOptions(goals=GOALS, tension_limit=limit), n=2)
         venv.seed(0)
         venv.reset()
         begun, told[limit] = venv.reset_infos[0]["parameters"], []
@@ -108,7 +110,8 @@ def test_a_policy_is_trained_evaluated_and_filmed(tmp_path):
     model = model_of(tmp_path, mechanisms=("actuator_lag",), cables={"b": "b"})
     sizes = {"steps": 2048, "environments": 8, "evaluate_every": 2048, "evaluation_episodes": 8}
     drawn = {"randomisation": "uniform", "ranges": {"damping": [0.005, 0.02], "actuator_lag": [0.0, 0.05]}}
-    summary = rb.train(model, tmp_path / "policy", show=False, tension_limit=50.0, **REACH, **sizes, **drawn)
+    options = rb.TrainingOptions(task=TASK, goals=GOALS, tension_limit=50.0, **sizes, **drawn)
+    summary = rb.train(model, tmp_path / "policy", options, show=False)
     assert summary["integrator"].startswith("mujoco ")
     assert (tmp_path / "policy" / "report.html").stat().st_size > 10_000
     found = rb.evaluate(model, [tmp_path / "policy"], tmp_path / "evaluation", episodes=8)

@@ -16,6 +16,7 @@ from rfdropo_bayes.posteriors import (
     PosteriorRecord,
     ProductOfPowers,
     RecordingPrediction,
+    Scope,
     load_posterior,
     summarise,
 )
@@ -32,7 +33,7 @@ def make_record(rng: np.random.Generator) -> PosteriorRecord:
     parameters = (
         ParameterInfo("young_modulus", "Pa", 1e4, 1e10, {"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}),
         ParameterInfo("density", "kg/m3", 1.0, 1e5, {"distribution": "LogNormal", "median": 1e3, "sigma": 0.5}),
-        ParameterInfo("offset_x@day/1", "m", description="offset of the camera frame"),
+        ParameterInfo("offset_x", "m", description="offset of the camera frame", scope=Scope("day/1")),
     )
     recordings = []
     for i, rows in enumerate((7, 5)):

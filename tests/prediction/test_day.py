@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.pooling import Pooled
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.day import fit_day
 from rfdropo_bayes.prediction.model_error import model_error
@@ -25,7 +25,7 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
     """
     normal = {"distribution": "Normal", "loc": 2.0, "scale": 1.0}
     spec = ParameterSpec("zero", "m", -99.0, 99.0, 2.0, normal, "")
-    space = build_space([spec], {"zero": {}}, {}, ["new"], pooled={"zero": Pooled(SPREAD, {"day": ("new",)})})
+    space = build_scopes([spec], {"zero": {}}, {}, ["new"], pooled={"zero": Pooled(SPREAD, {"day": ("new",)})})
     rng = np.random.default_rng(3)
     command = np.linspace(0.5, 2.0, ROWS)
     measured = 1.3 * command + 2.6 + SIGMA * rng.normal(size=ROWS)
@@ -37,7 +37,7 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
 
     model = SimpleNamespace(markers=SimpleNamespace(valid=np.ones(ROWS, dtype=bool)))
     problem = SimpleNamespace(model=model, n_rows=ROWS, residual_batch=residual_batch)
-    own = [p for p in space.parameters if p.added_to]
+    own = [p for p in space.parameters if p.scope.added_to]
     found = fit_day(problem, body, own, jax.random.key(0))
     design = np.stack([command, np.ones(ROWS)], axis=1) / SIGMA
     precision = design.T @ design + np.diag([0.3**-2, SPREAD**-2])
@@ -59,8 +59,8 @@ def test_coordinates_that_err_together_count_as_fewer():
     """
     columns = 8
     spec = ParameterSpec("zero", "m", -99.0, 99.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0}, "")
-    space = build_space([spec], {"zero": {}}, {}, ["new"], pooled={"zero": Pooled(SPREAD, {"day": ("new",)})})
-    own = [p for p in space.parameters if p.added_to]
+    space = build_scopes([spec], {"zero": {}}, {}, ["new"], pooled={"zero": Pooled(SPREAD, {"day": ("new",)})})
+    own = [p for p in space.parameters if p.scope.added_to]
     across = 0.1 * np.eye(columns) + 0.9
     share = columns / float(np.sum(across**2))
     model = SimpleNamespace(markers=SimpleNamespace(valid=np.ones(columns, dtype=bool)))

@@ -8,11 +8,9 @@ import pytest
 from scipy.stats import norm
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.bayes.pooling import DEVIATION
-from rfdropo_bayes.bayes.space import deviations
 from rfdropo_bayes.policies.randomisation import fitting
-from rfdropo_bayes.posteriors import SPREAD, ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.day_spread import day_deviations, draw_deviation, pooled_parameters
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
+from rfdropo_bayes.prediction.day_spread import day_deviations, draw_deviation
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
@@ -30,11 +28,14 @@ def pooled_posterior(spread: np.ndarray | None, **attrs: str) -> Calibration:
     modulus = rng.normal(CENTRE, WIDTH, ROWS)
     infos = [ParameterInfo("young_modulus", "Pa", 1e6, 5e7), ParameterInfo("trunk_mass", "kg", 1e-4, 10.0)]
     draws = {"young_modulus": modulus, "trunk_mass": 1e-7 * modulus}
+    scale = "" if spread is None else "young_modulus_spread"
     for day, apart in {"monday": 3e5, "tuesday": -3e5}.items():
-        infos.append(ParameterInfo(f"young_modulus{DEVIATION}@{day}", "Pa", prior=NORMAL))
+        scope = Scope(day, group=True, added_to="young_modulus", scaled_by=scale)
+        infos.append(ParameterInfo("young_modulus_deviation", "Pa", prior=NORMAL, scope=scope))
         draws[infos[-1].name] = rng.normal(apart, 1e4, ROWS)
     if spread is not None:
-        infos.append(ParameterInfo(f"young_modulus{SPREAD}", "Pa", 0.0, prior={"distribution": "HalfNormal"}))
+        prior = {"distribution": "HalfNormal"}
+        infos.append(ParameterInfo(scale, "Pa", 0.0, prior=prior, scope=Scope(spread=True)))
         draws[infos[-1].name] = spread
     record = PosteriorRecord(tuple(infos), {name: column[None] for name, column in draws.items()}, attrs=attrs)
     return Calibration(record, {}, "")
@@ -66,10 +67,9 @@ def test_an_episode_is_on_a_day_that_deviates_by_the_spread(inferred) -> None:
 def test_predictions_deviate_by_the_same_spread() -> None:
     spread = np.random.default_rng(2).uniform(2e5, 8e5, ROWS)
     record = pooled_posterior(spread).record
-    (pooled,) = pooled_parameters(record, SIMULATOR.parameters).values()
-    spec = next(spec for spec in SIMULATOR.parameters if spec.name == "young_modulus")
+    deviation = next(info for info in record.free if info.scope.added_to)
     values = {info.name: record.flat(info.name) for info in record.free}
-    drawn = draw_deviation(deviations(spec, pooled)[0], values, jax.random.key(0), ROWS)
+    drawn = draw_deviation(deviation, values, jax.random.key(0), ROWS)
     ratio = drawn / day_deviations(record, SIMULATOR.parameters)["young_modulus"].spread
     assert ratio.mean() == pytest.approx(0.0, abs=4 / np.sqrt(ROWS))
     assert ratio.var() == pytest.approx(1.0, abs=4 * np.sqrt(2 / ROWS))
@@ -84,7 +84,7 @@ def test_no_day_is_beyond_the_hard_bounds() -> None:
 def test_an_adapted_posterior_is_for_its_day() -> None:
     fit = pooled_posterior(np.full(ROWS, 5e5), **{ADAPTED_TO: "tuesday"})
     values = {name: fit.record.flat(name) for name in fit.record.posterior}
-    wanted = values["young_modulus"] + values[f"young_modulus{DEVIATION}@tuesday"]
+    wanted = values["young_modulus"] + values["young_modulus_deviation@tuesday"]
     assert np.isin(episodes_of(fit)["young_modulus"], wanted).all()
 
 
@@ -93,7 +93,7 @@ def test_sums_end_at_the_hard_bounds_as_in_the_fit_on_the_adapted_day_and_on_oth
     low = next(spec.low for spec in SIMULATOR.parameters if spec.name == "young_modulus")
     fit = pooled_posterior(np.full(ROWS, 1e9), **{ADAPTED_TO: "tuesday"})
     beyond = dict(fit.record.posterior)
-    beyond[f"young_modulus{DEVIATION}@tuesday"] = np.where(np.arange(ROWS) % 2, -1e7, 1e5)[None]
+    beyond["young_modulus_deviation@tuesday"] = np.where(np.arange(ROWS) % 2, -1e7, 1e5)[None]
     adapted = episodes_of(Calibration(replace(fit.record, posterior=beyond), {}, ""))["young_modulus"]
     assert np.mean(adapted == low) == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / DRAWN))
     unseen = episodes_of(pooled_posterior(np.full(ROWS, 1e7)))["young_modulus"]

@@ -10,7 +10,7 @@ import pytest
 
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, group_repeats, noise_floor
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction, Scope
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions
 
 STEP = 0.1
@@ -113,8 +113,9 @@ def make_run(rng: np.random.Generator, *, draws: int = 400, rows: int = 90) -> R
     }
     infos = list(INFOS)
     for trajectory in fit:
-        name = f"offset_x@{trajectory.name}"
-        infos.append(ParameterInfo(name, "m", prior={"distribution": "Normal", "loc": 0.0, "scale": 0.01}))
+        normal = {"distribution": "Normal", "loc": 0.0, "scale": 0.01}
+        infos.append(ParameterInfo("offset_x", "m", prior=normal, scope=Scope(trajectory.name)))
+        name = infos[-1].name
         posterior[name] = 0.002 * rng.normal() + 3e-4 * rng.normal(size=(2, draws))
         prior[name] = 0.01 * rng.normal(size=1000)
     groups = {i: g for g, members in enumerate(group_repeats(fit + test)) for i in members if len(members) > 1}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.space import build_space
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.scopes import build_scopes
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.report.identifiability import identify, product_in_words, spread_in_words
 from rfdropo_bayes.report.summary import bound_reached, posterior_table
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -114,14 +115,15 @@ def test_piles_are_looked_for_where_the_prior_ends(prior, ends) -> None:
     assert bound_reached(ends[1] - near, info) == "high"
     if prior:
         spec = ParameterSpec("p", "-", -10.0, 10.0, 0.0, prior, "")
-        np.testing.assert_allclose(build_space((spec,), {"p": prior}, {}, ["r"])["p"].ends, ends, rtol=1e-6)
+        np.testing.assert_allclose(build_scopes((spec,), {"p": prior}, {}, ["r"])["p"].ends, ends, rtol=1e-6)
 
 
 def test_a_spread_of_nothing_is_no_bound() -> None:
-    info = ParameterInfo("zero_spread", "m", 0.0, 10.0, {"distribution": "HalfNormal", "scale": 1.0})
+    table, scope = {"distribution": "HalfNormal", "scale": 1.0}, Scope(spread=True)
+    info = ParameterInfo("zero_spread", "m", 0.0, 10.0, table, scope=scope)
     assert bound_reached(np.random.default_rng(5).exponential(1e-2, 2000), info) is None
     spec = ParameterSpec("zero_spread", "m", 0.0, 10.0, 1.0, info.prior, "")
-    assert build_space((spec,), {"zero_spread": info.prior}, {}, ["r"])["zero_spread"].ends == info.ends
+    assert InferredParameter.of(spec, {}, scope, where="").ends == info.ends
 
 
 def test_logarithmic_parameters_are_compared_in_logarithms() -> None:

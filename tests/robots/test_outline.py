@@ -106,3 +106,28 @@ def test_what_was_assumed_is_marked_and_has_a_wide_prior(tmp_path):
 def test_answers_that_make_no_robot_are_refused(answers, message):
     with pytest.raises(InputError, match=message):
         RobotOutline(**ARM | answers)
+
+
+@pytest.mark.parametrize(("unit", "newtons"), [("N", 1.0), ("N m", 100.0), ("-", None)])
+def test_drives_that_hold_forces_pull_by_tensions(unit, newtons):
+    robot = Robot.outline(
+        name="arm", length=0.2, radius=0.02, markers={"tip": 0.2}, command_unit=unit, usual_command=2.0
+    )
+    assert robot.held_by_force
+    assert robot.initial_displacement_names == ()
+    gain = np.asarray(robot.channel_matrix(robot.nominal()))
+    if newtons is None:  # the usual command bends the body by a usual pull, 0.15 of the length
+        inertia, arm = np.pi / 4 * 0.02**4, 0.75 * 0.02
+        newtons = 1e6 * inertia * 0.15 / arm**2 / 2.0
+    np.testing.assert_allclose(gain, newtons * np.eye(4), rtol=1e-6)
+    assert robot.drive_limits()[0, 1] == pytest.approx(5.0 * 2.0 * newtons, rel=1e-5)
+
+
+def test_segments_have_lengths_of_their_own():
+    lengths = (0.06, 0.0625, 0.064)
+    given = {"name": "arm", "radius": 0.01, "markers": {"tip": 0.18}, "segments": 3, "cables": 3}
+    robot = Robot.outline(**given, length=sum(lengths), segment_lengths=lengths)
+    ends = [guides[-1, 2] for guides in robot.guides()]
+    np.testing.assert_allclose(ends, np.repeat(np.cumsum(lengths), 3), atol=1e-6)
+    with pytest.raises(InputError, match="do not make up the body"):
+        Robot.outline(**given, length=0.2, segment_lengths=lengths)

@@ -18,7 +18,8 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
 from rfdropo_bayes.data import RecordingEntry
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
+from rfdropo_bayes.posteriors import SHARED, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.report import page
@@ -61,7 +62,7 @@ def fit(zeros):
 def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
-    earlier = {"gain": np.full(2, 1.1 * GAIN), "zero_deviation@day_1": np.full(2, 0.004)}
+    earlier = {"gain": {"": np.full(2, 1.1 * GAIN)}, "zero_deviation": {"day_1": np.full(2, 0.004)}}
     whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)
     other = {name: 2.0 * measured for name, measured in whole.measured.items()}
     whole = whole.with_measured(other).counting({"markers": 0.5})
@@ -120,7 +121,7 @@ def known():
         "time_constant": ("s", {"distribution": "Uniform", "low": 0.05, "high": 1.0}),
         "zero": ("m", PRIORS["zero"]),
         "zero_spread": ("m", {"distribution": "HalfNormal", "scale": 0.02}),
-        "zero_deviation@day_0": ("m", normal),
+        "zero_deviation": ("m", normal),
         "observation_noise": ("m", {"distribution": "LogNormal", "median": 0.002, "sigma": 1.5}),
     }
     middle = {"gain": GAIN, "time_constant": LAG, "zero": 0.005, "zero_spread": SPREAD, "zero_deviation@day_0": 0.0}
@@ -128,7 +129,11 @@ def known():
     draws["observation_noise"] = np.full((1, 60), SIGMA)
     left = {"markers": ["tip"], "scale": [SIGMA] * 3, "correlation_time": STEP}
     attributes = {MODEL_ERROR: left, FITTED: ["day_0_a"], NOISE: "white"}
-    parameters = tuple(ParameterInfo(name, unit, -1.0, 3.0, prior) for name, (unit, prior) in infos.items())
+    scopes = {"zero_spread": Scope(spread=True), "zero_deviation": Scope("day_0", True, "zero", "zero_spread")}
+    parameters = tuple(
+        ParameterInfo(name, unit, -1.0, 3.0, prior, scope=scopes.get(name, SHARED))
+        for name, (unit, prior) in infos.items()
+    )
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups={**DAYS, "before": "morning"}, per_group={"zero": 0.02})
     return rb.Calibration(PosteriorRecord(parameters, draws, attrs=attributes), {"title": "lag"}, "", model)
 
@@ -197,7 +202,7 @@ def test_the_folder_of_a_day_keeps_the_values_of_the_recordings_that_were_fitted
     gone = [info for info in infos if info.name.startswith("zero")]
     zeros = {"zero@a": -0.02, "zero@b": 0.03}
     infos = [info for info in infos if info not in gone]
-    infos += [ParameterInfo(name, "m", -1.0, 1.0, PRIORS["zero"]) for name in zeros]
+    infos += [ParameterInfo("zero", "m", -1.0, 1.0, PRIORS["zero"], scope=Scope(owner)) for owner in "ab"]
     posterior = {info.name: posterior[info.name] for info in infos if info.name in posterior}
     posterior |= {name: value + 1e-4 * rng.normal(size=(1, 60)) for name, value in zeros.items()}
     attributes = {**known.record.attrs, FITTED: list("ab")}
@@ -208,8 +213,8 @@ def test_the_folder_of_a_day_keeps_the_values_of_the_recordings_that_were_fitted
     found = rb.adapt(fit, morning, seed=1, show=False)
     assert found.record.flat("zero@b").mean() == pytest.approx(zeros["zero@b"], abs=1e-4)
     assert found.record.flat("zero@morning").mean() == pytest.approx(0.05, abs=1e-3)
-    for name, zero in (*zeros.items(), ("zero@later", 0.05)):
-        run = recorded([name.partition("@")[2]], [zero], 40)[0]
+    for name, zero in (("a", zeros["zero@a"]), ("b", zeros["zero@b"]), ("later", 0.05)):
+        run = recorded([name], [zero], 40)[0]
         error = rb.predict(found, run).bands["mean"].values - run.position
         assert np.sqrt(np.mean(error**2)) < 5.0 * SIGMA
     again = rb.adapt(found, noon, seed=1, show=False)  # a folder of a day is adapted to another one
@@ -299,7 +304,7 @@ def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros, ca
     ]
     check = found.content["details"]["checks"]["b"]
     assert check["adapted"]["error_mm"] < check["from_first_row"]["error_mm"] + 1e3 * SIGMA
-    assert [c for c in found.cautions if "makes the rest of the recording worse" in c.sentence]
+    assert [c for c in found.cautions if "worsen the prediction of the rest of the recording" in c.sentence]
     (sentence,) = found.content["details"]["compared"]
     assert sentence.startswith("b, as far as it was not shown: from the first row ")
     assert "mm off, its 90 % bands held" in sentence
@@ -341,9 +346,10 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
 
     monkeypatch.setattr(adaptation, "load_recordings", read)
     (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
-    entry = RecordingEntry(observations="b.nc")
+    record = replace(known.record, attrs={**known.record.attrs, INTEGRATOR: "sdirk2"})
+    fit = rb.Calibration(record, {}, "", adaptation.fitted_model(tmp_path), tmp_path)
     with pytest.raises(rb.InputError, match="read"):
-        adaptation.run_adaptation(tmp_path, adaptation.fitted_model(tmp_path), entry, tmp_path / "out")
+        rb.adapt(fit, RecordingEntry(observations="b.nc"), out=tmp_path / "out")
     assert asked["missing"] == "mask"
 
 
@@ -431,7 +437,7 @@ def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
     with pytest.raises(rb.InputError, match="nothing of the model differs between days"):
         rb.adapt(replace(same, record=replace(record, parameters=shared, posterior=draws)), run, show=False)
     silent = {**record.attrs, MODEL_ERROR: None}
-    with pytest.raises(rb.InputError, match="does not say what its model leaves"):
+    with pytest.raises(rb.InputError, match="has no residuals of the fitted recordings"):
         rb.adapt(replace(known, record=replace(record, attrs=silent)), run, show=False)
 
 

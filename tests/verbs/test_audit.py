@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.differences import Groups, with_differences
@@ -21,9 +21,9 @@ from rfdropo_bayes.verbs.audit import extended_tables, sized_priors
 def answered(candidate: Candidate, x: list[float]) -> Any:
     """What an audit says of a drive that creeps, named and adopted."""
     creep = REGISTRY["drive_creep"]()
-    space = build_space(creep.parameters, {spec.name: {} for spec in creep.parameters}, {}, ())
+    space = build_scopes(creep.parameters, {spec.name: {} for spec in creep.parameters}, {}, ())
     names = tuple(spec.name for spec in creep.parameters)
-    coordinates = Coordinates(space, 0, names, {spec.name: spec.nominal for spec in creep.parameters}, {})
+    coordinates = Coordinates(space, 0, names)
     return SimpleNamespace(
         law=None,
         adopted=[SimpleNamespace(name=candidate.name)],
@@ -64,13 +64,13 @@ def test_a_mechanism_of_one_group_has_the_priors_of_its_own_parameters(tmp_path:
     )
     library = [Candidate(spec.name, (k,), REGISTRY["drive_creep"](), spec.name) for k, spec in enumerate(specs)]
     groups = Groups({"april": ("a",), "june": ("b",)}, compared=False)
-    known = build_space(specs, {spec.name: {} for spec in specs}, {}, ("a", "b"))
+    known = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ("a", "b"))
     space, candidates = with_differences(known, 0, (), library, groups, spreads={})
     nominal = {spec.name: spec.nominal for spec in specs}
     found = [candidate for candidate in candidates if candidate.group == "april"]
     answer = answered(found[0], np.zeros(len(space.names)).tolist())
     answer.extended.free = np.array([0])
-    answer.problem.coordinates = Coordinates(space, 0, tuple(nominal), nominal, {})
+    answer.problem.coordinates = Coordinates(space, 0, tuple(nominal))
     (priors,) = [sized_priors(answer, each) for each in found if each.title == "stretch"]
     assert priors["stretch"] == pytest.approx(factor)
     answer.adopted[:] = [SimpleNamespace(name="blur@april")]

@@ -19,7 +19,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.report import page
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
@@ -41,7 +41,7 @@ SHORT = [
 
 def test_a_fitted_stiffness_that_nothing_has_is_a_caution():
     """Whatever the bounds of the robot's file allow; a wide posterior that reaches plausible values is none."""
-    arm, info = Robot.load("smooth_arm"), ParameterInfo("young_modulus@run", "Pa", 0.1, 1e9, {}, "")
+    arm, info = Robot.load("smooth_arm"), ParameterInfo("young_modulus", "Pa", 0.1, 1e9, scope=Scope("run"))
     for draws, cautions in ((np.linspace(1.0, 5.0, 99), 1), (np.geomspace(1.0, 1e6, 99), 0)):
         record = PosteriorRecord((info,), {info.name: draws[None]}, {})
         found = implausible_fit(arm, {"trunk_mass": 0.1}, record)
@@ -150,7 +150,7 @@ def test_climbs_start_from_the_optimum_of_an_earlier_calibration(tmp_path):
     info = ParameterInfo("young_modulus", "Pa", 0.0, np.inf, {}, "")
     record = PosteriorRecord((info,), draws, {"young_modulus": draws["young_modulus"][0]}, ())
     record.save(tmp_path / "posterior.nc")
-    np.testing.assert_allclose(earlier_draws(tmp_path, "laplace")["young_modulus"], [1e6, 2e6, 3e6])
+    np.testing.assert_allclose(earlier_draws(tmp_path, "laplace")["young_modulus"][""], [1e6, 2e6, 3e6])
     for optimum, expected in (({"young_modulus": 5e6}, [5e6, 5e6, 5e6, 1e6, 2e6, 3e6]), (None, [1e6, 2e6, 3e6])):
         found = earlier_draws(Calibration(record, {"optimum": optimum}, ""), "laplace")
-        np.testing.assert_allclose(found["young_modulus"], expected)
+        np.testing.assert_allclose(found["young_modulus"][""], expected)

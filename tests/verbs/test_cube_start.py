@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, first_row_only
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.predictive import with_measured_starts
 from rfdropo_bayes.simulators.cube import push_table
-from rfdropo_bayes.verbs.predict import run_prediction
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 YAW, SHIFT = 0.2, np.array([0.003, -0.002, 0.004])
@@ -53,14 +53,14 @@ def test_the_cube_starts_where_it_was_measured_less_the_offset_and_on_the_plate(
     trajectory = recording(simulator)
     specs = simulator.parameters + noise_specs("white")
     offsets = [f"offset_{axis}" for axis in "xyz"]
-    space = build_space(specs, {name: {} for name in (*offsets, "cube_x", "observation_noise")}, {}, ["pushed"])
+    space = build_scopes(specs, {name: {} for name in (*offsets, "cube_x", "observation_noise")}, {}, ["pushed"])
     recordings = gather_recordings(simulator, [trajectory])
-    model = TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, "white"),))
+    model = TrajectoryModel(simulator, space, recordings, (Markers.gather(recordings, "white"),))
     values = {"cube_x": np.array([0.5, 0.5]), "observation_noise": np.full(2, 1e-3)}
     values |= {name: np.array([0.0, shift]) for name, shift in zip(offsets, SHIFT, strict=True)}
     placed, found = with_measured_starts(model, [first_row_only(trajectory)], values)
-    assert "cube_x" not in placed.space.names
-    own = placed.space.for_recording(found, "pushed")
+    assert "cube_x" not in placed.scopes.names
+    own = placed.scopes.values_in("pushed", found)
     np.testing.assert_allclose(own["cube_x"], [0.012, 0.012 - SHIFT[0]])
     np.testing.assert_allclose(own["cube_z"], [0.1, 0.1 - SHIFT[2]])
     table = push_table(simulator.robot)
@@ -85,12 +85,8 @@ def test_a_prediction_holds_every_draw_of_the_cube_in_the_measuring_frame(simula
     draws = {"offset_x": rng.normal(0, 0.005, (1, 8)), "observation_noise": np.full((1, 8), 1e-3)}
     PosteriorRecord(tuple(infos), draws, attrs={"integrator": "sdirk2"}).save(tmp_path / "posterior.nc")
     changes = ["simulator.push=true", "simulator.time_step=0.02", "data.format='netcdf'"]
-    run_prediction(
-        Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes),
-        tmp_path,
-        str(tmp_path / "commands.nc"),
-        tmp_path / "out",
-    )
+    model = rb.Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes)
+    rb.predict(rb.Calibration.of_posterior(tmp_path, model), tmp_path / "commands.nc", out=tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         assert opened["object"].shape == (8, 4, 7)
         np.testing.assert_allclose(opened["object"].values[..., 0], 0.012, atol=2e-4)

@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.predictive import HELD
+from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import build_summary, write_summary
@@ -112,7 +111,9 @@ def test_a_model_is_written_with_what_was_fixed_for_several_elements_and_what_th
     (tmp_path / "config.toml").write_text(EXPERIMENT)
     info = ParameterInfo("mass", "kg", 0.01, 10.0)
     draws = {"mass": np.full((1, 4), 0.06)}
-    PosteriorRecord((info,), draws, attrs={HELD: {"stiffness": 0.3}}).save(tmp_path / POSTERIOR)
+    PosteriorRecord(
+        (info,), draws, attrs={HELD: [{"parameter": ParameterInfo("stiffness", "-").as_dict(), "value": 0.3}]}
+    ).save(tmp_path / POSTERIOR)
     written = mujoco.MjModel.from_xml_path(str(export_model(tmp_path)))
     np.testing.assert_allclose(written.dof_damping, 0.02)
     assert written.jnt_stiffness[1] == pytest.approx(0.3)

@@ -22,7 +22,7 @@ from rfdropo_bayes.inference.method_options import attributes_of, settings_text
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.model.experiment import AuditTable, ModelTable
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.verbs.predict import fitted_parts
+from rfdropo_bayes.verbs.predict import fitted_scopes
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -144,7 +144,7 @@ def test_every_calibration_among_the_reports_has_a_model_of_its_parameters(folde
     """An audit's answer that lies beside it changes nothing."""
     fit = rb.load(folder)
     assert isinstance(fit, rb.Calibration)
-    assert set(fitted_parts(fit)[1].names) == {info.name for info in fit.record.free}
+    assert set(fitted_scopes(fit).names) == {info.name for info in fit.record.free}
 
 
 @pytest.mark.slow
@@ -233,9 +233,9 @@ def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
     back = rb.load(fit.folder)
     np.testing.assert_array_equal(back.idata.posterior["gain"], fit.idata.posterior["gain"])
     with pytest.raises(InputError, match=r"has no model: .*'lag'.*rb.load\(folder, model=model\)"):
-        fitted_parts(back)  # no file describes a function
+        fitted_scopes(back)  # no file describes a function
     back = rb.load(fit.folder, model=fit.model)
-    assert set(fitted_parts(back)[1].names) == {"gain", "time_constant"}
+    assert set(fitted_scopes(back).names) == {"gain", "time_constant"}
 
 
 @pytest.mark.slow
@@ -253,7 +253,9 @@ def test_an_audit_of_a_black_box_names_a_hidden_delay(runs):
     late = rb.Model(BOX, mechanisms=["command_delay"], fixed={"command_delay": 0.06})
     noise = {"standard_deviation": SIGMA}
     seen = rb.simulate(late, runs, parameters=TRUTH, noise=noise, seed=2)
-    found = rb.audit(rb.Model(BOX, noise="white"), seen[:3], test=seen[3:], noise=noise, seed=0, bootstraps=199)
+    found = rb.audit(
+        rb.Model(BOX, noise="white"), seen[:3], rb.AuditOptions(bootstraps=199), test=seen[3:], noise=noise, seed=0
+    )
     assert found.verdict in ("explained", "equivalent")
     assert "payload" in found.content["left_out"]
     members = found.content["findings"][0]["equivalence_class"]
@@ -285,10 +287,8 @@ def test_every_call_shows_the_keywords_that_it_takes():
     ("called", "schema", "without"),
     [
         (rb.read, DataSpec, {"fit", "test"}),
-        (rb.train, TrainingTable, set()),
-        (rb.make_vec, TrainingTable, set()),
-        (rb.evaluate, TrainingTable, set()),
-        (rb.audit, AuditTable, set()),
+        (rb.TrainingOptions, TrainingTable, set()),
+        (rb.AuditOptions, AuditTable, set()),
         (rb.Model, ModelTable, set()),
     ],
 )
@@ -303,6 +303,12 @@ def test_a_call_shows_the_keys_of_its_table(called, schema, without):
 def test_a_mistyped_key_names_the_nearest(tmp_path):
     with pytest.raises(InputError, match=r"unknown key 'resampel'.*did you mean 'resample'"):
         rb.read("run.csv", "csv", {}, folder=tmp_path, resampel=0.1)
+    with pytest.raises(InputError, match=r"TrainingOptions: unknown key 'step_'.*did you mean 'step'"):
+        rb.TrainingOptions(step_=3)
+    with pytest.raises(InputError, match=r"AuditOptions: bootstraps = 3"):
+        rb.AuditOptions(bootstraps=3)
+    with pytest.raises(InputError, match=r"a dict is no TrainingOptions.*make them with rb.TrainingOptions"):
+        rb.train(rb.Model("trunk_sofa"), tmp_path, {"steps": 3})
 
 
 @pytest.mark.parametrize("name", sorted(method.config.called for method in METHODS.values()))

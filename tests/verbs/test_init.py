@@ -14,6 +14,7 @@ from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment import load_experiment, matching
 from rfdropo_bayes.model.model_spec import find_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_names import guess_columns, suggested_names
 
 ROWS = 40
@@ -356,12 +357,21 @@ def test_what_was_guessed_is_marked_with_its_evidence(tmp_path, monkeypatch, cap
     assert "tension = true" in text
 
 
-def test_commands_in_percent_are_refused_by_their_names(tmp_path, monkeypatch, capsys):
+def test_commands_that_are_no_travel_pull_by_a_force_of_unknown_size(tmp_path, monkeypatch, capsys):
+    """Shares of a supply: one unit pulls with a force that is assumed, and said so; pressures pull no cable."""
     table("t", "{marker}_{axis}", "valve{0}_pct").to_csv(tmp_path / "run.csv", index=False)
     monkeypatch.chdir(tmp_path)
-    status, told = init(monkeypatch, capsys, "arm", "--recording", "run.csv")
+    assert init(monkeypatch, capsys, "arm", "--recording", "run.csv", "--length-mm", "200")[0] == 0
+    robot = Robot.load(tmp_path / "arm" / "arm.toml")
+    assert robot.command_unit == "-"
+    assert robot.held_by_force
+    assert "ASSUMED: the usual command bends the body" in (tmp_path / "arm" / "arm.toml").read_text()
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    assert load_recordings(experiment.data, tmp_path / "arm")[0].command_unit == "-"
+    table("t", "{marker}_{axis}", "valve{0}_bar").to_csv(tmp_path / "air.csv", index=False)
+    status, told = init(monkeypatch, capsys, "b", "--recording", "air.csv")
     assert status == 2
-    assert "commands are in '%' (valve1_pct, valve2_pct, valve3_pct, valve4_pct), neither lengths of cable nor" in told
+    assert "commands are in 'bar' (valve1_bar, valve2_bar, valve3_bar, valve4_bar), which no drive of a cable" in told
 
 
 def test_disks_that_nobody_counted_share_out_over_the_segments(tmp_path, monkeypatch, capsys):

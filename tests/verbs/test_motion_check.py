@@ -7,8 +7,7 @@ import pytest
 
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data.named_columns import CsvColumns
-from rfdropo_bayes.verbs.channel_order import Driven, best_order
-from rfdropo_bayes.verbs.motion_check import Motion, Reordered, motion_cautions
+from rfdropo_bayes.verbs.motion_check import Motion, Proposal, motion_cautions
 from rfdropo_bayes.verbs.motion_direction import Direction, Paths
 from rfdropo_bayes.verbs.motion_size import Size, Unit, likely_units, other_units, size_of
 
@@ -24,64 +23,37 @@ def columns(unit: str) -> CsvColumns:
     return CsvColumns(command_unit=unit, **table)
 
 
-def around(channels: int, markers: int = 2) -> np.ndarray:
-    """What cables evenly around a body move markers by, farther up the more."""
-    angle = 2.0 * np.pi * np.arange(channels) / channels
-    height = np.arange(1, markers + 1)[None, :, None]
-    return (height * np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]).reshape(channels, -1)
-
-
-def driven(command: np.ndarray, response: np.ndarray, columns: list[int]) -> Driven:
-    """A recording of noisy markers, whose file has column columns[k] where the robot's channel k took it."""
-    noise = 0.1 * np.random.default_rng(5).normal(size=(len(command), response.shape[1]))
-    motion = command[:, columns] @ response + noise
-    return Driven(command - command.mean(axis=0), motion - motion.mean(axis=0))
-
-
-@pytest.mark.parametrize("order", [[0, 2, 1], [1, 2, 0], [0, 2, 1, 3], [3, 0, 1, 2], [4, 2, 0, 3, 1, 5, 7, 6]])
-@pytest.mark.parametrize("opposed", [False, True])
-def test_the_order_of_the_columns_is_found_whatever_their_size(order, opposed):
-    """Opposed cables move together in some files: then a regression alone does not tell them apart."""
-    channels = len(order)
-    command = np.random.default_rng(channels).normal(size=(80, channels)).cumsum(axis=0)
-    if opposed and channels % 2 == 0:
-        command[:, channels // 2 :] = -command[:, : channels // 2]
-        command = command[:, np.argsort(order)]
-    found = best_order([driven(command, 7.0 * around(channels), order)], around(channels))
-    truth = command[:, order] @ around(channels)
-    assert found.agreement > 0.95
-    assert command[:, list(found.columns)] @ around(channels) == pytest.approx(truth)
-
-
-def test_columns_in_order_stay_and_those_that_never_move_keep_their_place():
-    command = np.random.default_rng(0).normal(size=(60, 6)).cumsum(axis=0)
-    command[:, [1, 4, 5]] = 0.0
-    assert best_order([driven(command, around(6), list(range(6)))], around(6)).columns == (0, 1, 2, 3, 4, 5)
-    still = Driven(np.zeros((20, 3)), np.zeros((20, 4)))
-    assert best_order([still], around(3)).columns == (0, 1, 2)
-
-
-def test_another_order_is_named_with_the_line_that_mends_it():
-    turned = Direction(1.2, 0.4, 0.3)
-    (caution,) = motion_cautions(Motion(turned, FITS, Reordered((0, 2, 1, 3), 0.97)), columns("mm"), NAMES, "m")
+def test_another_arrangement_is_named_with_the_lines_that_mend_it():
+    turned, lines = (
+        Direction(1.2, 0.4, 0.3),
+        ('commands = ["c1", "c3", "c2", "c4"] in [data.columns]', "gain = [[-1.0]]"),
+    )
+    (caution,) = motion_cautions(Motion(turned, FITS, Proposal(0.97, lines)), columns("mm"), "m")
     assert caution.code is Code.ORDER_DOUBTFUL
-    assert 'commands = ["c1", "c3", "c2", "c4"] in [data.columns]' in caution.sentence
+    assert "; ".join(lines) in caution.sentence
     assert "agreement 0.97" in caution.sentence
+    assert motion_cautions(Motion(WELL, FITS), columns("mm"), "m") == []
+
+
+def test_arrangements_that_explain_a_motion_as_well_are_named_beside_each_other():
+    lines = ('commands = ["c1", "c4", "c3", "c2"] in [data.columns]',)
+    (caution,) = motion_cautions(Motion(WELL, FITS, Proposal(0.97, lines, ("azimuth_deg",))), columns("mm"), "m")
+    assert "do not tell them apart" in caution.sentence
+    assert "; or azimuth_deg" in caution.sentence
     mirrored = Direction(0.0, 0.3, 0.96, 0.0)
-    (caution,) = motion_cautions(Motion(mirrored, FITS, Reordered((0, 3, 2, 1), 0.96)), columns("mm"), NAMES, "m")
+    (caution,) = motion_cautions(Motion(mirrored, FITS, Proposal(0.96, lines, (), True)), columns("mm"), "m")
     assert caution.code is Code.FRAME_DOUBTFUL
     assert 'axes = ["x", "-y", "z"]' in caution.sentence
-    assert 'commands = ["c1", "c4", "c3", "c2"]' in caution.sentence
-    assert motion_cautions(Motion(WELL, FITS), columns("mm"), NAMES, "m") == []
+    assert lines[0] in caution.sentence
 
 
 @pytest.mark.parametrize(("ratio", "unit", "doubtful"), [(0.5, "m", 0), (2.0, "m", 0), (9.0, "m", 1), (0.1, "rad", 1)])
 def test_a_motion_of_another_size_than_the_nominal_is_doubtful_if_commands_impose_it(ratio, unit, doubtful):
-    found = motion_cautions(Motion(WELL, Size(0.010 * ratio, 0.010)), None, NAMES, unit)
+    found = motion_cautions(Motion(WELL, Size(0.010 * ratio, 0.010)), None, unit)
     assert [caution.code for caution in found] == [Code.UNIT_DOUBTFUL] * doubtful
-    assert motion_cautions(Motion(WELL, Size(0.010 * ratio, 0.010)), None, NAMES, "N") == []
+    assert motion_cautions(Motion(WELL, Size(0.010 * ratio, 0.010)), None, "N") == []
     lost = Direction(0.0, 0.5, 0.5)  # what moves otherwise says nothing of sizes
-    assert motion_cautions(Motion(lost, Size(0.010 * ratio, 0.010)), None, NAMES, unit) == []
+    assert motion_cautions(Motion(lost, Size(0.010 * ratio, 0.010)), None, unit) == []
 
 
 @pytest.mark.parametrize(
@@ -93,7 +65,7 @@ def test_the_unit_that_is_tried_first_is_the_nearest(unit, ratio, likely):
     units = likely_units(other_units(columns(unit), kind), Size(0.01 * ratio, 0.01))
     assert units[0].name == likely
     then = Motion(WELL, Size(0.01 * ratio, 0.01), unit=(units[0], Size(0.01 * ratio, 0.011 * ratio)))
-    (caution,) = motion_cautions(then, columns(unit), NAMES, kind)
+    (caution,) = motion_cautions(then, columns(unit), kind)
     assert f'command_unit = "{likely}"' in caution.sentence
 
 
@@ -106,9 +78,9 @@ def test_commands_too_large_to_simulate_are_tried_smaller_and_forces_not_at_all(
 
 def test_markers_that_do_not_follow_are_doubtful_unless_the_model_hardly_moves():
     apart = Direction(2.0, 0.1, 0.2)
-    (caution,) = motion_cautions(Motion(apart, FITS), None, NAMES, "m")
+    (caution,) = motion_cautions(Motion(apart, FITS), None, "m")
     assert caution.code is Code.RECORDING_DOUBTFUL
-    assert motion_cautions(Motion(apart, Size(0.01, 1e-4)), None, NAMES, "m") == []
+    assert motion_cautions(Motion(apart, Size(0.01, 1e-4)), None, "m") == []
 
 
 def test_sizes_are_of_the_rows_that_were_seen_about_their_mean():

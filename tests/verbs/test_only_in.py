@@ -122,9 +122,10 @@ def test_the_file_that_an_audit_writes_is_calibrated_with_the_mechanism_in_its_g
     """What the audit finds in April alone: written, read back, calibrated, and predicted in April and in June."""
     base = rb.Model(BOX, noise="white", priors=PRIORS, groups=GROUPS)
     known = [*runs, *recorded({"june_b": 0.0}, 60)]
-    options = {"exclude": [name for name in REGISTRY if name != "command_delay"], "ports": False, "bootstraps": 199}
+    others = [name for name in REGISTRY if name != "command_delay"]
+    options, noise = rb.AuditOptions(exclude=others, ports=False, bootstraps=199), {"standard_deviation": SIGMA}
     unseen = recorded({"april_tested": DELAY, "june_tested": 0.0}, 20)
-    rb.audit(base, known, test=unseen, noise={"standard_deviation": SIGMA}, out=tmp_path / "audit", **options)
+    rb.audit(base, known, options, test=unseen, noise=noise, out=tmp_path / "audit")
     tables = tomllib.loads((tmp_path / "audit" / "extended.toml").read_text())["model"]
     assert tables["only_in"] == {"command_delay": ["april"]}
     model = rb.Model(BOX, **tables)
@@ -153,8 +154,8 @@ def test_the_law_of_one_group_that_an_audit_writes_is_calibrated_and_predicted_t
     known = shown(["april_a", "april_b", "april_c", "june_a", "june_b", "june_c"], 0)
     unseen = shown(["april_t", "april_u", "june_t", "june_u"], 20)
     base = rb.Model(BOX, noise="white", priors=PRIORS, groups=GROUPS)
-    options = {"library": False, "bootstraps": 199}
-    found = rb.audit(base, known, test=unseen, noise=noise, out=tmp_path / "audit", **options)
+    options = rb.AuditOptions(library=False, bootstraps=199)
+    found = rb.audit(base, known, options, test=unseen, noise=noise, out=tmp_path / "audit")
     assert (found.verdict, found.content["law"]["terms"][0]["group"]) == ("described", "april")
     tables = tomllib.loads((tmp_path / "audit" / "extended.toml").read_text())["model"]
     ((name, groups),) = tables["only_in"].items()

@@ -11,17 +11,22 @@ import numpy as np
 from rfdropo_bayes.bayes.channels import Weighed, WeighedParts
 from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.verbs.calibrate import with_ratios
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENT = ROOT / "experiments" / "asl_trunk_payload.toml"
 KNOWN, UNKNOWN = (f"payload_mass@observations_controlled_1_100g[{rows}]" for rows in ("0:3999", "5000:6999"))
 
+LOADS = {"payload_mass@a": "a", "payload_mass@b": "b"}
+
 
 def record(**draws: np.ndarray) -> PosteriorRecord:
-    infos = tuple(ParameterInfo(name, "kg", 0.0, np.inf, {}, "") for name in draws)
-    return PosteriorRecord(infos, {name: values[None] for name, values in draws.items()}, prior=draws)
+    infos = [ParameterInfo(name, "kg", 0.0, np.inf) for name in draws if name not in LOADS]
+    infos += [
+        ParameterInfo("payload_mass", "kg", 0.0, np.inf, scope=Scope(LOADS[name])) for name in draws if name in LOADS
+    ]
+    return PosteriorRecord(tuple(infos), {name: values[None] for name, values in draws.items()}, prior=draws)
 
 
 def test_a_payload_is_also_given_over_stiffness_and_over_mass():
@@ -55,4 +60,4 @@ def test_an_unknown_payload_is_free_beside_the_one_that_was_weighed(datasets, mo
         built = model.numpyro(load_recordings(model.settings.data, model.folder))
         (weighed,) = [channel for channel in built.channels if isinstance(channel, WeighedParts)]
         assert weighed.entries == (Weighed((KNOWN,), 0.1, 0.001),)
-        assert {name for name in built.space.names if name.startswith("payload_mass")} == payloads
+        assert {name for name in built.scopes.names if name.startswith("payload_mass")} == payloads

@@ -15,8 +15,9 @@ import pytest
 import tomli_w
 import xarray as xr
 
-from rfdropo_bayes.bayes.pooling import Pooled
-from rfdropo_bayes.bayes.space import build_space
+import rfdropo_bayes as rb
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
@@ -26,13 +27,13 @@ from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction, Scope
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
-from rfdropo_bayes.prediction.predictive import NOISE, _for_new_recordings
+from rfdropo_bayes.prediction.predictive import NOISE, draw_extended
+from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.verbs.predict import run_prediction
 from rfdropo_bayes.verbs.simulate import simulate_all
 
 FITTED_WITH = {INTEGRATOR: "sdirk2"}
@@ -54,9 +55,9 @@ def posterior(tmp_path_factory) -> Path:
         draws[name] = rng.uniform(low, high, (1, 40))
     for axis in "xyz":
         for recording in ("demo_1", "demo_2"):
-            name = f"offset_{axis}@{recording}"
-            infos.append(ParameterInfo(name, "m", -0.05, 0.05, {"distribution": "Normal", "loc": 0.0, "scale": 0.005}))
-            draws[name] = rng.normal(0.0, 0.003, (1, 40))
+            normal, scope = {"distribution": "Normal", "loc": 0.0, "scale": 0.005}, Scope(recording)
+            infos.append(ParameterInfo(f"offset_{axis}", "m", -0.05, 0.05, normal, scope=scope))
+            draws[infos[-1].name] = rng.normal(0.0, 0.003, (1, 40))
     PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(folder / "posterior.nc")
     return folder
 
@@ -70,7 +71,7 @@ def predict(posterior: Path, commands: str, out: Path, rows: tuple[int, int] = (
     piece = Trajectory.load(EXPERIMENTS / commands).slice_rows(*rows)
     piece.save(out / "commands.nc")
     model = Model.read(EXPERIMENTS / "demo.toml", COARSE)
-    run_prediction(model, posterior, str(out / "commands.nc"), out, **options)
+    rb.predict(Calibration.of_posterior(posterior, model), out / "commands.nc", out=out, **options)
     with xr.open_dataset(out / "prediction.nc") as opened:
         return opened.load()
 
@@ -120,9 +121,9 @@ def test_another_noise_than_the_fitted_one_is_refused(posterior, tmp_path):
 def test_a_piece_of_a_fitted_recording_keeps_its_frame(posterior, tmp_path):
     """What its first row says about the frame has been used already, with all the other rows."""
     record = PosteriorRecord.load(posterior / "posterior.nc")
-    renamed = [i.name.replace("@demo_1", "@demo_3[0:9]").replace("@demo_2", "@other") for i in record.parameters]
-    infos = tuple(replace(info, name=name) for info, name in zip(record.parameters, renamed, strict=True))
-    draws = {name: record.posterior[info.name] for name, info in zip(renamed, record.parameters, strict=True)}
+    owners = {"": "", "demo_1": "demo_3[0:9]", "demo_2": "other"}
+    infos = tuple(replace(info, scope=Scope(owners[info.scope.owner])) for info in record.parameters)
+    draws = {new.name: record.posterior[info.name] for new, info in zip(infos, record.parameters, strict=True)}
     (tmp_path / "same").mkdir()
     PosteriorRecord(infos, draws, attrs=FITTED_WITH).save(tmp_path / "same" / "posterior.nc")
     whole = Trajectory.load(EXPERIMENTS / COMMANDS)
@@ -143,16 +144,16 @@ def test_what_one_recording_alone_had_free_is_not_carried_to_a_new_one():
         )
     }
     specs["payload"] = ParameterSpec("payload", "kg", 0.0, 1.0, 0.0, {"distribution": "HalfNormal", "scale": 1.0}, "")
-    space = build_space(
+    space = build_scopes(
         tuple(specs.values()),
         {"offset_x": {}, "payload": {}},
         {"offset_x": ["a", "b[0:9]"], "payload": ["b[0:9]"]},
         ["a", "b[0:9]"],
     )
     values = {name: np.full(3, 0.1 * k) for k, name in enumerate(names)}
-    found, drawn = _for_new_recordings(
-        space, values, ["new", "b[20:30]", "a[3:4]"], ["a", "b[0:9]"], jax.random.key(0), {}
-    )
+    names = ["new", "b[20:30]", "a[3:4]"]
+    extension = space.extended(names, ["a", "b[0:9]"], {})
+    found, drawn = extension.scopes, draw_extended(extension, values, names, jax.random.key(0))
     assert set(drawn) == {"offset_x@new", "offset_x@b[20:30]", "payload@b[20:30]", "offset_x@a[3:4]"}
     assert set(found.names) == set(drawn)
     np.testing.assert_array_equal(drawn["offset_x@b[20:30]"], 0.1)
@@ -181,7 +182,7 @@ def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
     for group in (None, "april"):
         out = tmp_path / str(group)
         model = Model.read(EXPERIMENTS / "demo.toml", overrides)
-        facts = run_prediction(model, posterior, COMMANDS, out, group=group)
+        facts = rb.predict(Calibration.of_posterior(posterior, model), COMMANDS, out=out, group=group).content
         moved[group] = np.ptp(pd.read_csv(out / "prediction.csv")["m4_x_mean"])
         said[group] = [caution["code"] for caution in facts["cautions"]]
     assert said == {None: ["drives_unstated"], "april": []}
@@ -191,8 +192,9 @@ def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
 def test_wrong_requests_are_named(posterior, tmp_path):
     with pytest.raises(InputError, match="one file"):
         predict(posterior, COMMANDS, tmp_path, start=COMMANDS)
+    fit = Calibration.of_posterior(posterior, Model.read(EXPERIMENTS / "demo.toml", COARSE))
     with pytest.raises(InputError, match="no such file"):
-        run_prediction(Model.read(EXPERIMENTS / "demo.toml", COARSE), posterior, "demo/none.nc", tmp_path)
+        rb.predict(fit, "demo/none.nc", out=tmp_path)
     stranger = PosteriorRecord.load(posterior / "posterior.nc")
     infos = (*stranger.parameters, ParameterInfo("delay", "s", 0.0, 1.0, prior_of(0.1)))
     draws = {**stranger.posterior, "delay": np.full((1, 40), 0.1)}
@@ -223,15 +225,16 @@ def deviating(recordings, groups):
     """A space of one parameter that deviates between groups with a spread of 2, and draws of it."""
     spec = ParameterSpec("level", "m", -9.0, 9.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0}, "")
     pooled = {"level": Pooled(2.0, gather_groups(recordings, groups))}
-    space = build_space([spec], {"level": {}}, {}, recordings, pooled=pooled)
+    space = build_scopes([spec], {"level": {}}, {}, recordings, pooled=pooled)
     return space, {name: np.asarray(v) for name, v in space.sample(jax.random.key(1), 4000).items()}
 
 
 def test_a_new_recording_of_a_known_day_has_that_day_s_values_and_one_of_a_new_day_their_spread():
     days = {"january": "jan*", "april": "apr*"}
     space, values = deviating(["jan_1", "jan_2"], days)
-    found, drawn = _for_new_recordings(space, values, ["jan_3", "apr_1"], ["jan_1", "jan_2"], jax.random.key(0), days)
-    january, april = (found.for_recording(drawn, name)["level"] for name in ("jan_3", "apr_1"))
+    extension = space.extended(["jan_3", "apr_1"], ["jan_1", "jan_2"], days)
+    found, drawn = extension.scopes, draw_extended(extension, values, ["jan_3", "apr_1"], jax.random.key(0))
+    january, april = (found.values_in(name, drawn)["level"] for name in ("jan_3", "apr_1"))
     np.testing.assert_array_equal(january, values["level"] + values["level_deviation@january"])
     new = april - values["level"]
     assert np.std(new) == pytest.approx(2.0, rel=0.06)  # 5 standard errors
@@ -256,9 +259,9 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
         return moved.reshape(len(moved), horizon, 6), np.zeros(len(moved))
 
     problem = SimpleNamespace(
-        model=SimpleNamespace(space=space, recordings=recordings), n_recordings=1, rollouts=rollouts
+        model=SimpleNamespace(scopes=space, recordings=recordings), n_recordings=1, rollouts=rollouts
     )
-    drawn = [p for p in space.parameters if p.added_to]
+    drawn = [p for p in space.parameters if p.scope.added_to]
     matched, unmatched = match_first_row(problem, values, ["new"], drawn, left, jax.random.key(2))
     found = matched["level_deviation@new"]
     assert unmatched == 0
@@ -357,10 +360,12 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     offset = {f"offset_{axis}@old": np.random.default_rng(i).normal(0.0, 0.01, (1, 4)) for i, axis in enumerate("xyz")}
     priors = {"observation_noise": prior_of(1e-3)} | {s.name: dict(s.prior) for s in specs}
     infos = [ParameterInfo(n, "-", -np.inf, np.inf, priors[n]) for n in fixed]
-    infos += [ParameterInfo(n, "m", -0.5, 0.5, {"distribution": "Normal", "loc": 0.0, "scale": 0.01}) for n in offset]
+    normal = {"distribution": "Normal", "loc": 0.0, "scale": 0.01}
+    infos += [ParameterInfo(f"offset_{axis}", "m", -0.5, 0.5, normal, scope=Scope("old")) for axis in "xyz"]
     draws = {n: np.full((1, 4), v) for n, v in fixed.items()} | offset
     PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(tmp_path / "posterior.nc")
-    run_prediction(Model.read(tmp_path / "own.toml"), tmp_path, "trajectory.nc", tmp_path / "out")
+    fit = Calibration.of_posterior(tmp_path, Model.read(tmp_path / "own.toml"))
+    rb.predict(fit, "trajectory.nc", out=tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         predicted = opened["mean"].values
     measured = Trajectory.load(tmp_path / "trajectory.nc").position

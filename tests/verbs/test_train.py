@@ -19,8 +19,7 @@ from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.predictive import HELD
+from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
@@ -39,6 +38,7 @@ QUICK = [
 
 
 SINGLE = {"precision": "float32"}
+GOALS = [[0.0, 0.0, 0.25], [0.02, 0.02, 0.27]]
 
 
 def rfdropo(*words: object) -> str:
@@ -53,7 +53,7 @@ def test_an_arm_of_another_length_needs_goals_of_its_own() -> None:
     long = Robot.outline(name="long", length=0.3, radius=0.01, markers={"tip": 0.3})
     with pytest.raises(rb.InputError, match="a trunk of 195 mm, and long has 300 mm"):
         rb.make_vec("TrunkReach-v0", rb.Model(long), n=1)
-    venv = rb.make_vec("TrunkReach-v0", rb.Model(long), n=1, goals=[[0.0, 0.0, 0.25], [0.02, 0.02, 0.27]])
+    venv = rb.make_vec("TrunkReach-v0", rb.Model(long), n=1, options=rb.TrainingOptions(goals=GOALS))
     venv.reset()
     assert 0.25 <= venv.episodes.goal[0, 2] <= 0.27
 
@@ -225,7 +225,8 @@ def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, word
 
 def test_the_model_in_memory_makes_environments() -> None:
     model = rb.Model("trunk_sofa", simulator=SINGLE, fixed={"young_modulus": 4e6})
-    venv = rb.make_vec("TrunkReach-v0", model, n=3, observation="markers", start={"trunk_mass": [0.3, 0.4]})
+    options = rb.TrainingOptions(observation="markers", start={"trunk_mass": [0.3, 0.4]})
+    venv = rb.make_vec("TrunkReach-v0", model, options, n=3)
     venv.seed(0)
     assert venv.reset().shape == (3, 3 * 4 + 3 + 8 + 3 * 4)
     drawn = [info["parameters"] for info in venv.reset_infos]
@@ -239,11 +240,11 @@ def test_the_model_in_memory_makes_environments() -> None:
 def test_a_posterior_beside_another_randomisation_is_refused(tmp_path) -> None:
     """It would take the place of the ranges without a word."""
     model = rb.Model("trunk_sofa", simulator=SINGLE)
-    ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
+    ranges = rb.TrainingOptions(randomisation="uniform", ranges={"young_modulus": [4e6, 5e6]})
     with pytest.raises(InputError, match="a calibration was given, and randomisation = 'uniform'"):
-        rb.make_vec("TrunkReach-v0", model, fit=tmp_path, **ranges)
+        rb.make_vec("TrunkReach-v0", model, ranges, fit=tmp_path)
     with pytest.raises(InputError, match=r"posterior\.nc"):  # which is looked for where the two agree
-        rb.make_vec("TrunkReach-v0", model, fit=tmp_path, randomisation="posterior")
+        rb.make_vec("TrunkReach-v0", model, rb.TrainingOptions(randomisation="posterior"), fit=tmp_path)
 
 
 @pytest.mark.slow
@@ -254,11 +255,12 @@ def test_same_seed_same_curve_from_python(tmp_path) -> None:
     ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
     runs = {}
     for name, seed in (("first", 0), ("again", 0), ("other", 1)):
-        curve = rb.train(model, tmp_path / name, seed=seed, **options, **ranges)["curve"]
+        curve = rb.train(model, tmp_path / name, rb.TrainingOptions(**options, **ranges), seed=seed)["curve"]
         runs[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in curve]
     assert runs["first"] == runs["again"] != runs["other"]
     twins = [tmp_path / "first", tmp_path / "again"]
-    found = rb.evaluate(model, twins, tmp_path / "test", episodes=4, film=False, **ranges)["policies"]
+    drawn = rb.TrainingOptions(**ranges)
+    found = rb.evaluate(model, twins, tmp_path / "test", drawn, episodes=4, film=False)["policies"]
     assert found["first"] == found["again"]
     assert (tmp_path / "test" / "episodes.csv").exists()
 
@@ -274,11 +276,17 @@ def test_policies_whose_folders_are_called_the_same_are_told_apart(tmp_path) -> 
         rb.evaluate(rb.Model.read(REACH), [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)
 
 
+def held_at(name, value):
+    return {"parameter": ParameterInfo(name, "-").as_dict(), "value": value}
+
+
 def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
     """Its draws, or its phi, explain the data with these values, and not with nominal ones."""
     held = {"trunk_mass": 0.31, "observation_noise": 1e-3}
     modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
-    record = PosteriorRecord((modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: held})
+    record = PosteriorRecord(
+        (modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: [held_at(*each) for each in held.items()]}
+    )
     record.save(tmp_path / "posterior.nc")
     normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
     (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"young_modulus": normal}}))
@@ -310,9 +318,11 @@ def test_a_posterior_whose_law_the_simulator_lacks_is_refused(tmp_path) -> None:
     """A law is no mechanism of the library, and its effect would be left out without a word."""
     term = {"coefficient": "creep", "feature": "low_pass", "commands": ["own"], "shape": 0.3, "scale": 0.1}
     law = {"port": "every cable", "terms": [{**term, "shape_parameter": "creep_time"}]}
-    names = ("young_modulus", "creep", "creep_time", "observation_noise", "offset_x@monday", "cube_mass")
+    names = ("young_modulus", "creep", "creep_time", "observation_noise", "cube_mass")
     draws = {name: np.full((1, 3), 0.4) for name in names} | {"young_modulus": np.full((1, 3), 2e6)}
-    record = PosteriorRecord(tuple(ParameterInfo(name, "-") for name in names), draws)
+    offset = ParameterInfo("offset_x", "m", scope=Scope("monday"))
+    infos = (*(ParameterInfo(name, "-") for name in names), offset)
+    record = PosteriorRecord(infos, {**draws, offset.name: np.zeros((1, 3))})
     record.save(tmp_path / "posterior.nc")
     normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
     (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"young_modulus": normal}}))

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Channel, Seen
-from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import whole
+from rfdropo_bayes.posteriors import ParameterInfo, label
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
@@ -27,7 +27,7 @@ class Weighed(NamedTuple):
 
     Attributes:
         parameters: names; their sum was measured.
-        value: in their unit.
+        value: measured value in their unit.
         sd: its standard deviation.
     """
 
@@ -43,7 +43,7 @@ class WeighedParts(Channel):
     name: ClassVar[str] = "weighed"
     entries: tuple[Weighed, ...]
 
-    def named(self, names: Sequence[str]) -> WeighedParts:
+    def named(self, inferred: Sequence[ParameterInfo]) -> WeighedParts:
         """The same, each parameter by the name under which it is inferred.
 
         The whole recording's name stands for its only piece: ``payload_mass@a`` for ``payload_mass@a[0:99]``.
@@ -52,7 +52,7 @@ class WeighedParts(Channel):
             InputError: a part that is no inferred parameter, or one of several.
         """
         entries = (
-            entry._replace(parameters=tuple(_found(p, names) for p in entry.parameters)) for entry in self.entries
+            entry._replace(parameters=tuple(_found(p, inferred) for p in entry.parameters)) for entry in self.entries
         )
         return replace(self, entries=tuple(entries))
 
@@ -87,9 +87,10 @@ class WeighedParts(Channel):
         return self._sums(seen.values) + self._sd * jax.random.normal(key, (len(self.entries),))
 
 
-def _found(name: str, names: Sequence[str]) -> str:
-    """The one of ``names`` that is meant."""
-    pieces = [known for known in names if SEPARATOR in known and whole(known) == name]
+def _found(name: str, inferred: Sequence[ParameterInfo]) -> str:
+    """The label of the inferred parameter that is meant."""
+    names = [p.name for p in inferred]
+    pieces = [p.name for p in inferred if p.scope.owner and label(p.parameter, whole(p.scope.owner)) == name]
     if name in names or len(pieces) == 1:
         return name if name in names else pieces[0]
     what = f"several pieces of {name!r} are fitted" if pieces else f"{name!r} was weighed but is not inferred"

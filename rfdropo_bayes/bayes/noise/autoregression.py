@@ -2,7 +2,7 @@
 
 Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
 predicted from the min(k, p) rows before it (Levinson-Durbin). Noise shared by columns, such as from a shaking mount,
-has the same memory as the rest (a separable covariance); across a gap in some of the columns alone its whitening is
+has the memory of the other columns (a separable covariance); across a gap in some of the columns alone its whitening is
 approximate.
 
 Memory is defined in seconds, not in rows: in recordings of another rate each row is predicted under the autocorrelation
@@ -27,6 +27,7 @@ from rfdropo_bayes.data.sample_times import ONE_RATE
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
+INNOVATIONS = "innovations"  # white: the size of slow residuals that the rows before do not predict
 MISFIT = "misfit"  # white, of the size of a misspecified model's residuals
 SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
@@ -65,7 +66,14 @@ class Autoregression:
     @property
     def doubtful(self) -> bool:
         """Whether it was taken from residuals of a model that change more slowly than the noise of a measurement."""
-        return self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
+        slow = self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
+        return slow or self.source == INNOVATIONS
+
+    @property
+    def unpredicted(self) -> Autoregression:
+        """White noise with the size of the innovations."""
+        scale = self.scale * float(self.predictors[1][-1])
+        return replace(self, scale=scale, autocorrelation=np.ones(1), source=INNOVATIONS, correlation=None)
 
     def of_columns(self, columns: Sequence[int]) -> Autoregression:
         """The noise of some columns."""
@@ -109,7 +117,7 @@ class Autoregression:
             given["source"],
             np.inf if freedom is None else freedom,
             None if across is None else np.array(across),
-            given.get("step"),  # earlier versions do not say
+            given.get("step"),  # missing in earlier versions
         )
 
     @cached_property

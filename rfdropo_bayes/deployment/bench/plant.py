@@ -57,8 +57,8 @@ class SpringCables:
     """Each cable a spring under pretension; markers lean towards the cables that are pulled, without inertia.
 
     Tension is ``max(0, pretension + stiffness x length)``. The marker at height z above the base moves across by ``lean
-    x (z / z_tip)^2 x`` the sum of the pulls times the directions of their cables. Closed forms, so that tests know
-    every number; use a simulated trunk if the motion matters.
+    x (z / z_tip)^2 x`` the sum of the pulls times the directions of their cables. Tests compute the closed forms; use a
+    simulated trunk if the motion matters.
 
     Args:
         robot: gives channels, cables and markers.
@@ -103,7 +103,7 @@ class PlantHere:
     """A plant in this process.
 
     Args:
-        plant: that is asked.
+        plant: plant to query.
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -126,7 +126,7 @@ class PlantProcess:
     A plant slower than real time lags behind; ``late`` says by how much.
 
     Args:
-        name, robot, settings: as for `build_plant`; called in the new process.
+        name, robot, settings: see `build_plant`; called in the new process.
     """
 
     def __init__(self, name: str, robot: Robot, settings: Mapping[str, Any] | None = None) -> None:

@@ -84,13 +84,13 @@ class StrictServer(SdoServer):
             self._running = REQUEST_SEGMENT_UPLOAD
 
     def segmented_upload(self, command: int) -> None:
-        """Go on with it."""
+        """Send the next segment."""
         super().segmented_upload(command)
         if not self._buffer:
             self._running = None
 
     def init_download(self, request: bytearray) -> None:
-        """Begin a download."""
+        """Begin a download; SdoAbortedError if the object is read-only."""
         index, subindex = struct.unpack_from("<HB", request, 1)
         variable = self._node.variable(index, subindex)
         if not variable.writable:
@@ -106,7 +106,7 @@ class StrictServer(SdoServer):
         super().init_download(request)
 
     def segmented_download(self, command: int, request: bytearray) -> None:
-        """Go on with it."""
+        """Take the next segment; SdoAbortedError if the length differs from the announced length."""
         size = len(self._buffer or b"") + 7 - (command >> 1 & 7)
         beyond = self._announced is not None and size > self._announced
         if beyond or (command & NO_MORE_DATA and self._announced not in (None, size)):

@@ -44,7 +44,7 @@ class SimulationTable(NamedTuple):
     Attributes:
         robot: name or path of a robot with motors.
         bus: the bus that the drives are on.
-        plant, settings: as for `build_plant`.
+        plant, settings: see `build_plant`.
         own_process: whether the plant runs in a process of its own.
         markers: "HOST:PORT" that markers are sent to; empty for none.
         encoder_offset: counts that every encoder shows at length zero, less the motor's own offset.

@@ -40,7 +40,7 @@ class SimulatedDrive:
     """One axis.
 
     Args:
-        node: that it is part of.
+        node: node of the axis.
         axis: its number, from 1.
         position: counts at power-on.
     """

@@ -1,7 +1,7 @@
 """Effects of the body in SIMD lanes: laws of the section, Prony branch, softening, fluid, wall and stretching cables.
 
-The physics is that of ``fem.bending_law``, ``fem.surroundings`` and ``fem.dynamics``. What a batch does not have is
-skipped by flags that are the same for all lanes; cables and softening are a few operations a step, and always there.
+The physics follows ``fem.bending_law``, ``fem.surroundings`` and ``fem.dynamics``. Absent effects are skipped by flags
+that are the same for all lanes; cables and softening cost little and are always computed.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from rfdropo_bayes.fem.sections import LEAST_TANGENT
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
-"""Flags in ``samples.present``; the last one is Coulomb's friction, that of the capstan follows it."""
+"""Flags in ``samples.present``; the last is Coulomb's friction, followed by the capstan's."""
 LOADED = FRICTION + 2
-"""Flag of what acts on the body from step to step, see ``fem.section_loads``."""
+"""Flag of loads that change from step to step, see ``fem.section_loads``."""
 FLAGS = LOADED + 1
 (
     GAIN, SHARE, DECAY, LATER_DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN, FIBRE,
 ) = range(13)  # fmt: skip
-"""Rows of ``samples.effects``; gain and share are those of a stage, decay that of the moduli in each stage."""
+"""Rows of ``samples.effects``; gain and share belong to a stage, decay to the moduli in each stage."""
 EFFECTS = FIBRE + 1
 LAW = 6
 """Rows of ``samples.law`` for each element, added to its stiffness in bending and twist: 00, 01, 02, 11, 12, 22."""
@@ -47,7 +47,7 @@ def find_slopes(tables, samples, element, work, token):
 
 @kernel
 def _left(tables, samples, element, work, token):
-    """What the stretch leaves of the bending stiffness, by the law of fibres."""
+    """Remaining share of the bending stiffness under stretch, by the law of fibres."""
     steep = load(samples.effects, FIBRE, token) * (3.0 / tables.length[element])
     return fnma(steep, load(work.element, STRAIN + 2, token), fill(1.0, work.element, token))
 
@@ -79,7 +79,7 @@ def place_law_stress(tables, samples, element, force, rate, work, token):
 
 @kernel
 def add_branch(samples, factors, element, work, token):
-    """Add to the stresses what the Prony branch of an element makes of its strain."""
+    """Add the stress of an element's Prony branch."""
     rows, section, b, gain = work.element, SECTION * element, SIZE * element, load(factors.branch, 0, token)
     for i in range(3):
         stiffness = gain * load(samples.section, section + (0 if i < 2 else 1), token)
@@ -108,7 +108,7 @@ def follow_branch(factors, element, work, token):
 def add_surroundings(tables, samples, factors, station, predicted, work, token):
     """Add the wall and the fluid of a station to ``field`` and to its pivot.
 
-    ``predicted``: the wall is met where the position is, and the fluid with the derivative of the speed.
+    ``predicted``: the wall acts at the position itself, and the fluid with the derivative of the speed.
     """
     zero, row = fill(0.0, work.field, token), SIZE * station
     x, y, _ = load3(work.frame, FRAME * station, token)

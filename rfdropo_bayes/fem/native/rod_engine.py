@@ -121,7 +121,7 @@ class NativeRod:
         threads: lane blocks computed at the same time; None for all processors this process may use.
         lanes: samples side by side; None for the width of a vector register.
         scene: geometry on which the body pushes a cube; None for a body that touches nothing.
-        integrator: how a step is taken; with "quasi-static" every step is a row at rest, and the time step is not
+        integrator: scheme of a step; with "quasi-static" every step is a row at rest, and the time step is not
             used.
 
     Raises:

@@ -65,7 +65,7 @@ class Factors(NamedTuple):
     branch: Float[np.ndarray, "1 lanes"]  # of the elastic force of the Prony branch
     share: Float[np.ndarray, "1 lanes"]  # of its strain that its dashpot follows
     give: Float[np.ndarray, "1 lanes"]  # of a cable's length per impulse, over the time step
-    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in units of the other stage's
     narrow: Float[np.ndarray, "1 lanes"]  # its inverse
     going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
 
@@ -94,8 +94,8 @@ class RodWork(NamedTuple):
     slack: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
-    unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the impulses of the last step were not found
-    accepted: Float[np.ndarray, "1 lanes"]  # 1 where the last step was taken
+    unsolved: Float[np.ndarray, "1 lanes"]  # 1 if the impulses of the last step were not found
+    accepted: Float[np.ndarray, "1 lanes"]  # 1 if the last step was accepted
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses, or an equilibrium, were not found
     points: Float[np.ndarray, "point_values lanes"]
@@ -105,7 +105,7 @@ class RodWork(NamedTuple):
     largest: Float[np.ndarray, "1 lanes"]  # increment of the static iteration before [m]
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]
-    softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
+    softness: Float[np.ndarray, "1 lanes"]  # remaining share of the moduli after the time
     firmness: Float[np.ndarray, "1 lanes"]  # factor on the stiffness in a step, and on the damping
     loss: Float[np.ndarray, "1 lanes"]
     pushed: Float[np.ndarray, "stations3 lanes"]  # forces on the sections in a step [N]

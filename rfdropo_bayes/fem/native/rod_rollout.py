@@ -1,4 +1,4 @@
-"""Rollouts of a rod: one lane block from its parameters to the recorded motion, or on from where it stands."""
+"""Rollouts of a rod: one lane block from its parameters to the recorded motion, or continued from its state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, k
 from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
 
 ROW_ITERATIONS = 30
-"""Of a row of a quasi-static motion, at most."""
+"""Most iterations of a row of quasi-static motion."""
 
 
 class Batch(NamedTuple):
@@ -45,26 +45,24 @@ class Batch(NamedTuple):
     law: Float[np.ndarray, "batch element_rows"]
     effects: Float[np.ndarray, "batch rows"]
     present: Int[np.ndarray, " flags"]
-    start: Float[np.ndarray, "rows cables"]  # displacements before the first step, those of the initial equilibrium
+    start: Float[np.ndarray, "rows cables"]  # displacements before the first step, of the initial equilibrium
     displacement: Float[np.ndarray, "rows steps cables"]
     loads: Float[np.ndarray, "rows values"]  # forces at the places, two factors and gravity, of each step
     place: Int[np.ndarray, " places"]  # stations that forces act on
     places: int
     count: int
-    start_pitch: int  # from one row to the next, 0 where one serves all
+    start_pitch: int  # from one row to the next, 0 if a single row serves all
     displacement_pitch: int
     loads_pitch: int
 
 
 class RodOutput(NamedTuple):
-    """What a batch returns; recorded row 0 is the initial state."""
+    """Output of a batch; recorded row 0 is the initial state."""
 
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
-    converged: UInt8[
-        np.ndarray, " batch"
-    ]  # 0 where the impulses of a step, or the equilibrium of a row, were not found
+    converged: UInt8[np.ndarray, " batch"]  # 0 if the impulses of a step, or the equilibrium of a row, were not found
     imbalance: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium
     solves: Float[np.ndarray, " batch"]  # of the equilibria of all rows
     records: int
@@ -161,7 +159,7 @@ def start_rollouts(tables, batch, samples, work, first, token):
 
 @kernel
 def take_loads(batch, samples, work, row, first, token):
-    """What acts on the body in a step: forces on sections, factors on stiffness and damping, and gravity."""
+    """Load the forces of a step: forces on sections, factors on stiffness and damping, and gravity."""
     if samples.present[LOADED]:
         pitch, count, forces = batch.loads_pitch, batch.count, 3 * batch.places
         at = row * (forces + 5)
@@ -198,7 +196,7 @@ def _follow_branches(tables, factors, work, token):
 
 @kernel
 def _take_commands(tables, batch, work, step, share, first, token):
-    """Commands at the end of a stage: a share of the way from those before to those of the step."""
+    """Commands at the end of a stage: interpolated between the previous and the present step."""
     pitch, offset, cables = batch.displacement_pitch, step * tables.cables, tables.cables
     if share < 1.0:
         fill_lanes(batch.displacement, pitch, offset, cables, first, batch.count, work.slack, token)
@@ -211,7 +209,7 @@ def _take_commands(tables, batch, work, step, share, first, token):
 
 @kernel
 def begin_stage(tables, batch, samples, factors, work, touch, schedule, step, number, first, token):
-    """Factors and commands of a stage, and the place where its forces are taken."""
+    """Factors and commands of a stage, and the position at which its forces are taken."""
     stage = schedule.stages[number]
     if number == 0:
         take_loads(batch, samples, work, step + 1, first, token)
@@ -254,7 +252,7 @@ def finish_rollouts(work, output, first, count, token):
 
 @kernel
 def settle(tables, runs, batch, samples, factors, work, friction, rows, p, schedule, first, token):
-    """Parameters and initial state of a block's rollouts: as given, or in equilibrium; none where they go on."""
+    """Parameters and initial state of a block's rollouts: as given, or in equilibrium; unchanged if they continue."""
     start_rollouts(tables, batch, samples, work, first, token)
     take_loads(batch, samples, work, 0, first, token)
     fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
@@ -270,7 +268,7 @@ def settle(tables, runs, batch, samples, factors, work, friction, rows, p, sched
 
 @kernel
 def take_row(tables, runs, batch, samples, factors, work, friction, rows, p, schedule, step, first, token):
-    """One row of a quasi-static motion: the equilibrium at its commands, found from the one before."""
+    """One row of a quasi-static motion: the equilibrium at its commands, found from the row before."""
     slips = 0
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
@@ -294,8 +292,8 @@ def begin_step(tables, batch, work, touch, schedule, output, poses, step, first,
 def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, names its cache.
 
-    ``runs`` with ``friction``, and ``scene`` with ``cubes``, ``touch`` and ``poses``, are None where cables do not rub
-    and where there is no cube: what is None is no part of the kernel that is compiled.
+    ``runs`` with ``friction``, and ``scene`` with ``cubes``, ``touch`` and ``poses``, are None without friction of
+    cables and without a cube: the compiled kernel then lacks these parts.
     """
 
     @whole

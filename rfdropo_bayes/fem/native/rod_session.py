@@ -70,7 +70,7 @@ class RodSession:
     """Lanes of one rod, each with its own parameters and its own time.
 
     Args:
-        engine: that computes rollouts of the body.
+        engine: engine of the body's rollouts.
         count: lanes.
 
     Attributes:
@@ -108,9 +108,9 @@ class RodSession:
             material: fields with one entry per row.
             start: cable displacements [m] whose static equilibrium is the initial state; None starts undeformed. An
                 equilibrium that was found before is not computed again.
-            before: as in `NativeRod.rollout`.
-            cube: of an engine with a scene, as in `NativeRod.rollout`.
-            loads: that act on the initial state, in one row. Lanes are always given some, or never.
+            before: see `NativeRod.rollout`.
+            cube: for an engine with a scene, see `NativeRod.rollout`.
+            loads: loads on the initial state, in one row. Lanes are always given loads, or never.
 
         Returns:
             The initial state, as a rollout of one row.

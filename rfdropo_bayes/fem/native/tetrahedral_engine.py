@@ -43,7 +43,7 @@ class TetrahedralEngine:
         dtype: ``numpy.float64`` or ``numpy.float32``.
         threads: number of lane blocks at a time; results do not depend on it.
         scene: geometry on which the body pushes a cube; None for a body that touches nothing.
-        integrator: how a step is taken; SOFA's drive limits, which apply per step, need "euler".
+        integrator: scheme of a step; SOFA's drive limits, which apply per step, need "euler".
     """
 
     def __init__(

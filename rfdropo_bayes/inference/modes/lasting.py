@@ -95,7 +95,7 @@ def lasting_series(
 
     Args:
         series: residuals, whitened by the likelihood.
-        valid: which of them were measured.
+        valid: mask of measured values.
         reach: change of fitted values per posterior deviation along orthonormal directions; zero for invalid entries.
         steps: time between rows of each recording [s].
     """

@@ -409,7 +409,7 @@ def _go_on(climbs: Climbs, horizon: int) -> Climbs:
     positions, density = climbs.positions, climbs.log_density
     if not np.isfinite(density).any():
         raise NoLikelihoodError(
-            f"no climb has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
+            f"no optimisation has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
             where="[inference]",
             remedy="look at the simulator's reports there, or allow more starts",
         )
@@ -520,7 +520,9 @@ def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start
 
 def _unfinished(converged: bool) -> list[Caution]:
     """A caution if the best optimisation has not converged."""
-    sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+    sentence = (
+        "the best optimisation had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+    )
     return [] if converged else [Caution(Code.CLIMB_UNFINISHED, sentence, grave=True)]
 
 

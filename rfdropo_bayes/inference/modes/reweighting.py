@@ -46,7 +46,7 @@ class Reweighted(NamedTuple):
         position: unconstrained.
         rows: log density of each data row at each of them; None for draws of the normals, which no rollout has seen.
         effective: number of independent draws that they are worth.
-        candidates: whose posterior density was computed.
+        candidates: number of candidates with a posterior density.
     """
 
     position: Float[np.ndarray, "draw d"]
@@ -68,13 +68,13 @@ def reweighted(
     """Draws from a mixture of approximations, as the exact posterior has them.
 
     Args:
-        problem: whose posterior it is.
+        problem: problem with this posterior.
         modes: normal approximations.
-        weights: of the mixture.
+        weights: weights of the mixture.
         candidates: number of rollouts, at most.
         key: random key.
         ledger: is charged; candidates without a likelihood are counted there.
-        count: of draws wanted.
+        count: number of draws.
         by_evidence: let the exact posterior decide between the optima, and not the weights.
 
     Returns:
@@ -118,7 +118,7 @@ def _batches(candidates: int) -> list[tuple[bool, int]]:
 def _by_share(
     by_mode: Float[np.ndarray, "n mode"], weights: Float[np.ndarray, " mode"], by_evidence: bool
 ) -> Float[np.ndarray, " n"]:
-    """Weights of candidates: each optimum gets its share of the mixture, or what the exact posterior gives it."""
+    """Weights of candidates: each optimum gets its share of the mixture, or its share under the exact posterior."""
     mass = by_mode.sum(axis=0)
     found = mass > 0.0
     share = mass[found] if by_evidence else weights[found]

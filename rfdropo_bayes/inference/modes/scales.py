@@ -33,7 +33,7 @@ class Mixed(NamedTuple):
     Attributes:
         scales: draws of the standard deviations.
         position: draws of the coordinates, given each.
-        log_evidence: with the scales integrated out.
+        log_evidence: log evidence with the scales integrated out.
     """
 
     scales: Float[np.ndarray, "draw scale"]
@@ -54,9 +54,9 @@ def integrate_scales(
     Args:
         mode: found with the standard deviations held.
         held: their values there.
-        members: of each, the coordinates whose prior is Normal(0, it).
+        members: coordinates of each scale whose prior is Normal(0, scale).
         log_prior: log density of the standard deviations' prior, for rows of them.
-        draws: to return.
+        draws: number of draws to return.
         key: random key.
     """
     owner = np.concatenate([np.full(len(m), j) for j, m in enumerate(members)])

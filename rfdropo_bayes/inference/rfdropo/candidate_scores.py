@@ -1,4 +1,4 @@
-"""How well a distribution explains a trajectory.
+"""Score of a trajectory under a distribution.
 
 Eq. 2 and 3 of RF-DROPO: at every time step a Gaussian with the mean and covariance of rollouts drawn from it.
 """
@@ -108,7 +108,7 @@ def step_log_likelihood(
         alive: rollouts that ended well; at least two.
         observed: the trajectory, in the units of the features.
         mask: observed entries that count.
-        variance_floor: in squared units of the features; a scalar, or one value per feature.
+        variance_floor: floor of the variance in squared units of the features; a scalar, or one value per feature.
     """
     good = features[alive]
     mean = good.mean(axis=0)

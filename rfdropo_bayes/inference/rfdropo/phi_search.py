@@ -314,7 +314,7 @@ def paper_horizon(iteration: int, iterations: int, n_rows: int, *, mended: bool 
         iteration: i, from 0 to K.
         iterations: K, the number of iterations.
         n_rows: n, rows of data.
-        mended: as published the last horizon is 99 of 100 rows, so that the whole recording is never looked at;
+        mended: False for the published horizons, which end at 99 of 100 rows and never use the whole recording;
             mended, the curve is stretched by 1 / 0.99 and ends at n when ``i = K - 1``.
     """
     if not mended:
@@ -344,7 +344,10 @@ def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: 
         high: upper edge of the box.
         sigma: initial step, as a share of the box.
         population: candidates per generation.
-        seed: of its random numbers.
+        seed: seed of its random numbers.
+
+    Raises:
+        InputError: an unknown name.
     """
     if name == "cma":
         return CovarianceAdaptation(d, high, sigma * high, population, seed)
@@ -357,7 +360,7 @@ class CrossEntropy:
     """Cross-entropy method: refit a diagonal normal to the best candidates of each generation.
 
     Args:
-        d, high, sigma, population, seed: as in `make_optimiser`, sigma in the box's units.
+        d, high, sigma, population, seed: see `make_optimiser`, sigma in the box's units.
         elite: share of the candidates that the refit uses.
         smoothing: weight of the new fit; the old fit keeps the rest, which prevents collapse of the spread.
     """

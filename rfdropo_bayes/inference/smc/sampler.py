@@ -122,14 +122,14 @@ class ReplicatePlan(NamedTuple):
 
 
 class SmcState(NamedTuple):
-    """Everything a replicate needs to go on.
+    """State of a replicate between two stages.
 
     Attributes:
         population: particles; their rows reach to the end of the present block.
         block: index of the present block; -1 before the first.
         stage: number of stages done; random keys derive from it.
         log_evidence: log p(rows passed).
-        prefix_log_evidence: at every prefix passed, NaN elsewhere.
+        prefix_log_evidence: log evidence at every prefix passed, NaN elsewhere.
         ledger: cost and exclusions.
         trace: one dictionary per stage.
         seconds: time spent.
@@ -182,9 +182,12 @@ def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
 
 
 def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan, config: SmcConfig) -> SmcState:
-    """Prior draws, no rollouts yet.
+    """Prior draws, before any rollout.
 
-    Draws that their coordinates cannot hold keep their share of the prior, without weight.
+    Draws outside the range of their coordinates keep their share of the prior, with weight zero.
+
+    Raises:
+        InputError: no draw has a finite prior density.
     """
     n = plan.particles
     u, base, drawn = representable_draws(problem, key, n)
@@ -210,8 +213,8 @@ def step(
 
     Args:
         key: key of the whole replicate; the stage's own is derived from it, which makes a resumed run exact.
-        state: of the replicate.
-        problem: to be sampled.
+        state: state of the replicate.
+        problem: problem to sample.
         plan: sizes.
         config: settings.
     """

@@ -233,8 +233,8 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
     About log scales of noise, m residuals hold the information 2 m.
 
     Args:
-        problem: to be sampled.
-        config: of the sampler.
+        problem: problem to sample.
+        config: settings of the sampler.
         key: random key.
         ledger: is charged.
 

@@ -80,7 +80,7 @@ def MuJoCo(
             number of a keyframe.
         time_step: time step [s]; by default from the file.
         command_unit: unit of the commands; by default from the actuators' targets, "-" if these differ.
-        name: for reports; the model's own by default.
+        name: name in reports; the model's own by default.
         lanes: number of parameter sets simulated at once.
         threads: number of threads; one per processor by default.
         difference: see `BlackBox`.
@@ -122,7 +122,7 @@ def MuJoCo(
         batched=True,
         lanes=lanes,
         difference=difference,
-        stroke=rollouts.stroke,
+        usual_command=rollouts.usual_command,
         families=families,
         limits=rollouts.limits,
     )
@@ -141,7 +141,7 @@ def _read(path: Path) -> Any:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise InputError(f"MuJoCo cannot read it: {error}", where=str(path), remedy="mend the file") from None
+        raise InputError(f"MuJoCo cannot read it: {error}", where=str(path), remedy="correct the file") from None
 
 
 def _markers(spec: Any, markers: Mapping[str, str] | Sequence[str] | None) -> dict[str, tuple[str, str]]:
@@ -203,13 +203,13 @@ class MuJoCoRollouts:
         channels: actuators that are commanded.
         start: see `MuJoCo`.
         threads: see `MuJoCo`.
-        path: of the file that it was read from.
+        path: path of its source file.
 
     Attributes:
-        spec: as it was read.
+        spec: unchanged specification of the file.
         model: compiled, with sensors of the markers and cables.
         channels: number of the actuator's command in ``ctrl``, by channel.
-        edits: how each parameter changes the model, by name.
+        edits: effect of each parameter on the model, by name.
         first: state, and ``ctrl``, before anything settles.
 
     Raises:
@@ -306,7 +306,7 @@ class MuJoCoRollouts:
         return ("N m" if turning else "N") if plain and np.isclose(gain * gear, 1.0) else "-"
 
     @property
-    def stroke(self) -> float:
+    def usual_command(self) -> float:
         """Size of usual commands: half the mean of their ranges, 1 without ranges."""
         ranges = [np.ptp(self.model.actuator_ctrlrange[k]) for k in self.actuators.values()]
         return 0.5 * float(np.mean([r if r > 0.0 else 2.0 for r in ranges]))
@@ -357,7 +357,7 @@ class MuJoCoRollouts:
         ctrl = np.tile(self.first[1], (*commands.shape[:2], 1))
         ctrl[:, :, list(self.channels.values())] = commands
         state, found = self.begun(models, ctrl[:, 0])
-        # MuJoCo's sensors tell of the state before a step: one step more than rows shows the last row.
+        # MuJoCo's sensors refer to the state before a step: one step more than rows shows the last row.
         played = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
         states, sensed = self.rolled(models, state, played)
         found &= self._arrived(states[:, -1], len(commands[0]))
@@ -426,7 +426,7 @@ class MuJoCoRollouts:
         return MuJoCoLanes(self, count)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:
-        """Which rollouts went on to the end: MuJoCo stops the clock of one with a warning."""
+        """Mask of complete rollouts: MuJoCo stops the clock of one with a warning."""
         late = state[:, 0] - self.first[0][0] - steps * self.model.opt.timestep
         return (np.abs(late) < 0.5 * self.model.opt.timestep) & np.isfinite(state).all(axis=1)
 

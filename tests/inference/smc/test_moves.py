@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from rfdropo_bayes.bayes.pooling import Pooled
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.problem import ProblemDefaults
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.inference.smc.moves import Reference, StraightProblem, distinct_size, fit_reference, propose
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -70,7 +70,7 @@ class DaysApart(ProblemDefaults):
     """A zero that differs from day to day, with a spread that is inferred, and a stiffness that shows nowhere."""
 
     def __init__(self) -> None:
-        self.space = build_space(
+        self.space = build_scopes(
             (
                 ParameterSpec("zero", "m", -1.0, 1.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.3}, ""),
                 ParameterSpec("stiffness", "N/m", 1.0, 9.0, 2.0, {"distribution": "Uniform", "low": 1, "high": 9}, ""),

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.pooling import Pooled
-from rfdropo_bayes.bayes.space import build_space
+import rfdropo_bayes
+from rfdropo_bayes.bayes.inferred_parameter import Pooled
+from rfdropo_bayes.bayes.scopes import Scopes, build_scopes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups, group_of, in_group
+from rfdropo_bayes.posteriors import ParameterInfo
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPECS = (
@@ -23,7 +29,7 @@ SPECS = (
 
 
 def space():
-    return build_space(
+    return build_scopes(
         SPECS, {"young_modulus": {}, "poisson_ratio": {}, "offset_x": {}}, {"offset_x": ["a", "b"]}, ["a", "b", "c"]
     )
 
@@ -31,8 +37,8 @@ def space():
 def test_a_parameter_of_single_recordings_is_free_there_and_absent_elsewhere():
     values = space().sample(jax.random.key(0), 3)
     assert set(values) == {"young_modulus", "poisson_ratio", "offset_x@a", "offset_x@b"}
-    np.testing.assert_array_equal(space().for_recording(values, "b")["offset_x"], values["offset_x@b"])
-    assert "offset_x" not in space().for_recording(values, "c")
+    np.testing.assert_array_equal(space().values_in("b", values)["offset_x"], values["offset_x@b"])
+    assert space().values_in("c", values)["offset_x"] == 0.0  # the nominal one
 
 
 @pytest.mark.parametrize(
@@ -46,7 +52,7 @@ def test_a_parameter_of_single_recordings_is_free_there_and_absent_elsewhere():
     ],
 )
 def test_a_prior_ends_where_it_says_or_at_the_hard_bounds(prior, ends):
-    parameter = build_space(SPECS, {"young_modulus": prior}, {}, ["a"])["young_modulus"]
+    parameter = build_scopes(SPECS, {"young_modulus": prior}, {}, ["a"])["young_modulus"]
     np.testing.assert_allclose(parameter.ends, ends, rtol=1e-6)
     drawn = parameter.prior.sample(jax.random.key(2), (500,))
     assert np.all((drawn >= ends[0]) & (drawn <= ends[1]))
@@ -62,7 +68,7 @@ def test_a_prior_ends_where_it_says_or_at_the_hard_bounds(prior, ends):
 )
 def test_a_prior_without_ends_or_with_one_has_no_more(bounds, prior, ends):
     spec = ParameterSpec("p", "-", *bounds, 1.0, prior, "")
-    assert build_space((spec,), {"p": prior}, {}, ["a"])["p"].ends == ends
+    assert build_scopes((spec,), {"p": prior}, {}, ["a"])["p"].ends == ends
 
 
 def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobian():
@@ -82,7 +88,7 @@ def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobi
 def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_inside():
     """What it lacks, and what lies outside the support, comes from the prior; one value for all serves every one."""
     modulus = np.array([2e6, 3e6, 1e6, 9e9])  # the third on the bound, the fourth beyond it
-    earlier = {"young_modulus": modulus, "offset_x": 1e-9 * modulus, "offset_x@b": np.full(4, 0.02)}
+    earlier = {"young_modulus": {"": modulus}, "offset_x": {"": 1e-9 * modulus, "b": np.full(4, 0.02)}}
     values = space().sample_around(earlier, jax.random.key(3), 200)
     assert np.isfinite(space().to_unconstrained(values)).all()
     inside = np.isin(np.round(values["young_modulus"], 3), modulus)
@@ -91,7 +97,7 @@ def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_insid
     assert np.max(values["young_modulus"]) < 5e7
     np.testing.assert_allclose(values["offset_x@b"], 0.02, rtol=1e-12)
     assert len(np.unique(values["poisson_ratio"])) == 200
-    other = space().sample_around({"offset_x@elsewhere": np.full(4, 0.03)}, jax.random.key(3), 5)
+    other = space().sample_around({"offset_x": {"elsewhere": np.full(4, 0.03)}}, jax.random.key(3), 5)
     np.testing.assert_allclose(other["offset_x@a"], 0.03, rtol=1e-12)
 
 
@@ -106,7 +112,7 @@ def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_insid
 )
 def test_what_cannot_be_inferred_is_refused(priors, scopes, message):
     with pytest.raises(InputError, match=message):
-        build_space(SPECS, priors, scopes, ["a", "b", "c"])
+        build_scopes(SPECS, priors, scopes, ["a", "b", "c"])
 
 
 DAYS = {"january": ["a*"], "april": "b"}
@@ -114,7 +120,7 @@ DAYS = {"january": ["a*"], "april": "b"}
 
 def pooled_space(recordings=("a1", "a2", "b", "c")):
     pooled = {"offset_x": Pooled(0.002, gather_groups(recordings, DAYS))}
-    return build_space(SPECS, {"young_modulus": {}, "offset_x": {}}, {}, list(recordings), pooled=pooled)
+    return build_scopes(SPECS, {"young_modulus": {}, "offset_x": {}}, {}, list(recordings), pooled=pooled)
 
 
 def test_groups_of_recordings_deviate_from_what_all_share():
@@ -123,7 +129,7 @@ def test_groups_of_recordings_deviate_from_what_all_share():
     deviations = {f"offset_x_deviation@{group}" for group in ("january", "april", "c")}
     assert set(chosen.names) == {"young_modulus", "offset_x", *deviations}
     values = chosen.sample(jax.random.key(0), 4000)
-    own = {r: chosen.for_recording(values, r)["offset_x"] for r in ("a1", "a2", "b", "c")}
+    own = {r: chosen.values_in(r, values)["offset_x"] for r in ("a1", "a2", "b", "c")}
     np.testing.assert_array_equal(own["a1"], own["a2"])
     np.testing.assert_allclose(own["b"] - own["a1"], sum_of(values, "april") - sum_of(values, "january"), atol=1e-15)
     assert np.std(own["c"] - values["offset_x"]) == pytest.approx(0.002, rel=0.06)  # 5 standard errors
@@ -136,14 +142,14 @@ def sum_of(values, group):
 
 
 def test_a_climb_starts_from_a_group_s_own_deviation_and_from_no_other_s():
-    earlier = {"offset_x": np.full(3, 0.01), "offset_x_deviation@january": np.full(3, 0.001)}
+    earlier = {"offset_x": {"": np.full(3, 0.01)}, "offset_x_deviation": {"january": np.full(3, 0.001)}}
     values = pooled_space().sample_around(earlier, jax.random.key(1), 50)
     np.testing.assert_allclose(values["offset_x_deviation@january"], 0.001, rtol=1e-12)
     assert len(np.unique(values["offset_x_deviation@april"])) == 50
 
 
 def test_the_first_draw_around_an_earlier_posterior_is_its_first():
-    earlier = {"young_modulus": np.linspace(1.1e6, 2e6, 30), "offset_x": np.linspace(0.001, 0.01, 30)}
+    earlier = {"young_modulus": {"": np.linspace(1.1e6, 2e6, 30)}, "offset_x": {"": np.linspace(0.001, 0.01, 30)}}
     for seed in range(5):
         values = pooled_space().sample_around(earlier, jax.random.key(seed), 3)
         np.testing.assert_allclose(values["young_modulus"][0], 1.1e6)
@@ -170,16 +176,16 @@ def test_a_recording_is_moved_to_a_group_from_the_one_that_named_it():
 def test_what_cannot_be_pooled_is_refused():
     with pytest.raises(InputError, match="a1 is in two groups: january and winter"):
         gather_groups(["a1"], {**DAYS, "winter": "*1"})
-    with pytest.raises(InputError, match=r"about a value that all share.*name it under \[model.priors\], too"):
-        build_space(SPECS, {"young_modulus": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.1, {"april": ("b",)})})
+    with pytest.raises(InputError, match=r"about a value that all share.*also name it under \[model.priors\]"):
+        build_scopes(SPECS, {"young_modulus": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.1, {"april": ("b",)})})
     with pytest.raises(InputError, match="the spread between groups is 0"):
-        build_space(SPECS, {"offset_x": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.0, {"april": ("b",)})})
+        build_scopes(SPECS, {"offset_x": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.0, {"april": ("b",)})})
 
 
 def hierarchical(known=None):
     """Three groups' offsets about a shared one, their spread inferred, or known."""
     pooled = {"offset_x": Pooled(0.002, gather_groups(("a1", "b", "c"), DAYS), "offset")}
-    space = build_space(SPECS, {"offset_x": {}}, {}, ["a1", "b", "c"], pooled=pooled)
+    space = build_scopes(SPECS, {"offset_x": {}}, {}, ["a1", "b", "c"], pooled=pooled)
     return space if known is None else space.holding({"offset_spread": known})
 
 
@@ -201,3 +207,56 @@ def test_a_spread_between_groups_that_is_inferred_is_that_of_the_deviations():
     held = hierarchical(0.001)
     assert "offset_spread" not in held.names
     assert held["offset_x_deviation@c"].prior.scale == 0.001
+
+
+def every_kind():
+    """A shared parameter, one of each recording, one of one group alone, and one that is pooled."""
+    size = ParameterSpec("size", "-", 0.0, 9.0, 0.5, {"distribution": "HalfNormal", "scale": 1.0}, "")
+    recordings = ("a1", "b", "c")
+    pooled = {"offset_x": Pooled(0.002, gather_groups(recordings, DAYS), "offset")}
+    priors = {"young_modulus": {}, "poisson_ratio": {}, "offset_x": {}, "size": {}}
+    alone, only_in = {"poisson_ratio": ["a1", "b"]}, {"size": {"april": ("b",)}}
+    return build_scopes((*SPECS, size), priors, alone, recordings, pooled=pooled, only_in=only_in)
+
+
+def test_a_posterior_says_whose_each_parameter_is():
+    """Read back from its record, the parameters hold where they held: a group's in new recordings of the group."""
+    chosen = every_kind()
+    infos = [ParameterInfo.from_dict(json.loads(json.dumps(info.as_dict()))) for info in chosen.infos]
+    back = Scopes.read(infos, tuple(chosen.specs.values()), {})
+    assert back.names == chosen.names
+    values = {name: float(k) for k, name in enumerate(chosen.names, 1)}
+    new = back.extended(["a1[3:9]", "b2", "d"], ["a1", "b", "c"], {**DAYS, "april": "b*"})
+    assert new.like["size@april"] == ("size@april",)
+    assert new.like["poisson_ratio@a1[3:9]"] == ("poisson_ratio@a1",)
+    assert new.like["offset_x_deviation@d"] == ()
+    assert "poisson_ratio@d" not in new.scopes.names  # two of three fitted recordings had one
+    given = values | {"poisson_ratio@a1[3:9]": 0.3, "offset_x_deviation@d": 0.01}
+    piece, april, other = (new.scopes.values_in(name, given) for name in ("a1[3:9]", "b2", "d"))
+    assert (piece["poisson_ratio"], piece["size"], other["poisson_ratio"]) == (0.3, 0.5, 0.45)
+    assert (april["size"], other["size"]) == (values["size@april"], 0.5)
+
+
+def test_what_is_held_acts_where_it_did():
+    chosen = every_kind()
+    values = {name: float(column[0]) for name, column in chosen.sample(jax.random.key(0), 1).items()}
+    held = {name: values[name] for name in ("offset_x_deviation@january", "poisson_ratio@b", "young_modulus")}
+    rest = {name: value for name, value in values.items() if name not in held}
+    for recording in ("a1", "b", "c"):
+        assert chosen.holding(held).values_in(recording, rest) == chosen.values_in(recording, values)
+
+
+def test_a_parameter_that_the_model_lacks_is_refused():
+    with pytest.raises(InputError, match="holds 'size', which the experiment's model lacks"):
+        Scopes.read(every_kind().infos, SPECS, {})
+
+
+def test_no_label_is_taken_apart():
+    """The structure of parameters is in `Scope`; text that knows the sign is text for people."""
+    package = Path(rfdropo_bayes.__file__).parent
+    found = {
+        p.name
+        for p in package.rglob("*.py")
+        if re.search(r"""(split|partition|in)\W{1,2}["']@["']""", p.read_text("utf-8"))
+    }
+    assert found == set()

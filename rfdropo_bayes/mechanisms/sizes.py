@@ -1,0 +1,75 @@
+"""One rule for sizes of mechanisms: numbers of a usual trunk, scaled to a robot by the dimension of their unit.
+
+A play of half a millimetre is much for a robot that pulls eight, and nothing for a robot that pulls eighty. So lengths
+of cable scale with the pull of usual commands, other lengths with the body's length, masses with the body's mass, and
+forces with the tension that bends the body by a usual pull, ``E I pull / (length radius^2)``. Times, angles and
+ratios stay, and so does the density of a fluid around the body.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+
+class Scales(NamedTuple):
+    """Sizes that mechanisms are measured by."""
+
+    pull: float  # of a cable under a usual command [m]
+    length: float  # of the body [m]
+    mass: float  # of the body [kg]
+    force: float  # tension that bends the body by a usual pull [N]
+
+
+USUAL = Scales(pull=0.03, length=0.2, mass=0.2, force=40.0)
+"""A silicone trunk, for which the library's numbers are given."""
+POWERS: dict[str, Scales] = {
+    "m": Scales(0, 1, 0, 0),
+    "m/s": Scales(0, 1, 0, 0),
+    "kg": Scales(0, 0, 1, 0),
+    "N": Scales(0, 0, 0, 1),
+    "m/N": Scales(1, 0, 0, -1),
+    "N/m2": Scales(0, -2, 0, 1),
+}
+"""Powers of the scales in the units of mechanisms of bodies and cameras."""
+WITH_UNIT = ("loc", "scale", "median", "low", "high")
+"""Entries of a prior's table that have the parameter's unit."""
+
+
+def scales_of(robot: Robot) -> Scales:
+    """Scales of a robot at nominal parameters."""
+    nominal = robot.nominal()
+    rigidity = nominal["young_modulus"] * float(np.mean(robot.body.bending_moment_area_m4))
+    arm = float(np.mean([np.hypot(*guides[:, :2].T).mean() for guides in robot.guides()]))
+    if robot.held_by_force:
+        force = robot.usual_command * float(np.abs(np.asarray(robot.channel_matrix(nominal))).max())
+        pull = force * robot.length * arm**2 / rigidity
+    else:
+        pull = robot.usual_command * float(np.abs(np.asarray(robot.channel_matrix(nominal))).max())
+        force = rigidity * pull / (robot.length * arm**2)
+    return Scales(pull, robot.length, nominal["trunk_mass"], force)
+
+
+def scaled(spec: ParameterSpec, factor: float) -> ParameterSpec:
+    """A parameter with all that has its unit multiplied by a factor."""
+    prior: dict[str, Any] = {name: factor * v if name in WITH_UNIT else v for name, v in spec.prior.items()}
+    return spec._replace(
+        low=factor * spec.low,
+        high=factor * spec.high,
+        nominal=factor * spec.nominal,
+        prior=prior,
+        grid=tuple(factor * value for value in spec.grid),
+    )
+
+
+def sized(spec: ParameterSpec, scales: Scales) -> ParameterSpec:
+    """A parameter of a body's or a camera's mechanism, given for a usual trunk, in the sizes of a robot."""
+    powers = POWERS.get(spec.unit)
+    if powers is None:
+        return spec
+    ratios = np.array(scales) / np.array(USUAL)
+    return scaled(spec, float(np.prod(ratios ** np.array(powers))))

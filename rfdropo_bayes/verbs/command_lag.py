@@ -1,0 +1,126 @@
+"""Delay of markers behind the commands of their rows, from residuals of quadratic maps of the commands, without a
+model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.data.sample_times import sample_time
+
+DELAYS = (0.0, 0.1, 0.2, 0.4)
+"""[s] of a motion after its commands."""
+MOST_ROWS = 2000
+"""Rows of a recording that are used."""
+RIDGE = 1e-6
+"""Ridge penalty of the maps, as a share of the mean square of their features."""
+CLEARLY = 0.9
+"""Ratio of the root mean square residuals of two maps below which the better map is reported."""
+
+
+class Left(NamedTuple):
+    """Residual of the markers' motion after a quadratic map of the commands.
+
+    Attributes:
+        rows: rows by which the commands precede the markers; 0 is the same row.
+        error: root mean square residual [m].
+    """
+
+    rows: int
+    error: float
+
+
+def left_by_rows(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)) -> list[Left]:
+    """Residuals if each row shows the effect of the command some rows before, for each lag."""
+    return [Left(lag, _left([(own, _shifted(sent, lag)) for own, sent in _series(runs)])) for lag in lags]
+
+
+def best_delay(runs: Sequence[Trajectory]) -> float:
+    """Delay [s] of the markers behind the commands at which a quadratic map fits best."""
+    step = sample_time(*(run.time for run in runs))
+    delays = sorted({*DELAYS, step})
+    left = [
+        _left([(_positions(run)[:MOST_ROWS], run.command_at(run.time - d)[:MOST_ROWS]) for run in runs]) for d in delays
+    ]
+    return delays[int(np.argmin(left))]
+
+
+def _series(runs: Sequence[Trajectory]) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(_positions(run)[:MOST_ROWS], run.command_at(run.time)[:MOST_ROWS]) for run in runs]
+
+
+def _positions(run: Trajectory) -> Float[np.ndarray, "row coordinate"]:
+    seen = np.where(run.position_mask[..., None], run.position, np.nan)
+    return seen.reshape(len(run.time), -1)
+
+
+def _shifted(command: Float[np.ndarray, "row channel"], lag: int) -> Float[np.ndarray, "row channel"]:
+    """Commands of another row, NaN beyond the ends."""
+    moved = np.full(command.shape, np.nan)
+    rows = np.arange(len(command)) - lag
+    inside = (rows >= 0) & (rows < len(command))
+    moved[inside] = command[rows[inside]]
+    return moved
+
+
+def _left(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Residual of a single map for all recordings, with a separate mean per recording."""
+    parts = []
+    for position, command in series:
+        whole = np.isfinite(position).all(axis=1) & np.isfinite(command).all(axis=1)
+        if whole.sum() > 1:
+            features = _quadratic(command[whole])
+            parts.append((features - features.mean(axis=0), position[whole] - position[whole].mean(axis=0)))
+    if not parts:
+        return np.inf
+    features, motion = (np.concatenate(each) for each in zip(*parts, strict=True))
+    gram = features.T @ features
+    ridge = RIDGE * np.trace(gram) / len(gram) + 1e-300
+    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), features.T @ motion)
+    free = max(len(motion) - np.linalg.matrix_rank(features), 1)
+    return float(np.sqrt(np.sum((motion - features @ weights) ** 2) / free))
+
+
+def _quadratic(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row feature"]:
+    """Scaled commands, their positive parts, and the products of all pairs."""
+    size = np.sqrt(np.mean(command**2, axis=0))
+    scaled = command / np.where(size > 0.0, size, 1.0)
+    one, other = np.triu_indices(scaled.shape[1])
+    return np.concatenate([scaled, np.maximum(scaled, 0.0), scaled[:, one] * scaled[:, other]], axis=1)
+
+
+class LagWords(NamedTuple):
+    """The row of the command that a pose shows, in words; and a doubt if the simulation uses another row."""
+
+    words: str
+    doubt: str | None
+
+
+CLOCKS = "look at the clocks of commands and positions"
+REMEDIES = {
+    0: "commands_with_poses = true in [data.columns]: commands were measured with the pose, or poses are at rest",
+    1: "commands_with_poses = false in [data.columns]",
+}
+NAMES = {-1: "the next row", 0: "its own row", 1: "the row before", 2: "two rows before"}
+
+
+def lag_words(runs: Sequence[Trajectory], columns: CsvColumns | None) -> LagWords:
+    """Find the row of the command that poses at rest show."""
+    left = {each.rows: each.error for each in left_by_rows(runs)}
+    best = min(left, key=lambda rows: left[rows])
+    taken = 0 if columns is None or columns.commands_with_poses else 1
+    told = ", ".join(f"{NAMES[rows]} {1e3 * error:.3g}" for rows, error in left.items())
+    words = (
+        f"a pose follows the command of {NAMES[best]} best; the simulation takes that of {NAMES[taken]} (a quadratic "
+        f"map of the command leaves, in mm: {told})"
+    )
+    if left[best] >= CLEARLY * left[taken]:
+        return LagWords(words, None)
+    shares = f"{1e3 * left[best]:.3g} mm are left, by {NAMES[taken]} {1e3 * left[taken]:.3g} mm"
+    return LagWords(words, f"a pose follows the command of {NAMES[best]} ({shares}): {REMEDIES.get(best, CLOCKS)}")
