@@ -151,7 +151,7 @@ class TraceableProblem(Problem, Protocol):
 
 @runtime_checkable
 class WarmStart(Problem, Protocol):
-    """A problem that knows places to start from beside its prior.
+    """A problem with starting points beside its prior.
 
     Attributes:
         earlier: draws of an earlier posterior, by parameter and owner; empty without one.
@@ -273,7 +273,7 @@ class RolloutDefaults(ProblemDefaults):
     def noisy_rollouts(
         self: Any, key: PRNGKeyArray, values: Values
     ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
-        """The rollouts as they are."""
+        """The rollouts unchanged."""
         return self.rollouts(values, self.n_rows)
 
     def noise_deviation(self: Any, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:

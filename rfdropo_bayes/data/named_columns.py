@@ -1,7 +1,8 @@
 """The table [data.columns]: the meaning of each column of a table, and the recording read with it.
 
 Timing. The command in row k is in force from the time of row k until the time of row k + 1, as for a loop that measures
-and then commands; `first_command` finds the command before row 0. Commands may stand in a table of their own, with n or
+and then commands; `first_command` finds the command before row 0. With `CsvColumns.commands_with_poses` it is in force
+from half-way after row k - 1 on, so that row k shows its pose. Commands may stand in a table of their own, with n or
 n - 1 rows for n observations; or with their own times and any number of rows.
 """
 
@@ -116,6 +117,11 @@ class CsvColumns(BaseModel):
         description="unit of each column of commands or positions whose unit differs from command_unit or "
         "position_unit, by the name of the column",
     )
+    commands_with_poses: bool = Field(
+        default=False,
+        description="the pose in a row is the pose under the command of the same row, as of poses at rest, or of "
+        "commands that were measured with the pose; by default a command acts from its row on",
+    )
     command_time: str | None = Field(
         default=None,
         description="column of the commands' own times, in their file; by default command k is sent in row k of the "
@@ -143,6 +149,11 @@ class CsvColumns(BaseModel):
         (0.0, 0.0, 0.0),
         description="position of the robot's base in the file's frame: x, y, z along the file's axes, in "
         "position_unit; the base is the centre of the body at the clamp",
+    )
+    base_marker: tuple[str, str, str] | None = Field(
+        default=None,
+        description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved: "
+        "positions are counted from it, and origin is the base's place beside it",
     )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
@@ -219,6 +230,8 @@ class CsvColumns(BaseModel):
             if names is not None and len(names) != count:
                 what = "marker in positions" if key == "markers" else "channel in commands"
                 raise ValueError(f"{key} has {len(names)} entries instead of {count}, one for each {what}")
+        if self.commands_with_poses and self.command_time is not None:
+            raise ValueError("commands_with_poses and command_time contradict each other: leave out one of them")
         if len(self.orientations or ()) != len(self.sections or ()):
             raise ValueError("give one name in sections for each of orientations")
         for turn in self.orientations or ():
@@ -310,16 +323,21 @@ def read_tables(
     command = _commands(table, source, columns)
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = _angles(table, columns)
+    first = command[0]
+    if columns.commands_with_poses:
+        # A command acts from half-way between two rows on, so that clocks of any step see it in its own row.
+        sent, command = 0.5 * (time[: len(command) - 1] + time[1 : len(command)]), command[1:]
     notes = [*faults.notes, *_timing_notes(table, columns, time)]
     if columns.command_time is not None:
         notes += command_notes(sent, command)
     seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)
     notes += _counter_notes(table, source, columns, Motion(sent, time, seen))
     settings = faults._replace(notes=notes).settings
+    settings |= {"settled_poses": True} if columns.commands_with_poses else {}
     settings |= {} if angle is None else {"motor_angle_hold": hold_time(time, angle)}
     return Recorded(
         replace(origin or origin_of(table, columns), settings=settings),
-        SentCommands(sent, command, *_channels(columns), command[0], _largest(columns)),
+        SentCommands(sent, command, *_channels(columns), first, _largest(columns)),
         Measured(
             time=time,
             position=fill_missing(time, position),
@@ -365,7 +383,10 @@ def _largest(columns: CsvColumns) -> float | None:
 
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
     """Positions of the markers [m] in the base frame."""
-    return in_base(table.points(coordinates(columns), allow_missing=mask_missing), columns)
+    place = table.points(coordinates(columns), allow_missing=mask_missing)
+    if columns.base_marker is not None:
+        place = place - table.points(list(columns.base_marker), allow_missing=mask_missing)
+    return in_base(place, columns)
 
 
 def in_base(place: Float[np.ndarray, "*rows marker 3"], columns: CsvColumns) -> Float[np.ndarray, "*rows marker 3"]:
@@ -381,7 +402,7 @@ def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
 
 
 def untimed(columns: CsvColumns) -> bool:
-    """Whether the number of a row stands in for its time."""
+    """Whether row numbers replace times."""
     return columns.time == ROWS
 
 

@@ -176,7 +176,7 @@ class ControlLoop:
     # Phases
 
     def run(self, phases: Callable[[ControlLoop], None]) -> Stop:
-        """Go through the phases, and come to rest whatever happens.
+        """Go through the phases, and come to rest after any error.
 
         Returns:
             Why it ended.
@@ -343,7 +343,7 @@ class ControlLoop:
                 raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
 
     def _brake(self, began: float, stop: Stop) -> Stop:
-        """Quick stop, and look on: the drives must show that they stand, and go on holding.
+        """Quick stop; the drives must then report standstill and keep holding.
 
         Returns:
             The stop, with the drives that did not hold; these are the cause of a session that had ended as planned.
@@ -390,7 +390,7 @@ class ControlLoop:
 
 
 def _as_stop(error: Exception) -> Stop:
-    """The stop that an exception of any part of a session stands for."""
+    """The stop for an exception in any part of a session."""
     if isinstance(error, Stop):
         return error
     return Stop(

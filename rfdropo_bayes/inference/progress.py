@@ -2,7 +2,7 @@
 
 - `Progress`: a bar with the time left for people, one JSON line per stage for programs.
 - `say_step`: a report on the work after a bar.
-- `Checkpoint`: a killed run goes on from its last whole stage and ends with the same draws.
+- `Checkpoint`: a killed run continues from its last whole stage and ends with the same draws.
 - `Logbook`: both of them, for a run or a part of one.
 """
 
@@ -269,7 +269,7 @@ class Logbook:
 
     Attributes:
         folder: folder for checkpoints; None keeps none.
-        resume: go on from the checkpoints found there.
+        resume: continue from its checkpoints.
         progress: receives reports of stages.
         begin, end: shares of the whole work before and after this part.
     """

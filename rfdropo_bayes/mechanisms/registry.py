@@ -1,7 +1,7 @@
 """All mechanisms by name. To add one: write its class in the module of its stage, and one line here.
 
-A mechanism may also live in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
-experiment file, stands wherever a registry name does; see docs/mechanisms.md.
+A mechanism may also be defined in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
+experiment file, replaces a registry name; see docs/mechanisms.md.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class MechanismChoice:
 def choose_mechanisms(
     names: Iterable[Any], *, folder: Path = Path(), where: str = "[model] mechanisms"
 ) -> tuple[MechanismChoice, ...]:
-    """The mechanisms that names stand for.
+    """The named mechanisms.
 
     Args:
         names: names in the registry, ``module:ClassName`` of user code, or mechanisms as classes or objects.
@@ -185,7 +185,7 @@ def source_of(mechanism: Any) -> str:
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:
-    """The class that ``module:ClassName`` or ``file.py:ClassName`` stands for."""
+    """The class named by ``module:ClassName`` or ``file.py:ClassName``."""
     source, _, attribute = name.rpartition(":")
     try:
         if source.endswith(".py"):

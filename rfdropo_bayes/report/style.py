@@ -1,4 +1,4 @@
-"""One look for all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
+"""Common style of all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
 distinguish.
 """
 
@@ -109,7 +109,7 @@ def _our_style() -> Iterator[None]:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Run a drawing function under the common style, whatever the user's matplotlibrc says."""
+    """Run a drawing function under the common style, independently of the user's matplotlibrc."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -165,7 +165,7 @@ def _inches(figure: Figure, box: Bbox) -> Bbox:
 
 
 def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
-    """Axes that stand in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
+    """Axes in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
 
     None if the figure is one piece: a single column, axes outside of a grid, or a grid too fine to be taken apart.
     """
@@ -201,7 +201,7 @@ def label_with_unit(name: str, unit: str) -> str:
 
 
 class PlainLogFormatter(LogFormatter):
-    """Numbers of a logarithmic axis as they are read: 0.6, and not 6e-01."""
+    """Plain numbers on a logarithmic axis: 0.6, and not 6e-01."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return f"{x:g}" if super().__call__(x, pos) else ""

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory, shared_markers
-from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
+from rfdropo_bayes.model.assembly import build_robot_simulator, expand_groups
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend
@@ -35,12 +34,12 @@ class Rows(NamedTuple):
     time: Float[np.ndarray, " row"]  # [s] in its recording
 
     def of(self, index: np.ndarray) -> Rows:
-        """Some rows."""
+        """A subset of the rows."""
         return Rows(*(part[index] for part in self))
 
 
 def rows_of(recordings: Sequence[Trajectory], markers: Sequence[str], late: float = 0.0) -> Rows:
-    """All rows of recordings, with the commands that were in force so much earlier [s]."""
+    """All rows of recordings, with the commands in force a delay [s] earlier."""
     names = shared_markers(recordings, markers)
     parts = []
     for run in recordings:
@@ -73,22 +72,18 @@ def spread_rows(rows: Rows, most: int, seed: int = 0) -> np.ndarray:
     return usable[np.sort(chosen)]
 
 
-def resting(spec: ModelSpec, mechanisms: Sequence[Any] = ()) -> RestingRobot:
-    """The robot of a model at rest, with its mechanisms that a body at rest has and these.
+def resting(spec: ModelSpec) -> RestingRobot:
+    """The rod of a model's robot at rest, with its mechanisms without memory.
 
     Raises:
-        InputError: a body that cannot be at rest: a black box, or a mesh of tetrahedra.
+        InputError: a black box.
     """
-    table = spec.simulator
-    if table.body != "rod":
-        raise InputError("a mesh of tetrahedra is never at rest", where="[simulator] body", remedy='use body = "rod"')
-    still = table.model_copy(
-        update={"motion": QUASI_STATIC, "precision": "float64", "push": False, **dict.fromkeys(MOVING)}
-    )
-    simulator = build_robot_simulator(replace(spec, simulator=still, mechanisms=()))
+    still = {"body": "rod", "tetrahedra": None, "motion": QUASI_STATIC, "precision": "float64", "push": False}
+    table = spec.simulator.model_copy(update=still | dict.fromkeys(MOVING))
+    simulator = build_robot_simulator(replace(spec, simulator=table))
     assert isinstance(simulator, TrunkSimulator)
-    kept = [mechanism for mechanism in mechanisms if without_memory(mechanism)]
-    simulator = replace(simulator, mechanisms=tuple(kept)).with_backend(Backend("numba"))
+    kept = tuple(mechanism for mechanism in simulator.mechanisms if without_memory(mechanism))
+    simulator = replace(simulator, mechanisms=kept).with_backend(Backend("numba"))
     return RestingRobot(simulator, shown=tuple(simulator.marker_names), held=_held(spec, simulator))
 
 
@@ -100,29 +95,29 @@ def without_memory(mechanism: Any) -> bool:
 
 def _held(spec: ModelSpec, simulator: TrunkSimulator) -> dict[str, float]:
     """Fixed values that a robot at rest has."""
-    known = {each.name for each in simulator.parameters}
-    fixed = {name: value for name, value in spec.fixed.items() if name in known}
-    return physical_values(replace(spec, fixed=fixed, mechanisms=()), simulator)
+    known = [each.name for each in simulator.parameters]
+    given = expand_groups(spec.fixed, simulator.parameters)
+    return {name: float(value) for name, value in given.items() if name in known}
 
 
 class RestingRobot:
     """A robot in which every row of commands is an equilibrium of its own.
 
     Args:
-        simulator: of a rod at rest, with mechanisms that have no memory.
-        shown: the markers that are told, in this order.
-        held: values of parameters that are not nominal.
+        simulator: simulator of a rod at rest, with mechanisms without memory.
+        shown: the predicted markers, in this order.
+        held: fixed parameter values; others are nominal.
     """
 
     def __init__(self, simulator: TrunkSimulator, shown: tuple[str, ...], held: Mapping[str, float]) -> None:
         self.simulator, self.shown, self.held = simulator, shown, dict(held)
 
     def showing(self, markers: Sequence[str]) -> RestingRobot:
-        """The same robot, which tells these markers alone."""
+        """The same robot with predictions of these markers alone."""
         return RestingRobot(self.simulator, tuple(markers), self.held)
 
     def with_cables(self, cables: Sequence[Cable]) -> RestingRobot:
-        """The same body, parameters and drives, with cables that run elsewhere; nothing is compiled anew."""
+        """The same body, parameters and drives, with other cables; nothing is recompiled."""
         own = self.simulator
         robot = own.robot.with_changes(cables=tuple(cables))
         assembly = assemble(robot, own.discretisation)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.posteriors import central_interval
+from rfdropo_bayes.report.rest_figure import rest_figure
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
@@ -42,11 +43,13 @@ from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
+from rfdropo_bayes.verbs.command_lag import lag_words
 from rfdropo_bayes.verbs.motion_check import measure_motion
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 from rfdropo_bayes.verbs.recording_doubts import asked_pulls, cables_beyond, recording_cautions, shortened
+from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
 LONG = 60.0
@@ -143,7 +146,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     if ahead and recordings["fit"] and not found.problems:
         fewer = [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
-            _say_motion(found, experiment, folder, recordings["fit"], fewer[0])
+            _say_motion(found, experiment, folder, recordings, fewer, output_folder(out))
         _say_ahead(found, experiment, folder, fewer)
     if any(recordings.values()):
         out = output_folder(out)
@@ -160,20 +163,39 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
 
 
 def _say_motion(
-    found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory], first: Trajectory
+    found: Check,
+    experiment: Experiment,
+    folder: Path,
+    recordings: Mapping[str, Sequence[Trajectory]],
+    fewer: Sequence[Trajectory],
+    out: Path,
 ) -> None:
-    """Report on the nominal model: errors of time step, elements and motion, and motions in another direction.
+    """Report on the nominal model: numerical errors, another arrangement of the commands, and a fit at rest.
 
-    ``first`` is the first recording, thinned to the rows that its motion needs.
+    ``fewer`` are the recordings to fit, thinned to the rows that their motion needs.
     """
-    say_step(f"simulating {first.name} with a finer time step, more elements, and the other kind of motion")
-    spec = spec_of(experiment, folder)
-    found.lines += _try(found, partial(numerical_error_lines, spec, first)) or []
+    say_step(f"simulating {fewer[0].name} with a finer time step, more elements, and the other kind of motion")
+    spec, runs = spec_of(experiment, folder), recordings["fit"]
+    found.lines += _try(found, partial(numerical_error_lines, spec, fewer[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
+    rests = spec.simulator.motion == QUASI_STATIC
+    if rests:
+        lag = lag_words(runs, columns)
+        found.lines.append(("row and pose", lag.words))
+        found.doubts += [] if lag.doubt is None else [lag.doubt]
     compared = _try(found, partial(measure_motion, spec, runs, columns))
-    if compared is not None:
-        found.lines.append(("motion", compared.words))
-        found.doubts += [caution.sentence for caution in compared.cautions]
+    if compared is None:
+        return
+    found.lines.append(("motion", compared.words))
+    found.doubts += [caution.sentence for caution in compared.cautions]
+    if compared.arrangement is not None:
+        shown = (runs, recordings["test"]) if rests else (fewer, [looked_at(run) for run in recordings["test"]])
+        fit = _try(found, partial(first_answer, spec, *shown, compared.arrangement))
+        if fit is not None:
+            found.lines += rest_lines(fit)
+            found.notes += rest_notes(fit) if rests else []
+            found.files.append(out / "at_rest.png")
+            rest_figure(fit).savefig(found.files[-1])
 
 
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.sample_times import sample_time
 
 DELAYS = (0.0, 0.1, 0.2, 0.4)
@@ -19,7 +20,7 @@ MOST_ROWS = 2000
 """Rows of a recording that are used."""
 RIDGE = 1e-6
 """Ridge penalty of the maps, as a share of the mean square of their features."""
-CLEARLY = 0.8
+CLEARLY = 0.9
 """Ratio of the root mean square residuals of two maps below which the better map is reported."""
 
 
@@ -41,7 +42,7 @@ def left_by_rows(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)
 
 
 def best_delay(runs: Sequence[Trajectory]) -> float:
-    """How long [s] after its commands the markers move, as a quadratic map explains most."""
+    """Delay [s] of the markers behind the commands at which a quadratic map fits best."""
     step = sample_time(*(run.time for run in runs))
     delays = sorted({*DELAYS, step})
     left = [
@@ -60,7 +61,7 @@ def _positions(run: Trajectory) -> Float[np.ndarray, "row coordinate"]:
 
 
 def _shifted(command: Float[np.ndarray, "row channel"], lag: int) -> Float[np.ndarray, "row channel"]:
-    """Commands of another row, not a number beyond the ends."""
+    """Commands of another row, NaN beyond the ends."""
     moved = np.full(command.shape, np.nan)
     rows = np.arange(len(command)) - lag
     inside = (rows >= 0) & (rows < len(command))
@@ -92,3 +93,34 @@ def _quadratic(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "
     scaled = command / np.where(size > 0.0, size, 1.0)
     one, other = np.triu_indices(scaled.shape[1])
     return np.concatenate([scaled, np.maximum(scaled, 0.0), scaled[:, one] * scaled[:, other]], axis=1)
+
+
+class LagWords(NamedTuple):
+    """The row of the command that a pose shows, in words; and a doubt if the simulation uses another row."""
+
+    words: str
+    doubt: str | None
+
+
+CLOCKS = "look at the clocks of commands and positions"
+REMEDIES = {
+    0: "commands_with_poses = true in [data.columns]: commands were measured with the pose, or poses are at rest",
+    1: "commands_with_poses = false in [data.columns]",
+}
+NAMES = {-1: "the next row", 0: "its own row", 1: "the row before", 2: "two rows before"}
+
+
+def lag_words(runs: Sequence[Trajectory], columns: CsvColumns | None) -> LagWords:
+    """Find the row of the command that poses at rest show."""
+    left = {each.rows: each.error for each in left_by_rows(runs)}
+    best = min(left, key=lambda rows: left[rows])
+    taken = 0 if columns is None or columns.commands_with_poses else 1
+    told = ", ".join(f"{NAMES[rows]} {1e3 * error:.3g}" for rows, error in left.items())
+    words = (
+        f"a pose follows the command of {NAMES[best]} best; the simulation takes that of {NAMES[taken]} (a quadratic "
+        f"map of the command leaves, in mm: {told})"
+    )
+    if left[best] >= CLEARLY * left[taken]:
+        return LagWords(words, None)
+    shares = f"{1e3 * left[best]:.3g} mm are left, by {NAMES[taken]} {1e3 * left[taken]:.3g} mm"
+    return LagWords(words, f"a pose follows the command of {NAMES[best]} ({shares}): {REMEDIES.get(best, CLOCKS)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from rfdropo_bayes.data import Trajectory, shared_markers
 from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.arrangement import Arrangement, as_written
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, resting, rows_of, spread_rows
 from rfdropo_bayes.verbs.command_lag import best_delay
 from rfdropo_bayes.verbs.motion_direction import (
@@ -59,7 +59,7 @@ class Motion(NamedTuple):
     """Recordings beside the nominal model.
 
     Attributes:
-        direction, size: of the motion.
+        direction, size: direction and size of the motion.
         proposal: another arrangement of the commands that explains the motion much better; None without.
         unit: another unit of the commands and the size of the motion under it; None without.
     """
@@ -114,10 +114,17 @@ def _proposed(direction: Direction, proposal: Proposal, axes: tuple[str, str, st
 
 
 class Compared(NamedTuple):
-    """A comparison with the nominal model in words, and cautions on frame, order and unit of the commands."""
+    """Comparison with the robot at rest.
+
+    Attributes:
+        words: summary.
+        cautions: on frame, order and unit of the commands.
+        arrangement: best arrangement of the commands; None without equilibria under them.
+    """
 
     words: str
     cautions: list[Caution]
+    arrangement: Arrangement | None
 
 
 def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> Compared:
@@ -125,15 +132,15 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
 
     Args:
         spec: model of a robot; values are nominal or fixed.
-        recordings: in the frame of the base; the first `MOST` are used.
+        recordings: recordings in the base's frame; the first `MOST` are used.
         columns: table used to read them.
 
     Raises:
         InputError: no common marker of robot and recordings.
     """
     runs = recordings[:MOST]
-    robot = resting(replace(spec, simulator=spec.simulator.model_copy(update={"body": "rod", "tetrahedra": None})))
-    rows = rows_of(runs, robot.simulator.marker_names, best_delay(runs))
+    robot, late = resting(spec), best_delay(runs)
+    rows = rows_of(runs, robot.simulator.marker_names, late)
     rows = rows.of(spread_rows(rows, ROWS))
     robot = robot.showing(shared_markers(runs, robot.simulator.marker_names))
     unit, measured = runs[0].command_unit, size_of([_paths(robot, rows, 0.0)]).measured
@@ -143,7 +150,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
         smaller = _explained(robot, rows, likely_units(units, None))
         said = "the robot has no equilibrium under most of the commands as they were read"
         words = f"{said}, and the markers moved by {1e3 * measured:.3g} mm; {unit_words(columns, smaller)}"
-        return Compared(said, [Caution(Code.UNIT_DOUBTFUL, words)])
+        return Compared(said, [Caution(Code.UNIT_DOUBTFUL, words)], None)
     direction, found = direction_of([here]), find_arrangement(robot, rows)
     proposal = _proposal(found, robot.simulator.robot, columns, runs[0].cable_names)
     if proposal is not None:
@@ -157,11 +164,13 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
         f"the markers move by {1e3 * size.measured:.3g} mm, the robot at rest under commands in {in_unit} by "
         f"{1e3 * size.nominal:.3g} mm; agreement {found.written.straight:.2f}"
     )
-    return Compared(words, motion_cautions(Motion(direction, size, proposal, other), columns, unit))
+    cautions = motion_cautions(Motion(direction, size, proposal, other), columns, unit)
+    written = as_written(len(rows.command[0]), len(found.arrangement.turns))
+    return Compared(words, cautions, found.arrangement if cautions else written)
 
 
 def _paths(robot: RestingRobot, rows: Rows, factor: float = 1.0) -> Paths:
-    """Rows beside the robot at rest, under commands times a factor; rows without an equilibrium are not seen."""
+    """Rows beside the robot at rest, under commands times a factor; rows without an equilibrium are masked."""
     nominal = robot.markers(factor * rows.command)[0]
     seen = np.isfinite(nominal).all(axis=2) & np.isfinite(rows.position).all(axis=2)
     return Paths(np.nan_to_num(nominal), np.nan_to_num(rows.position), seen)
@@ -178,8 +187,7 @@ def _explained(robot: RestingRobot, rows: Rows, units: Sequence[Unit]) -> tuple[
 
 
 def _proposal(found: Finding, robot: Robot, columns: CsvColumns | None, names: Sequence[str]) -> Proposal | None:
-    """The found arrangement, if it has another order, another sign, or sections turned against each other, and is
-    clearly better.
+    """The found arrangement, if it has another order, another sign or rotated sections, and is clearly better.
 
     A turn of the whole is reported as a turn of the frame, see `direction_doubt`.
     """

@@ -81,10 +81,10 @@ def unexplained(correlation: float) -> float:
 
 
 def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
-    """Look for the arrangement of a robot's commands.
+    """Find the arrangement of a robot's commands.
 
     Args:
-        resting: the robot as it is written, showing the markers of the rows.
+        resting: the robot of the file, with the markers of the rows.
         rows: rows of recordings.
     """
     robot = resting.simulator.robot
@@ -119,7 +119,7 @@ class _Finder:
         return self._seen[arrangement]
 
     def straight(self, arrangement: Arrangement) -> float:
-        """Correlation as it is."""
+        """Correlation without rotation."""
         return self.agreement(arrangement).straight
 
     def levelled(self, arrangement: Arrangement) -> Arrangement:
@@ -195,7 +195,7 @@ def arranged(resting: RestingRobot, arrangement: Arrangement) -> RestingRobot:
 
 
 def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key: str) -> list[str]:
-    """Lines that bring an arrangement about.
+    """Lines of an experiment file for an arrangement.
 
     Args:
         arrangement: found arrangement.

@@ -159,3 +159,19 @@ def test_a_name_that_exists_comes_before_a_pattern_that_matches_elsewhere(folder
     (folder / "run [1].csv").write_text("own")
     monkeypatch.setenv(DATA_VARIABLE, str(elsewhere))
     assert find_files("run [1].csv", folder) == [folder / "run [1].csv"]
+
+
+def test_commands_measured_with_the_pose_are_in_force_in_their_own_row(tmp_path):
+    """By default the row before shows; with the key the row's own, whatever comes before or after."""
+    (tmp_path / "run.csv").write_text("t,c,x,y,z\n0,1,0,0,1\n1,2,0,0,1\n3,4,0,0,1\n")
+    columns = {
+        "time": "t", "commands": ["c"], "command_unit": "mm", "positions": [["x", "y", "z"]], "position_unit": "m",
+    }  # fmt: skip
+    table = {"format": "csv", "fit": ["run.csv"], "columns": {**columns, "commands_with_poses": True}}
+    (run,) = load_recordings(DataSpec.parse(table), tmp_path)
+    just_before = run.command_at(run.time - 1e-3)[:, 0]
+    assert just_before.tolist() == pytest.approx([1e-3, 2e-3, 4e-3])
+    assert run.command_time.tolist() == [0.5, 2.0]
+    table["columns"] |= {"command_time": "t"}
+    with pytest.raises(InputError, match="contradict each other"):
+        DataSpec.parse(table)

@@ -72,7 +72,7 @@ def MuJoCo(
         channels: the actuator of each command: ``{command: actuator}``, by name or number; all of them by default.
             Actuators without a command keep the value of the keyframe, or zero.
         parameters: parameters that may be inferred: ``{parameter: address}``, see `mujoco_elements`; an address may
-            stand in a table with ``low``, ``high``, ``prior``, ``unit`` or ``nominal`` of your own. Other attributes
+            be a table with ``low``, ``high``, ``prior``, ``unit`` or ``nominal`` of your own. Other attributes
             are candidates of an audit, by kind.
         cables: actuators whose pull is measured as a tension [N]: ``{cable: actuator}``.
         start: "rest", the model's reference pose without speed; "settled", the equilibrium under the first command,
@@ -426,7 +426,7 @@ class MuJoCoRollouts:
         return MuJoCoLanes(self, count)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:
-        """Which rollouts went on to the end: MuJoCo stops the clock of one with a warning."""
+        """Mask of complete rollouts: MuJoCo stops the clock of one with a warning."""
         late = state[:, 0] - self.first[0][0] - steps * self.model.opt.timestep
         return (np.abs(late) < 0.5 * self.model.opt.timestep) & np.isfinite(state).all(axis=1)
 

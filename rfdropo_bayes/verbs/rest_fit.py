@@ -1,0 +1,257 @@
+"""A first fit in seconds: the model's parameters with their priors, fitted to some rows of a robot at rest.
+
+Least squares by Gauss-Newton steps with a line search. The noise is estimated from the residuals, so that a prior has
+little weight if the rows are informative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.bayes.scopes import Scopes
+from rfdropo_bayes.data import Trajectory, group_repeats
+from rfdropo_bayes.report.baselines import mean_pose
+from rfdropo_bayes.report.fir import fit_fir
+from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, rows_of, spread_rows
+
+FITTED, SHOWN = 60, 240
+"""Rows that are fitted, and rows whose residuals are shown."""
+ITERATIONS, SETTLED = 10, 1e-3
+"""Most steps, and the least relative decrease of the cost by a step."""
+STEP = 0.01
+"""Step of derivatives, in standard deviations of the prior."""
+DRAWS = 400
+"""Number of prior draws for its location and size."""
+SHORTEST = 1e-2
+"""Shortest trial step, relative to the full step."""
+KEPT = 0.7
+"""Share of its prior standard deviation from which on a parameter counts as undetermined."""
+SMALLEST = 1e-5
+"""Smallest noise [m]."""
+
+
+class Scale(NamedTuple):
+    """Location and size of a parameter's prior, of the logarithm if it has a scale."""
+
+    name: str
+    unit: str
+    logarithmic: bool
+    mean: float
+    sd: float
+    low: float
+    high: float
+
+    def value(self, z: Float[np.ndarray, " set"]) -> Float[np.ndarray, " set"]:
+        """Values at a distance from the middle of the prior, in standard deviations."""
+        x = self.mean + self.sd * np.asarray(z, float)
+        return np.clip(np.exp(x) if self.logarithmic else x, self.low, self.high)
+
+
+class Estimate(NamedTuple):
+    """Result of a fit for a parameter.
+
+    Attributes:
+        value, prior: estimate, and middle of the prior, in its unit.
+        sd: its standard deviation, relative if ``logarithmic``.
+        kept: posterior over prior standard deviation.
+    """
+
+    name: str
+    unit: str
+    value: float
+    prior: float
+    sd: float
+    logarithmic: bool
+    kept: float
+
+
+class RestFit(NamedTuple):
+    """A fit at rest.
+
+    Attributes:
+        estimates: results for the parameters.
+        markers: names; the errors are those of the last marker, root mean square [m].
+        before, after: errors on the fitted rows.
+        unseen: errors on unfitted rows of the fit and of predictors without physics, by name.
+        each: error of every marker on the unfitted rows.
+        fitted, other: numbers of fitted and unfitted rows.
+        rows: that are shown, of all recordings; residual: measured less computed [m]; ways: whether each command was
+            last changed upwards (1) or downwards (-1); recording: number of each row's recording.
+    """
+
+    estimates: tuple[Estimate, ...]
+    markers: tuple[str, ...]
+    before: float
+    after: float
+    unseen: Mapping[str, float]
+    each: tuple[float, ...]
+    fitted: int
+    other: int
+    rows: Rows
+    residual: Float[np.ndarray, "row marker 3"]
+    ways: Float[np.ndarray, "row channel"]
+    recording: np.ndarray
+
+
+OWN = "own"
+"""Key of the fitted robot among errors."""
+
+
+def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
+    """Priors of the inferred parameters of a robot at rest, without parameters of single recordings."""
+    drawn = scopes.sample(jax.random.key(0), DRAWS)
+    found = []
+    for parameter in scopes.parameters:
+        draws, spec = np.asarray(drawn[parameter.name]), parameter.spec
+        if parameter.name not in known or not np.ptp(draws) > 0.0:
+            continue
+        family = parameter.table.get("distribution")
+        logarithmic = family in ("LogNormal", "LogUniform") and bool(np.all(draws > 0.0))
+        inside = np.log(draws) if logarithmic else draws
+        middle, sd = float(np.median(inside)), float(np.std(inside))
+        found.append(Scale(spec.name, spec.unit, logarithmic, middle, sd, spec.low, spec.high))
+    return found
+
+
+def least_squares(
+    predict: Callable[[Float[np.ndarray, "set parameter"]], Float[np.ndarray, "set number"]],
+    measured: Float[np.ndarray, " number"],
+    count: int,
+) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, "parameter parameter"]]:
+    """Parameters in standard deviations of their priors, and their covariance.
+
+    Args:
+        predict: predictions for sets of parameters, one set more than parameters; NaN without an equilibrium.
+        measured: the measured values; NaN if missing.
+        count: number of parameters.
+    """
+    z, information = np.zeros(count), np.eye(count)
+    seen = np.isfinite(measured)
+    size = float(np.std(measured[seen])) or 1.0
+
+    def residuals(made: Float[np.ndarray, "set number"]) -> Float[np.ndarray, "set number"]:
+        left = measured[seen] - made[:, seen]
+        return np.where(np.isfinite(left), left, size)
+
+    for _ in range(ITERATIONS):
+        left = residuals(predict(z + STEP * np.vstack([np.zeros(count), np.eye(count)])))
+        noise = max(float(np.sqrt(np.mean(left[0] ** 2))), SMALLEST)
+        slope = (left[0] - left[1:]) / STEP / noise
+        information = np.eye(count) + slope @ slope.T
+        step = np.linalg.solve(information, slope @ left[0] / noise - z)
+        tried = z + np.geomspace(1.0, SHORTEST, count + 1)[:, None] * step
+        cost = np.sum((residuals(predict(tried)) / noise) ** 2, axis=1) + np.sum(tried**2, axis=1)
+        before = float(np.sum((left[0] / noise) ** 2) + np.sum(z**2))
+        if cost.min() >= before:
+            break
+        z = tried[int(np.argmin(cost))]
+        if cost.min() > (1.0 - SETTLED) * before:
+            break
+    return z, np.linalg.inv(information)
+
+
+def fit_at_rest(
+    robot: RestingRobot,
+    scopes: Scopes,
+    fit: Sequence[Trajectory],
+    test: Sequence[Trajectory],
+    late: float,
+    sent: Callable[[np.ndarray], np.ndarray],
+) -> RestFit:
+    """Fit a robot at rest.
+
+    Args:
+        robot: robot with the markers of all recordings.
+        scopes: scopes of the inferred parameters.
+        fit: recordings to fit.
+        test: unseen recordings; without any, errors are those of the fitted recordings.
+        late: delay [s] of the body behind its commands.
+        sent: commands of the channels from the recorded commands.
+    """
+    scales = scales_of(scopes, [spec.name for spec in robot.simulator.parameters])
+    every = rows_of(fit, robot.shown, late)
+    rows = every.of(spread_rows(every, FITTED))
+
+    def made(z: Float[np.ndarray, "set parameter"], of: Rows) -> Float[np.ndarray, "set row marker 3"]:
+        values = {scale.name: scale.value(z[:, k]) for k, scale in enumerate(scales)}
+        return robot.markers(sent(of.command), values)
+
+    z, covariance = least_squares(
+        lambda sets: made(sets, rows).reshape(len(sets), -1), rows.position.reshape(-1), len(scales)
+    )
+    whole = rows_of([*fit, *test], robot.shown, late)
+    counts = [len(run.time) for run in (*fit, *test)]
+    number = np.repeat(np.arange(len(counts)), counts)
+    ways = np.concatenate([_ways(run.command_at(run.time - late)) for run in (*fit, *test)])
+    held = number >= len(fit) if test else np.ones(len(number), dtype=bool)
+    index = np.unique(np.concatenate([_even(np.flatnonzero(held), SHOWN), _even(np.flatnonzero(~held), SHOWN // 2)]))
+    shown, judged = whole.of(index), held[index]
+    residual = shown.position - made(z[None], shown)[0]
+    without = {
+        name: _rms(shown.position - path[index], judged) for name, path in _without_physics(fit, test, robot).items()
+    }
+    start, end = (rows.position - each[0] for each in (made(np.zeros((1, len(z))), rows), made(z[None], rows)))
+    fitted = np.ones(len(rows.time), dtype=bool)
+    return RestFit(
+        tuple(_estimate(scale, z[k], float(np.sqrt(covariance[k, k]))) for k, scale in enumerate(scales)),
+        robot.shown,
+        _rms(start, fitted),
+        _rms(end, fitted),
+        {OWN: _rms(residual, judged), **without},
+        tuple(_rms(residual[:, : k + 1], judged) for k in range(len(robot.shown))),
+        len(rows.time),
+        int(judged.sum()),
+        shown,
+        residual,
+        ways[index],
+        number[index],
+    )
+
+
+def _without_physics(
+    fit: Sequence[Trajectory], test: Sequence[Trajectory], robot: RestingRobot
+) -> dict[str, Float[np.ndarray, "row marker 3"]]:
+    """Predictions of all rows without physics, by name of the predictor."""
+    groups = [list(group) for group in group_repeats(fit)]
+    predictors = {
+        "cubic FIR": fit_fir(fit, groups, degree=3).predict,
+        "linear FIR": fit_fir(fit, groups, degree=1).predict,
+        "mean pose": mean_pose(fit),
+    }
+    found = {}
+    for name, predict in predictors.items():
+        paths = []
+        for run in (*fit, *test):
+            chosen = [run.marker_names.index(marker) for marker in robot.shown]
+            paths.append(predict(run)[:, chosen])
+        found[name] = np.concatenate(paths)
+    return found
+
+
+def _estimate(scale: Scale, z: float, kept: float) -> Estimate:
+    value, prior = scale.value(np.array([z, 0.0]))
+    return Estimate(scale.name, scale.unit, float(value), float(prior), kept * scale.sd, scale.logarithmic, kept)
+
+
+def _ways(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row channel"]:
+    """Direction of each command's last change; zero before its first change."""
+    change = np.sign(np.diff(command, axis=0, prepend=command[:1]))
+    last = np.maximum.accumulate(np.where(change != 0.0, np.arange(len(command))[:, None], 0), axis=0)
+    return np.take_along_axis(change, last, axis=0)
+
+
+def _even(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most ``most`` of the rows, evenly spaced."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int))] if len(rows) else rows
+
+
+def _rms(residual: Float[np.ndarray, "row marker 3"], counted: Bool[np.ndarray, " row"]) -> float:
+    """Root mean square distance of the last marker [m] over the given rows."""
+    square = np.sum(residual[counted, -1] ** 2, axis=-1)
+    square = square[np.isfinite(square)]
+    return float(np.sqrt(np.mean(square))) if len(square) else float("nan")
