@@ -382,8 +382,8 @@ class ExtensionSearch:
         return best
 
     def surpasses(self, new: Fit, old: Fit, worth: float) -> bool:
-        """Whether a model may replace an earlier choice: it must bring ``worth`` nats, also under priors of its further
-        parameters that are twice as wide.
+        """Whether a model may replace an earlier choice: its gain must be ``worth`` nats, also with doubled widths of
+        its further priors.
         """
         further = max(len(new.free) - len(old.free), 0)
         return new.log_evidence > old.log_evidence + worth + WIDER * further

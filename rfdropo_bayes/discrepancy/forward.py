@@ -1,4 +1,4 @@
-"""Rollouts and their derivatives in batches of one size, so that two compilations serve a whole audit."""
+"""Rollouts and their derivatives in batches of one size, so that two compilations suffice for an audit."""
 
 from __future__ import annotations
 
