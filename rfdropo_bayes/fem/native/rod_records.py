@@ -1,5 +1,6 @@
-"""What one lane block of rods works on: its parameters, the factors of a solve, its state, scratch, and the
-friction of its cables."""
+"""Data of a lane block of rods: its parameters, the factors of a solve, its state, scratch, and the friction of its
+cables.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +31,10 @@ DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM, HELD 
 """First rows of an element's scratch: directors in its middle, these times W, chord, g, b, strains, their rates and the
 stresses; the section's tangent, of shear, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six
 without the law of fibres; and how taut cables hold it in space: its force by stretch and shear (lower half, by
-columns), that by bending and twist (columns), and the moment by these (lower half)."""
-ELEMENT = HELD + 21
+columns), that by bending and twist (columns), and the moment by these (lower half); and the force and moment of the
+section and of these cables in space."""
+NET = HELD + 21
+ELEMENT = NET + 6
 
 
 class RodSamples(NamedTuple):
@@ -50,10 +53,11 @@ class RodSamples(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """What makes a solve a time step or a static iteration; (1, lanes) each."""
+    """Factors that make a solve a time step or a static iteration; (1, lanes) each."""
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
-    held: Float[np.ndarray, "1 lanes"]  # of what taut cables hold there
+    held: Float[np.ndarray, "1 lanes"]  # of the stiffness of taut cables
+    turning: Float[np.ndarray, "1 lanes"]  # of how forces turn with the sections there, for equilibria
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
@@ -69,7 +73,8 @@ class Factors(NamedTuple):
 
 class RodWork(NamedTuple):
     """State and scratch of one lane block; the last axis is the lane. Values are the six velocities of every station,
-    or what goes with them."""
+    or quantities of the same layout.
+    """
 
     turn: Float[np.ndarray, "stations4 lanes"]  # unit quaternion (w, x, y, z) of every section
     frame: Float[np.ndarray, "stations12 lanes"]  # position and directors
@@ -96,14 +101,10 @@ class RodWork(NamedTuple):
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses, or an equilibrium, were not found
     points: Float[np.ndarray, "point_values lanes"]
-    before: Float[np.ndarray, "values lanes"]  # the increment of the stage or static iteration before
+    before: Float[np.ndarray, "values lanes"]  # the change of velocity in the stage before
     sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
-    way: Float[np.ndarray, "values lanes"]  # that a static iteration goes
-    change: Float[np.ndarray, "values lanes"]  # of the increment in the iteration before
-    went: Float[np.ndarray, "values lanes"]  # way that made this change
-    older: Float[np.ndarray, "values lanes"]  # the same of an iteration earlier
-    earlier: Float[np.ndarray, "values lanes"]
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
+    largest: Float[np.ndarray, "1 lanes"]  # increment of the static iteration before [m]
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]
     softness: Float[np.ndarray, "1 lanes"]  # remaining share of the moduli after the time
@@ -139,7 +140,7 @@ class Friction(NamedTuple):
 
 
 def runs_of(layout: CableLayout) -> Runs:
-    """Runs of cables; those without a guide are left out."""
+    """Runs of cables; runs without a guide are left out."""
     first_guide = np.concatenate([[0], np.cumsum(layout.used.sum(axis=1))])
     runs = [
         (cable, first_guide[cable] + guides[0], first_guide[cable] + guides[-1] + 1)

@@ -1,4 +1,4 @@
-"""What the kernels know of a rod, its cables and its recorded points: arrays in the precision of the kernels.
+"""Constants of a rod, its cables and its recorded points for the kernels: arrays in the precision of the kernels.
 
 A station has six velocities: its section's velocity and its spin, both in space. It has twelve rows of `frame`: the
 position of the centre line and the three directors, the columns of the section's rotation. A material point is a sum of
@@ -48,7 +48,8 @@ class RodTables(NamedTuple):
     beside_start: Int[np.ndarray, " pieces"]  # guide that the way begins at; of the first way of a cable its end
     beside_share: Float[np.ndarray, " pieces"]  # see `cables.CableLayout`
     beside_along: Float[np.ndarray, " pieces"]
-    row: Int[np.ndarray, " cables"]  # of the border that a cable has: those that reach farthest first
+    beside_part: Float[np.ndarray, " pieces"]  # of the element that the piece runs beside
+    row: Int[np.ndarray, " cables"]  # of a cable's border: cables with the longest reach first
     active: Int[np.ndarray, " stations"]  # panels of the border that are not zero at a station
     section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
     section_area: Float[np.ndarray, " stations"]  # that times the body's width [m2]
@@ -77,7 +78,7 @@ def section_areas(body: Rod) -> Float[np.ndarray, "elements 5"]:
 
 
 def entries_of(points: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Entries of points bound to two sections each, without those that are zero: first, station, weight and arm."""
+    """Entries of points bound to two sections each, without zero entries: first, station, weight and arm."""
     station, weight, arm = (np.asarray(getattr(points, name)) for name in ("station", "weight", "arm"))
     used = (weight != 0.0) | np.any(arm != 0.0, axis=-1)
     first = np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int64)
@@ -128,25 +129,27 @@ def _cables(layout: Any, body: Rod) -> dict[str, np.ndarray]:
         "anchor": anchor,
         "rest_length": length,
         "near": ROUND * layout.way[used],
-        **_beside(layout, body.elements),
+        **_beside(layout, np.diff(body.station)),
         "row": row,
         "active": np.array(active, dtype=np.int64),
     }
 
 
-def _beside(layout: Any, elements: int) -> dict[str, np.ndarray]:
+def _beside(layout: Any, length: Float[np.ndarray, " elements"]) -> dict[str, np.ndarray]:
     """Pieces of the ways to guides, sorted by the elements that they run beside."""
     number = np.cumsum(layout.used.ravel()).reshape(layout.used.shape) - 1
     cable, guide, piece = np.nonzero(layout.share)
     order = np.argsort(layout.element[cable, guide, piece], kind="stable")
     cable, guide, piece = cable[order], guide[order], piece[order]
+    share = layout.share[cable, guide, piece]
     return {
-        "beside_first": np.searchsorted(layout.element[cable, guide, piece], np.arange(elements + 1)),
+        "beside_first": np.searchsorted(layout.element[cable, guide, piece], np.arange(len(length) + 1)),
         "beside_cable": cable,
         "beside_guide": number[cable, guide],
         "beside_start": number[cable, np.maximum(guide - 1, 0)],
-        "beside_share": layout.share[cable, guide, piece],
+        "beside_share": share,
         "beside_along": layout.along[cable, guide, piece],
+        "beside_part": share * length[layout.element[cable, guide, piece]] / layout.way[cable, guide],
     }
 
 
