@@ -74,7 +74,7 @@ def as_options(kind: type[Table]) -> type[Table]:
         found = parse_table(kind, given, where=kind.__name__)
         super(kind, self).__init__(**found.model_dump(exclude_unset=True))
 
-    kind.__init__ = init  # type: ignore[method-assign]
+    kind.__init__ = init  # type: ignore[method-assign, assignment]
     kind.__doc__ = "\n".join([inspect.cleandoc(kind.__doc__ or ""), "", "Attributes:", *_told(kind.model_fields)])
     return kind
 

@@ -113,7 +113,7 @@ class InferredParameter:
 
 @dataclass(frozen=True)
 class Pooled:
-    """How one parameter is pooled.
+    """Pooling of one parameter.
 
     Attributes:
         spread: standard deviation between groups, in the parameter's unit: the scale of its half-normal prior, or its

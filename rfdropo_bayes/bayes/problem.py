@@ -151,7 +151,7 @@ class TraceableProblem(Problem, Protocol):
 
 @runtime_checkable
 class WarmStart(Problem, Protocol):
-    """A problem that knows places to start from beside its prior.
+    """A problem with starting points beside its prior.
 
     Attributes:
         earlier: draws of an earlier posterior, by parameter and owner; empty without one.

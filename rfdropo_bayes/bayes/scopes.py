@@ -51,7 +51,7 @@ class Scopes:
         Args:
             infos: facts about the inferred parameters.
             specs: every parameter of the model.
-            fixed: values that the model knows.
+            fixed: values known to the model.
             held: parameters whose values the fit took for known.
 
         Raises:

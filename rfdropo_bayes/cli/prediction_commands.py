@@ -53,21 +53,22 @@ def predict(
     check_folder(out, "predict", overwrite=overwrite)
     from rfdropo_bayes.inference.progress import say_step
     from rfdropo_bayes.model.model import Model
-    from rfdropo_bayes.verbs.predict import run_prediction
+    from rfdropo_bayes.results.calibrated import Calibration
+    from rfdropo_bayes.verbs.predict import predict as predict_motion
 
     say_step(f"predicting {commands} with draws of {fit}", show=False if quiet or as_json else None)
-    facts = run_prediction(
-        Model.read(experiment, overrides),
-        fit,
+    found = predict_motion(
+        Calibration.of_posterior(fit, Model.read(experiment, overrides)),
         _from_here(commands),
-        out,
+        out=out,
         start=None if start is None else _from_here(start),
         episode=episode,
         seed=seed,
         group=group,
         overwrite=overwrite,
     )
-    show_prediction(facts, quiet=quiet, as_json=as_json)
+    files = [str(out / f"prediction.{ending}") for ending in ("nc", "csv")]
+    show_prediction({**found.content, "files": files}, quiet=quiet, as_json=as_json)
 
 
 def adapt(
@@ -94,18 +95,19 @@ def adapt(
     see_calibration(run, "DIR")
     check_folder(out, "adapt", overwrite=overwrite)
     from rfdropo_bayes.data import RecordingEntry
-    from rfdropo_bayes.verbs.adapt import fitted_model, run_adaptation
+    from rfdropo_bayes.results.calibrated import Calibration
+    from rfdropo_bayes.verbs.adapt import adapt as adapt_fit
+    from rfdropo_bayes.verbs.adapt import fitted_model
 
     entry = RecordingEntry(
         observations=_from_here(recording),
         commands=None if commands is None else _from_here(commands),
         episodes=None if episode is None else [episode],
     )
-    found = run_adaptation(
-        run,
-        fitted_model(run, overrides),
+    found = adapt_fit(
+        Calibration.of_posterior(run, fitted_model(run, overrides)),
         entry,
-        out,
+        out=out,
         seconds=seconds,
         group=group,
         seed=seed,

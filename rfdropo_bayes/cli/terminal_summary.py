@@ -109,7 +109,7 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
 
 
 def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
-    """Print how far a simulation is from its recordings; ``found`` is the content of simulation.json."""
+    """Print the distance of a simulation from its recordings; ``found`` is the content of simulation.json."""
     runs = found["recordings"].items()
     lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
     if found["error_mm"] is not None and len(lines) > 1:
@@ -118,7 +118,7 @@ def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> 
 
 
 def _off(error: Mapping[str, float] | None) -> str:
-    """How far markers are off."""
+    """Error of the markers."""
     if error is None:
         return ""
     return (

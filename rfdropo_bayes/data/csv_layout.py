@@ -1,4 +1,4 @@
-"""How the text of a table is laid out: its separator and decimal sign, and whether names and units stand above it."""
+"""Layout of a table's text: its separator and decimal sign, and whether names and units stand above it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def dialect_of(lines: Sequence[str]) -> Dialect:
 
 
 def _fit(lines: Sequence[str], separator: str) -> tuple[bool, float, int, int]:
-    """How well a separator fits: whether it separates, the share of values and their number, and the names."""
+    """Score of a separator: whether it separates, the share of values and their number, and the names."""
     names = len(cells_of(lines[0], separator))
     rows = [cells_of(line, separator) for line in lines[1 : SAMPLED + 1] or lines if line.strip()]
     cells = [cell for row in rows for cell in row]

@@ -176,7 +176,7 @@ class CsvTable:
 
     @classmethod
     def of_frame(cls, frame: pd.DataFrame, name: str, required: Sequence[str]) -> CsvTable:
-        """A table in memory; ``name`` stands for its path.
+        """A table in memory; ``name`` replaces its path.
 
         A named index is also a column; an unnamed index of dates is the column "index".
 

@@ -156,7 +156,7 @@ def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
 
 
 def _changes(trajectory: Trajectory) -> bool:
-    """Whether any command that is looked at differs from the first."""
+    """Whether any examined command differs from the first."""
     return bool(np.any(trajectory.command[trajectory.command_time <= LOOKED_AT] != trajectory.command[0]))
 
 

@@ -150,6 +150,11 @@ class CsvColumns(BaseModel):
         description="position of the robot's base in the file's frame: x, y, z along the file's axes, in "
         "position_unit; the base is the centre of the body at the clamp",
     )
+    base_marker: tuple[str, str, str] | None = Field(
+        default=None,
+        description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved: "
+        "positions are counted from it, and origin is the base's place beside it",
+    )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
     )
@@ -378,7 +383,10 @@ def _largest(columns: CsvColumns) -> float | None:
 
 def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
     """Positions of the markers [m] in the base frame."""
-    return in_base(table.points(coordinates(columns), allow_missing=mask_missing), columns)
+    place = table.points(coordinates(columns), allow_missing=mask_missing)
+    if columns.base_marker is not None:
+        place = place - table.points(list(columns.base_marker), allow_missing=mask_missing)
+    return in_base(place, columns)
 
 
 def in_base(place: Float[np.ndarray, "*rows marker 3"], columns: CsvColumns) -> Float[np.ndarray, "*rows marker 3"]:

@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class Reaction(Enum):
-    """How the drives come to rest.
+    """Way in which the drives stop.
 
     ``RAMP`` slows the set-points down within the limits and holds; it needs drives and bus that work. ``QUICK_STOP``
     lets each drive brake on its own ramp and hold.
@@ -41,7 +41,7 @@ class Cause(Enum):
 
     @property
     def word(self) -> str:
-        """As it stands in the log."""
+        """The word in the log."""
         return self.value[0]
 
     @property

@@ -343,7 +343,7 @@ class ControlLoop:
                 raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
 
     def _brake(self, began: float, stop: Stop) -> Stop:
-        """Quick stop, and look on: the drives must show that they stand, and go on holding.
+        """Quick stop; the drives must then report standstill and keep holding.
 
         Returns:
             The stop, with the drives that did not hold; these are the cause of a session that had ended as planned.

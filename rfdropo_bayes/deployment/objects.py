@@ -1,4 +1,4 @@
-"""Objects of CiA 301 and CiA 402 that master and simulated drive speak about, and the layout of their process data."""
+"""Objects of CiA 301 and CiA 402 used by master and simulated drive, and the layout of their process data."""
 
 from __future__ import annotations
 

@@ -309,7 +309,7 @@ class MarkerView:
         self._acted: np.ndarray | None = None
 
     def update(self, now: float) -> None:
-        """Look at the sensor once a cycle."""
+        """Read the sensor, once per cycle."""
         self.fresh, self.object_fresh = np.zeros_like(self.fresh), False  # if the sensor raises, nothing was seen
         sighting = self._sensor.latest()
         new = sighting.number != self._number and now - sighting.time <= self._table.stale_s

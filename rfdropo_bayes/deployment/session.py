@@ -61,7 +61,7 @@ class Mode(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """How a session ended.
+    """End of a session.
 
     Attributes:
         cause, detail: reason of the end, and one line about it.

@@ -148,7 +148,7 @@ class SafetyTable(_Table):
 
 
 class HomingTable(_Table):
-    """How length zero is found.
+    """Search for length zero.
 
     Attributes:
         file: file of the result; none if the robot file has the motors' offsets.

@@ -8,7 +8,7 @@ coordinate is infinite. A parameter without effect at null (a time constant) is 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -36,10 +36,8 @@ class Coordinates:
     Attributes:
         space: every parameter, base first; each with its prior.
         base: number of base parameters.
-        physical: names of the simulator's parameters, in the order of rollouts; nominal: their default values.
-        fixed: fixed values, by name.
-        limits: hard bounds of the simulator's parameters, to which sums of a shared value and a group's deviation are
-            clipped.
+        physical: names of the simulator's parameters, in the order of rollouts; a sum of a shared value and a group's
+            deviation is clipped to their hard bounds.
         widening: factor by which prior and unit of each coordinate are wider than its parameter's prior; empty for
             none.
     """
@@ -47,10 +45,12 @@ class Coordinates:
     space: Scopes
     base: int
     physical: tuple[str, ...]
-    nominal: Mapping[str, float]
-    fixed: Mapping[str, float]
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     widening: tuple[float, ...] = ()
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """Value of each of the simulator's parameters that is not inferred."""
+        return {name: self.space.fixed.get(name, self.space.specs[name].nominal) for name in self.physical}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -207,14 +207,14 @@ class Coordinates:
     def gains(self, x: Float[np.ndarray, "n d"]) -> dict[str, Float[np.ndarray, " n"]]:
         """Values of parameters that channels want and rollouts do not, inferred or fixed."""
         return self._beside(self.values(x)) | {
-            name: np.full(len(x), value) for name, value in self.fixed.items() if name not in self.physical
+            name: np.full(len(x), value) for name, value in self.space.fixed.items() if name not in self.physical
         }
 
     def gain_tangents(
         self, x: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"]
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Derivatives of `gains` along directions."""
-        zero = {name: np.zeros(len(x)) for name in self.fixed if name not in self.physical}
+        zero = {name: np.zeros(len(x)) for name in self.space.fixed if name not in self.physical}
         return self._beside(self.slopes(x) * directions) | zero
 
     def _beside(self, columns: np.ndarray) -> dict[str, np.ndarray]:
@@ -232,9 +232,9 @@ class Coordinates:
         self, x: Float[np.ndarray, "n d"], slots: Int[np.ndarray, "recording d"]
     ) -> Float[np.ndarray, "n recording physical"]:
         """Inputs of the simulator for each recording."""
-        start = np.array([self.fixed.get(name, self.nominal[name]) for name in self.physical], dtype=float)
+        start, specs = np.array(list(self.nominal.values())), [self.space.specs[name] for name in self.physical]
         found = self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
-        return np.clip(found, *np.transpose([self.limits.get(name, (-np.inf, np.inf)) for name in self.physical]))
+        return np.clip(found, *np.transpose([(spec.low, spec.high) for spec in specs]))
 
     def physical_tangents(
         self,

@@ -129,7 +129,7 @@ class Deadline:
 
 
 def about(seconds: float) -> str:
-    """A time in words, as rough as it is known."""
+    """A time in words, rounded to its accuracy."""
     if seconds < 90.0:
         return f"about {max(round(seconds), 1)} s"
     return f"about {seconds / 60.0:.0f} min"

@@ -503,7 +503,7 @@ def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"
 
 
 def _searching(target: FitTarget) -> LaplaceConfig:
-    """How `calibrate` searches; rows of a body at rest do not depend on the rows before them, and have one horizon."""
+    """Search settings of `calibrate`; rows of a body at rest are independent, and have one horizon."""
     rests = getattr(target.forward.lanes.simulator, "integrator", None) == QUASI_STATIC
     return LaplaceConfig(tolerance=CLIMBED, **({"blocks": 1} if rests else {}))
 

@@ -110,7 +110,7 @@ class Gain:
 
     @property
     def trajectories(self) -> int:
-        """How many there are."""
+        """Number of trajectories."""
         return len(self.differences)
 
     @property

@@ -225,7 +225,7 @@ class Answer:
 
     @property
     def law(self) -> Described | None:
-        """The law that joins the model for good; None without one."""
+        """The adopted law; None without one."""
         found = self.causes.described
         return found if found is not None and found.holds else None
 

@@ -1,4 +1,4 @@
-"""How long a run has waited for processors that other programs held."""
+"""Time that a run has waited for processors used by other programs."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class Balance(NamedTuple):
 
     @property
     def other_loss(self) -> Float[Array, " rows"]:
-        """Energy that went elsewhere [J]: into the damping of implicit Euler, which vanishes with the time step, and
+        """Other dissipated energy [J]: into the damping of implicit Euler, which vanishes with the time step, and
         into effects that hold or dissipate energy (a Prony branch, softening, a wall, drag, compliant cables)."""
         given = self.cable_work + self.contact_work - self.damping_loss
         return given - (self.total_energy - self.total_energy[0])

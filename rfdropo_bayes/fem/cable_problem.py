@@ -57,7 +57,7 @@ def settle_cables(
         return usable & (velocity < 0.0)
 
     def searched(current: Array, change: Array, velocity: Array, moving: Array) -> Array:
-        """How far to go along a change of the impulses."""
+        """Step length along a change of the impulses."""
 
         def slope(share: Any) -> Array:
             reached = velocity + share * moving

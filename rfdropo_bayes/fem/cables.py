@@ -248,7 +248,7 @@ def _at_stations(
 
 
 class Held(NamedTuple):
-    """How taut cables hold the ends of elements: forces and moments of changes of strain times length, in space."""
+    """Stiffness of taut cables at the ends of elements: forces and moments per strain times length, in space."""
 
     force: Matrix  # by stretch and shear [N/m]
     mixed: Matrix  # force by bending and twist [N]

@@ -98,7 +98,7 @@ class State(NamedTuple):
 
 
 class StepInfo(NamedTuple):
-    """How a step went."""
+    """Diagnostics of a step."""
 
     diverged: Bool[Array, ""]  # the step was not finite, or left the body's surroundings, and was not taken
     converged: Bool[Array, ""]  # whether the impulses of all constraints were found

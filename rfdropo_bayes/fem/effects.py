@@ -15,7 +15,7 @@ Scalar = Float[Array, ""] | float
 
 
 class BendingLaw(NamedTuple):
-    """How the moments of a section answer its bending and twist, beyond its profile; null 0 for all."""
+    """Moments of a section in response to bending and twist, beyond its profile; null 0 for all."""
 
     fibre: Scalar = 0.0  # c: energy of a fibre E (x^2 - c x^3) / 2 of its strain x; -1 St. Venant-Kirchhoff, 2/3 rubber
     anisotropy: Scalar = 0.0  # ln of EI in the xz plane over EI in the yz plane; their product stays

@@ -37,7 +37,7 @@ NO_TIME = Stage(0.0, 1.0, 0.0, True)
 
 
 class EquilibriumInfo(NamedTuple):
-    """How well the body is in equilibrium."""
+    """Quality of an equilibrium."""
 
     residual: Float[Array, ""]  # largest force on a station out of balance / sum of the loads
     converged: Bool[Array, ""]  # the body came to rest, cable problem solved

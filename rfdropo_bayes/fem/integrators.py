@@ -57,7 +57,7 @@ class Stage(NamedTuple):
 
     @property
     def going(self) -> Any:
-        """Share of the change of velocity in the stage before with which the motion goes on."""
+        """Share of the earlier stage's velocity change with which the motion continues."""
         return self.carried + 1.0 - self.wide
 
 

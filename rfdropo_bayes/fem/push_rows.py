@@ -80,7 +80,7 @@ def meet(
 def _widened(
     touch: Touch, cube: CubeState, twist: Float[Array, "stations 6"], stage: Stage, time_step: Scalar
 ) -> Float[Array, ""]:
-    """How much longer a stage is for its impacts: as long as the first of them is past, see ``fem.integrators``."""
+    """Factor on the length of a stage with impacts: as long as the first of them is past, see ``fem.integrators``."""
     opening = touch.on_cube[:, 0] @ twist_of(cube) + jnp.einsum("sir,si->r", touch.rows[..., ::3], twist)
     closes = (touch.gap < 0.0) & (opening < 0.0)
     past = jnp.where(closes, touch.gap / jnp.where(closes, opening, 1.0), 0.0)
@@ -90,7 +90,7 @@ def _widened(
 
 
 def _impact(change: Float[Array, " contacts"]) -> Float[Array, " contacts"]:
-    """How much of an impact a change of the closing speed [m/s] is, from 0 to 1."""
+    """Degree to which a change of the closing speed [m/s] is an impact, from 0 to 1."""
     return change**2 / (change**2 + REBOUND**2)
 
 

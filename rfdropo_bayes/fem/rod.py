@@ -161,18 +161,18 @@ def joined(maps: Sequence[PointMap]) -> PointMap:
 
 
 def tributary_lengths(body: Rod) -> Float[np.ndarray, " stations"]:
-    """Length of the body [m] that each station stands for."""
+    """Length of the body [m] that belongs to each station."""
     half = np.diff(body.station) / 2.0
     return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
 
 
 def drag_areas(body: Rod) -> Float[np.ndarray, " stations"]:
-    """Width times length [m2] that each station stands for."""
+    """Width times length [m2] that belongs to each station."""
     return tributary_lengths(body) * np.sum(body.half_width, axis=1)
 
 
 def inertia_per_density(body: Rod) -> tuple[Float[np.ndarray, " stations"], Float[np.ndarray, "stations 3"]]:
-    """Volume [m3] and second moments about the section's axes [m5] that each station stands for: lumped mass and rotary
+    """Volume [m3] and second moments about the section's axes [m5] that belong to each station: lumped mass and rotary
     inertia over density."""
     half = np.diff(body.station) / 2.0
     about_y, about_x = body.mass_moment_area.T

@@ -19,7 +19,7 @@ class MethodOptions:
     """Base of the options of every method: frozen dataclasses with a section "Attributes" in their docstring.
 
     Attributes:
-        called: name of the class at the front door, ``import rfdropo_bayes as rb``.
+        called: name of the class in ``import rfdropo_bayes as rb``.
     """
 
     called: ClassVar[str]

@@ -98,7 +98,7 @@ def run(
         options: table of options, or the method's configuration itself.
         key: random key; the same key gives the same draws.
         checkpoint_dir: folder for checkpoints; None keeps none.
-        resume: go on from the checkpoints found there; a finished run is then only read.
+        resume: continue from its checkpoints; a finished run is then only read.
         progress: receives reports of stages.
 
     Raises:

@@ -269,7 +269,7 @@ class Logbook:
 
     Attributes:
         folder: folder for checkpoints; None keeps none.
-        resume: go on from the checkpoints found there.
+        resume: continue from its checkpoints.
         progress: receives reports of stages.
         begin, end: shares of the whole work before and after this part.
     """

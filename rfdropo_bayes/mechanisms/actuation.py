@@ -470,7 +470,7 @@ class GuideAzimuth(MemorylessActuation):
 
 
 def _strains(cable: Cable, ends: Sequence[float], turn: float) -> Float[np.ndarray, " strain"]:
-    """How much of a cable the bending about both axes and the stretch of each segment take up, by its length."""
+    """Shortening of a cable by bending about both axes and by stretch of each segment, relative to its length."""
     azimuth, radius, found, begin = math.radians(cable.azimuth_deg) + turn, cable.guide_radius_m[-1], [], 0.0
     for end in ends:
         length = max(min(end, cable.guide_z_m[-1]) - begin, 0.0)

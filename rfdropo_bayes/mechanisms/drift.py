@@ -65,7 +65,7 @@ def _rate(spec: ParameterSpec) -> ParameterSpec:
 
 
 class ActuationDrift(Drift, SteppedActuation):
-    """Drift of a mechanism of actuation that looks at the command of the moment."""
+    """Drift of a mechanism of actuation that depends on the present command."""
 
     stage = "actuation"
     inside_drive = False
@@ -82,7 +82,7 @@ class ActuationDrift(Drift, SteppedActuation):
 
 
 class SensingDrift(Drift):
-    """Drift of a mechanism of sensing that looks at the markers of the moment."""
+    """Drift of a mechanism of sensing that depends on the present markers."""
 
     stage = "sensing"
 

@@ -153,7 +153,7 @@ class MechanismChoice:
 def choose_mechanisms(
     names: Iterable[Any], *, folder: Path = Path(), where: str = "[model] mechanisms"
 ) -> tuple[MechanismChoice, ...]:
-    """The mechanisms that names stand for.
+    """The named mechanisms.
 
     Args:
         names: names in the registry, ``module:ClassName`` of user code, or mechanisms as classes or objects.
@@ -185,7 +185,7 @@ def source_of(mechanism: Any) -> str:
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:
-    """The class that ``module:ClassName`` or ``file.py:ClassName`` stands for."""
+    """The class named by ``module:ClassName`` or ``file.py:ClassName``."""
     source, _, attribute = name.rpartition(":")
     try:
         if source.endswith(".py"):

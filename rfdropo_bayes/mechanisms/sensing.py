@@ -30,7 +30,7 @@ class CameraRotation:
     cause = "registration of the motion-capture frame to the robot's base"
     remedy = "register the frame on three points of the base"
     parameters = tuple(
-        ParameterSpec(f"camera_rotation_{axis}", "rad", -0.8, 0.8, 0.0, _ANGLE, f"rotation of the frame about {axis}")
+        ParameterSpec(f"camera_rotation_{axis}", "rad", -1.6, 1.6, 0.0, _ANGLE, f"rotation of the frame about {axis}")
         for axis in "xyz"
     )
 
@@ -55,7 +55,7 @@ class CameraScale:
     cause = "scale calibration of the motion capture"
     remedy = "measure a known length"
     parameters = (
-        ParameterSpec("camera_scale_error", "-", -0.5, 0.5, 0.0, normal(0.02), "relative error of measured lengths"),
+        ParameterSpec("camera_scale_error", "-", -0.9, 9.0, 0.0, normal(0.02), "relative error of measured lengths"),
     )
 
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:

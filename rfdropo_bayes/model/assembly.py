@@ -88,7 +88,7 @@ def robot_of(spec: ModelSpec) -> Robot:
 
 
 def integrator_of(spec: ModelSpec) -> str | None:
-    """How time steps are taken: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
+    """Integrator of time steps: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
     black box."""
     if isinstance(spec.robot, BlackBox):
         return None
@@ -248,7 +248,7 @@ def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"])
 
 
 def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) -> dict[str, Entry]:
-    """Write out the keys that stand for several parameters: ``offset`` for ``offset_x``, ``offset_y``, ``offset_z``."""
+    """Expand keys for several parameters: ``offset`` for ``offset_x``, ``offset_y``, ``offset_z``."""
     known = [spec.name for spec in specs]
     expanded: dict[str, Entry] = {}
     for name, entry in table.items():
@@ -316,7 +316,7 @@ def build_model(
     """The probabilistic program of a model for the given recordings.
 
     Args:
-        spec: what is meant; simulator: with all mechanisms.
+        spec: the model; simulator: with all mechanisms.
         trajectories: the recordings.
         specs: parameters that may be inferred; all by default.
         fitted: number of recordings, the first ones, that are fitted; all by default.

@@ -364,7 +364,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experime
 
 
 def matching(names: Sequence[str], patterns: str | Sequence[str], *, where: str) -> list[str]:
-    """Recordings that ``"all"``, a name or a wildcard pattern stand for; InputError if one stands for none."""
+    """Recordings of ``"all"``, a name or a wildcard pattern; InputError if one matches no recording."""
     from fnmatch import fnmatchcase
 
     if patterns == "all":

@@ -85,7 +85,7 @@ def run_folder(
         options: settings of the command line that results depend on.
         data: hashes of the recordings, by their names.
         texts: files named in the tables that exist in no folder, such as the description of a robot made in Python.
-        resume: go on with the run that the folder holds, if any.
+        resume: continue the run in the folder, if any.
         overwrite: start anew in any folder of this program.
 
     Yields:
@@ -225,7 +225,7 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
     """See that a command may write to a folder.
 
     Raises:
-        InputError: the folder holds a run that neither option asks to go on with or to replace.
+        InputError: the folder holds a run, and no option asks to continue or to replace it.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite contradict each other", remedy="give one of them")

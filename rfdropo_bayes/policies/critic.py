@@ -1,6 +1,6 @@
 """A critic that sees the simulator's parameters of the episode, which a robot never shows.
 
-Only the actor is exported, so that the critic may know more (Pinto et al. 2018, "Asymmetric actor critic for
+Only the actor is exported, so that the critic may have more inputs (Pinto et al. 2018, "Asymmetric actor critic for
 image-based robot learning"). Environments append the parameters to the observation; the actor's network begins with the
 numbers before them.
 """

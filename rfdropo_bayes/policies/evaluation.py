@@ -163,7 +163,7 @@ def tension_sentence(pull: Mapping[str, float], limit: float | None) -> str:
 
 
 def without_end(stopped: float, failed: float) -> str:
-    """How many episodes reached no end, and why, in words."""
+    """Number of episodes without an end, and the reason, in words."""
     return f"{stopped:.0f} stopped by the limit on tension, {failed:.0f} failed"
 
 

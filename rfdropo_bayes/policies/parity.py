@@ -56,7 +56,7 @@ def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float
 
 
 def difference(policy: ExportedPolicy, act: Act, seen: Float[np.ndarray, "row size"]) -> str | None:
-    """How an exported policy acts otherwise than ``act``, in words; None if it does not."""
+    """Difference between an exported policy and ``act``, in words; None if it does not."""
     found, wanted = policy.act(seen), np.asarray(act(seen))
     if policy.layout.kind == "discrete":
         share = float(np.mean(found != wanted))

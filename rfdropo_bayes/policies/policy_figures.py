@@ -1,4 +1,4 @@
-"""Figures of policies: how one learnt, and how often each succeeds within which distance."""
+"""Figures of policies: the learning curve, and success rates against distance."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
         summary: content of summary.json of the training.
         played: episodes of the policy that was kept.
         title: title of the experiment.
-        config: the experiment file as it was run.
+        config: the experiment file of the run.
     """
     rates = [(1e3 * limit, *success(played.episodes, limit)) for limit in THRESHOLDS]
     pictures = {

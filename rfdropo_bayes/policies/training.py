@@ -95,7 +95,7 @@ def train(
             and the checkpoint.
         seed: seed of all random numbers.
         gamma: discount factor of a control period, unless the options have one.
-        resume: go on from the checkpoint in ``out``.
+        resume: continue from the checkpoint in ``out``.
         fingerprint: settings, posterior and versions that a checkpoint must match.
         show: progress on stderr; None draws a bar on a terminal, and prints a line now and then elsewhere.
 
@@ -132,7 +132,7 @@ def train(
 
 
 def _plain(table: TrainingTable) -> dict[str, Any]:
-    """The table as it stands in a checkpoint."""
+    """The table as stored in a checkpoint."""
     try:
         return table.model_dump(mode="json")
     except PydanticSerializationError as error:
@@ -333,7 +333,7 @@ def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]
 def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None:
     """Numbers of a checkpoint; InputError if it is damaged, or of other settings.
 
-    A run that was interrupted before its first checkpoint left none: None stands for a start from the beginning.
+    A run that was interrupted before its first checkpoint left none: None starts from the beginning.
     """
     old = folder.with_name(f"{CHECKPOINT}.old")
     if not folder.exists() and old.exists():  # killed between the two renames

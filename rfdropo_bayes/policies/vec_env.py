@@ -114,7 +114,7 @@ class TrunkVecEnv(VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method that serves all lanes."""
+        """Call a method of all lanes."""
         found = getattr(self, method_name)(*method_args, **method_kwargs)
         return [found for _ in self._get_indices(indices)]
 

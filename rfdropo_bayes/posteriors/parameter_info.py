@@ -44,7 +44,7 @@ class ParameterInfo:
     """Facts about a parameter beside its draws.
 
     Attributes:
-        parameter: name in the experiment file, whoever has it.
+        parameter: name in the experiment file.
         unit: SI unit, "-" if it has none.
         low, high: hard bounds, infinite without a bound.
         prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.

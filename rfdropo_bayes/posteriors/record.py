@@ -217,7 +217,7 @@ def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
 
 
 def _predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Recordings differ in length and may differ in draws, of which ArviZ knows one number."""
+    """Recordings differ in length and may differ in the number of draws, but ArviZ has a single number of draws."""
     predicted = {i: np.asarray(r.predicted, dtype=np.float32) for i, r in enumerate(recordings)}
     data = _with_draws(predicted)
     for i, r in enumerate(recordings):
@@ -259,7 +259,7 @@ def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | Non
 
 
 def _masks(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Which observations are there; ArviZ looks for a prediction of everything that is observed data."""
+    """Masks of the observations; ArviZ looks for a prediction of everything that is observed data."""
     data = {
         f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8)) for i, r in enumerate(recordings)
     }

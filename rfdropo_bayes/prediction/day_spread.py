@@ -1,4 +1,4 @@
-"""How far a day, or another group of recordings, deviates from the values that all of a posterior's days share."""
+"""Deviation of a session, or another group of recordings, from the shared values of a posterior."""
 
 from __future__ import annotations
 

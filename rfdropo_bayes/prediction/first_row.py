@@ -198,6 +198,6 @@ def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray,
 
 
 def _errors(markers: Sequence[str], left: ModelError | None) -> Float[np.ndarray, " marker"]:
-    """How far [m] the model is off for each marker; a metre for one that was not fitted."""
+    """Error [m] of the model for each marker; a metre for one that was not fitted."""
     known = () if left is None else left.markers
     return np.array([max(left.of_marker(name), SMALLEST_ERROR) if left and name in known else 1.0 for name in markers])

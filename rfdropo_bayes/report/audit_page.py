@@ -38,7 +38,7 @@ def render_audit(
         seen: data of its figures.
         content: content of audit.json.
         title: title of the experiment.
-        config: the experiment file as it was run.
+        config: the experiment file of the run.
         outline: outline of the robot.
     """
     return render(

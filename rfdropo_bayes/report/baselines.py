@@ -1,7 +1,7 @@
 """The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, repeats, a regression on the
 commands.
 
-None of them knows anything of the robot. A calibrated simulator that does not beat them has not earned its keep.
+They use no model of the robot. A calibrated simulator that does not beat them has not earned its keep.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class BaselineErrors:
     Attributes:
         name: key in summary.json.
         title: name for people.
-        description: how it predicts, in one sentence.
+        description: the method, in one sentence.
         fit, test: its errors; None if it has none.
         reason: why it could not predict; empty if it could.
     """

@@ -22,7 +22,7 @@ class FirRegression:
     """A trained regression.
 
     Attributes:
-        lags: ages of the commands it looks at [s].
+        lags: ages of its input commands [s].
         degree: highest power of a command.
         low, high: range of each feature in training; features are cut there, so that powers do not run away.
         centre, scale: constants that standardise the features.

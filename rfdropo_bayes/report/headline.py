@@ -68,7 +68,7 @@ def _repeats(summary: Mapping[str, Any]) -> str:
 
 
 def best_baseline(summary: Mapping[str, Any], role: str, marker: str | None = None) -> tuple[str, float] | None:
-    """Title and error of the best predictor that knows nothing of the robot, of the given or the last marker; None if
+    """Title and error of the best predictor without a model of the robot, of the given or the last marker; None if
     none was scored.
     """
     scored = []

@@ -34,7 +34,7 @@ TIMES = " \u00d7 "
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters and how well it is known.
+    """A product of powers of parameters and its uncertainty.
 
     Attributes:
         powers: exponent of each parameter that takes part; the largest is 1 in absolute value.
@@ -63,7 +63,7 @@ def identify(record: PosteriorRecord, *, names: list[str] | None = None) -> list
 
     Args:
         record: posterior, and prior draws to compare with.
-        names: parameters to look at; by default the parameters shared by all recordings.
+        names: examined parameters; by default the parameters shared by all recordings.
     """
     chosen = [info for info in record.free if (not info.scope.owner if names is None else info.name in names)]
     varying = [info for info in chosen if np.ptp(record.flat(info.name)) > 0]

@@ -84,7 +84,7 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
     Args:
         record: posterior and predictions.
         summary: content of summary.json, as `build_summary` made it.
-        config: the experiment file as it was run, TOML.
+        config: the experiment file of the run, TOML.
     """
     return render(
         "page.html.j2",

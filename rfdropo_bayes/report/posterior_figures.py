@@ -41,7 +41,7 @@ def _transformed(record: PosteriorRecord, name: str) -> Float[np.ndarray, " n"]:
 
 
 class _Scale:
-    """How the values of one parameter are put on an axis: unit, logarithm, range."""
+    """Axis of the values of one parameter: unit, logarithm, range."""
 
     def __init__(self, info: ParameterInfo, values: Float[np.ndarray, " n"], *, margin: float = 0.08) -> None:
         self.factor, unit = display_unit(info.unit, float(np.median(np.abs(values))))

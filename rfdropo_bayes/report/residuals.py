@@ -63,7 +63,7 @@ def check_residuals(
 
 
 def check(white: Sequence[Float[np.ndarray, "time series"]], counted: bool = False) -> ResidualCheck:
-    """Check of series that may have gaps (NaN); a lag counts rows that are there."""
+    """Check of series that may have gaps (NaN); a lag counts measured rows."""
     series = [column[np.isfinite(column)] for part in white for column in part.T]
     series = [column for column in series if len(column) > 1]
     values = np.concatenate(series) if series else np.zeros(0)

@@ -55,7 +55,7 @@ def goal_figure(time: Float[np.ndarray, " row"], distance: Float[np.ndarray, " r
 
 @styled
 def punctuality_figure(session: Trajectory, period: float) -> Figure:
-    """How late every cycle began, over time and in order of lateness; ``period`` of the loop [s]."""
+    """Delay of every cycle's start, over time and sorted; ``period`` of the loop [s]."""
     late = 1e3 * session.dataset["lateness"].to_numpy()
     figure = Figure(figsize=(WIDTH, 2.4))
     left, right = figure.subplots(1, 2)

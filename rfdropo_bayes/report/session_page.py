@@ -90,7 +90,7 @@ def render_session(session: MotorSession) -> str:
 
 
 def drive_rows(recording: Trajectory) -> list[dict[str, Any]]:
-    """How each drive followed: range and differences [mm], greatest tension [N], cycles without an answer [%]."""
+    """Tracking of each drive: range and differences [mm], greatest tension [N], cycles without an answer [%]."""
     set_point, length = (1e3 * recording.dataset[name].to_numpy() for name in ("set_point", "length"))
     tension, answered = recording.dataset["tension"].to_numpy(), recording.tension_mask
     assert answered is not None

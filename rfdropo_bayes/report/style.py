@@ -1,4 +1,4 @@
-"""One look for all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
+"""Common style of all figures: sizes that read at 100 % in a browser, colours that colour-blind readers can
 distinguish.
 """
 
@@ -165,7 +165,7 @@ def _inches(figure: Figure, box: Bbox) -> Bbox:
 
 
 def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
-    """Axes that stand in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
+    """Axes in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
 
     None if the figure is one piece: a single column, axes outside of a grid, or a grid too fine to be taken apart.
     """

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from rfdropo_bayes.cautions import Caution
-from rfdropo_bayes.files import output_folder, whole
+from rfdropo_bayes.files import output_folder, whole, write_json
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report.trajectory_figures import AXES, draw_band
 from rfdropo_bayes.results.calibrated import axes_or_new
@@ -36,6 +37,7 @@ class Prediction:
         group: assumed group of the commands.
         group_fitted: whether the posterior has values of the group; None if groups share all parameters.
         cautions: reasons to doubt the prediction.
+        facts: origin of commands and draws, for prediction.json.
         unseen: facts on the error in a session that no fit has seen; empty for other sessions.
     """
 
@@ -45,6 +47,23 @@ class Prediction:
     group_fitted: bool | None = None
     cautions: list[Caution] = field(default_factory=list)
     unseen: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The content of prediction.json."""
+        return {
+            **self.facts,
+            "group": self.group,
+            "group_fitted": self.group_fitted,
+            "unseen_day": self.unseen or None,
+            "rows": len(self.drawn.time),
+            "draws": int(self.drawn.predicted.shape[0]),
+            "draws_that_did_not_match_the_first_row": self.bands.attrs["draws_that_did_not_match_the_first_row"],
+            "cautions": [caution.as_dict() for caution in self.cautions],
+            "unit": "m",
+            "frame": self.bands.attrs["frame"],
+        }
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -65,13 +84,19 @@ class Prediction:
         return axes
 
     def save(self, folder: Path | str) -> list[Path]:
-        """Write prediction.nc and prediction.csv; return their paths."""
-        files = [Path(folder) / "prediction.nc", Path(folder) / "prediction.csv"]
+        """Write prediction.nc, prediction.csv and prediction.json; return their paths.
+
+        The first has mean and the 5, 25, 75 and 95 % quantiles of the measurement, in metres, in the robot's base
+        frame, the second the same, one row per time. The centre of a pushed object is in both files, every draw of its
+        pose in the first.
+        """
+        files = [Path(folder) / f"prediction.{ending}" for ending in ("nc", "csv", "json")]
         output_folder(files[0].parent)
         with whole(files[0]) as partial:
             self.bands.to_netcdf(partial, engine="h5netcdf")
         with whole(files[1]) as partial:
             self.frame.to_csv(partial, index=False, float_format="%.6f")
+        write_json(files[2], {**self.content, "files": [str(file) for file in files[:2]]})
         return files
 
     def __repr__(self) -> str:

@@ -76,7 +76,7 @@ class DriveTravel(RobotTable):
         return np.broadcast_to(np.asarray(_NUMBERS[name] if value is None else value, float), (count,))
 
     def holds_for(self, recording: str, group: str) -> bool:
-        """Whether the table speaks of a recording of a group, or of a piece of it."""
+        """Whether the table applies to a recording of a group, or to a piece of it."""
         patterns = (self.recordings,) if isinstance(self.recordings, str) else self.recordings
         return group in patterns or any(fnmatchcase(whole(recording), pattern) for pattern in patterns)
 

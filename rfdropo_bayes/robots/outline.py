@@ -53,6 +53,9 @@ class RobotOutline:
         mass: mass of the body [kg]; None for silicone of its volume.
         young_modulus: Young's modulus [Pa].
         segment_lengths: lengths of the segments, base to tip; equal by default.
+        segment_azimuths: azimuth of the first cable of each segment [deg]; cables of all segments are spread evenly by
+            default.
+        azimuth_evidence: reason for these azimuths, if they were found from a recording.
         usual_command: size of usual commands, in their unit.
         assumed: names of attributes that have default values.
     """
@@ -76,6 +79,8 @@ class RobotOutline:
     mass: float | None = None
     young_modulus: float = 1e6
     segment_lengths: tuple[float, ...] | None = None
+    segment_azimuths: tuple[float, ...] | None = None
+    azimuth_evidence: str = ""
     usual_command: float | None = None
     assumed: frozenset[str] = frozenset()
 
@@ -150,6 +155,11 @@ class RobotOutline:
         station = np.array(section_profile([self.section]).station_m)
         return 0.5 * (station[1::2] + station[2::2])
 
+    def first_azimuths(self) -> list[float]:
+        """Azimuth of the first cable of each segment [deg]."""
+        even = [360.0 / self.cables * segment / self.segments for segment in range(self.segments)]
+        return list(self.segment_azimuths or even)
+
     def segment_ends(self) -> list[float]:
         """Height at which each segment ends [m]."""
         lengths = self.segment_lengths or (self.length / self.segments,) * self.segments
@@ -191,8 +201,10 @@ class RobotOutline:
 
 def not_given(answers: Mapping[str, Any]) -> frozenset[str]:
     """Names of the answers of a `RobotOutline` that are taken as defaults, and that its shape needs."""
-    needless = {"assumed", "usual_command"} | ({"disks"} if answers.get("shape") != "disks" else set())
-    needless |= {"segment_lengths"} if answers.get("segments", 1) == 1 else set()
+    needless = {"assumed", "usual_command", "azimuth_evidence"} | (
+        {"disks"} if answers.get("shape") != "disks" else set()
+    )
+    needless |= {"segment_lengths", "segment_azimuths"} if answers.get("segments", 1) == 1 else set()
     return frozenset(field.name for field in fields(RobotOutline) if field.name not in answers) - needless
 
 
@@ -272,12 +284,13 @@ def _cables(o: RobotOutline) -> list[str]:
     radius = at_base * (1.0 + (tip / o.radius - 1.0) * heights / o.length)
     lines = [
         "# Cables at their azimuth, from +x towards +y, through guides up to their ends."
-        + _mark(o, "cables", "cable_radius", "segment_lengths")
+        + _mark(o, "cables", "cable_radius", "segment_lengths", "segment_azimuths"),
+        *([f"# ASSUMED azimuths: {o.azimuth_evidence}."] if o.azimuth_evidence else []),
     ]
     names = o.cable_names()
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
-        azimuth = 360.0 / o.cables * (cable + segment / o.segments)
+        azimuth = 360.0 / o.cables * cable + o.first_azimuths()[segment]
         end = o.segment_ends()[segment]
         if o.shape == "disks":  # cables are tied to the disk that is nearest to the end of their segment
             end = heights[np.argmin(np.abs(heights - end))]

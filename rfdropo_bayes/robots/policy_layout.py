@@ -80,7 +80,7 @@ class PolicyLayout:
 
     @property
     def size(self) -> int:
-        """How many numbers an observation has."""
+        """Size of an observation."""
         return sum(part.size for part in self.observation)
 
     @property
@@ -183,7 +183,7 @@ class Earlier:
         self._commands[rows], self._moved[rows] = commands[:, None], 0.0
 
     def add(self, commands: Float[np.ndarray, "lane channel"], moved: Float[np.ndarray, "lane size"]) -> None:
-        """Note the command that was in force until now, and how far the markers had come under it [m]."""
+        """Store the previous command, and the displacement of the markers under it [m]."""
         for kept, latest in ((self._commands, commands), (self._moved, moved)):
             if kept.shape[1]:
                 kept[:, 1:] = kept[:, :-1].copy()

@@ -189,7 +189,8 @@ class Robot(RobotTable):
         for name, place in points.items():
             width = np.stack([np.interp(place[:, 2], station, half[:, axis]) for axis in (0, 1)], axis=1)
             outside = (place[:, 2] < station[0] - 1e-9) | (place[:, 2] > station[-1] + 1e-9)
-            outside |= np.any(np.abs(place[:, :2]) > width + 1e-9, axis=1)
+            if not name.startswith("marker"):  # markers may stand on stalks
+                outside |= np.any(np.abs(place[:, :2]) > width + 1e-9, axis=1)
             if np.any(outside):
                 row = int(np.argmax(outside))
                 x, y, z = place[row]
@@ -229,10 +230,11 @@ class Robot(RobotTable):
                 by name. These four are required. ``shape``: "cylinder", "cone" (with ``tip_radius``), "tube" (with
                 ``inner_radius``), or "disks" on a backbone of ``inner_radius`` (``disks`` of ``disk_thickness``).
                 ``segments`` of ``segment_lengths`` (equal by default), each with its own ``cables`` evenly around it,
-                at ``cable_radius`` from the axis at the base; with ``pairs`` opposite cables share a motor.
-                ``command_unit``: "m" of cable, "rad" or "N m" of a motor with ``spool_radius``, "N" of tension, or "-"
-                of other drives; ``usual_command``: the size of usual commands. ``gravity``: its direction, "+z" for a
-                robot that hangs. ``mass`` [kg], silicone by default; ``young_modulus`` [Pa].
+                from ``segment_azimuths`` [deg] on (``azimuth_evidence`` says why), at ``cable_radius`` from the axis at
+                the base; with ``pairs`` opposite cables share a motor. ``command_unit``: "m" of cable, "rad" or "N m"
+                of a motor with ``spool_radius``, "N" of tension, or "-" of other drives; ``usual_command``: the size of
+                usual commands. ``gravity``: its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone by
+                default; ``young_modulus`` [Pa].
 
         Raises:
             InputError: an unknown answer, a missing answer, or answers that make no robot.

@@ -181,7 +181,7 @@ class SectionedBody(RobotTable):
 
 
 def section_profile(sections: Sequence[Cylinder | Cone | Tube | Disks]) -> Body:
-    """The body that shapes make up, one after the other from the clamp to the tip.
+    """The body of consecutive shapes from the clamp to the tip.
 
     Args:
         sections: e.g. ``[Cone(length_m=0.2, layers=10, radius_m=(0.014, 0.009))]``.

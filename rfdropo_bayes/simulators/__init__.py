@@ -1,4 +1,4 @@
-"""Simulators: one call shape, whatever computes the motion."""
+"""Simulators: the same call for every engine."""
 
 from rfdropo_bayes.runtime import configure_jax
 

@@ -137,7 +137,7 @@ class BlackBox:
 
     @property
     def body(self) -> None:
-        """Nobody knows it."""
+        """Unknown."""
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
         """The pull [m] itself if commands are lengths, else `ACTION` of each range.
@@ -149,7 +149,7 @@ class BlackBox:
         return np.full(len(low), pull) if self.command_unit == "m" else ACTION * (high - low)
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
-        """All markers: nobody knows its undeformed body."""
+        """All markers: its undeformed body is unknown."""
         return tuple(range(len(self.markers)))
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:

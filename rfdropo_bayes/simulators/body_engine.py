@@ -190,7 +190,7 @@ class Engine:
 
     @property
     def lanes(self) -> int:
-        """How many rollouts it likes to be given at once."""
+        """Preferred number of rollouts per call."""
         if self.backend.name == "jax":
             return 64
         return 512 if self.is_rod else 64

@@ -1,4 +1,4 @@
-"""The bodies of a session in an engine: lanes that go on from the state in which they were left."""
+"""The bodies of a session in an engine: lanes that continue from their last state."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Sessions: many robots that go on from one control period to the next, each with its own parameters and its own time.
+"""Sessions: many robots that advance by one control period per call, each with its own parameters and time.
 
-A session is a simulator's rollout taken apart: the same drives, mechanisms, body and cameras, whose state stands still
-between two calls. Its state is plain arrays with one row a lane.
+A session splits a simulator's rollout: the same drives, mechanisms, body and cameras, whose state is kept between
+calls. Its state is plain arrays with one row per lane.
 """
 
 from __future__ import annotations

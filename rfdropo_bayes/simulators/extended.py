@@ -113,7 +113,7 @@ class ExtendedSimulator:
 
     @property
     def unsolved(self) -> Result:
-        """How a rollout ended whose constraints were not all solved."""
+        """Result code of a rollout with unsolved constraints."""
         return Result.DIVERGED
 
     def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
@@ -158,7 +158,7 @@ class ExtendedSimulator:
     ) -> Int[Array, ""] | None:
         """Time steps to simulate so that all rows within the first ``steps`` are measured as in a whole rollout.
 
-        Mechanisms of sensing may look at later rows, as cameras with a late clock do. The look-ahead is found from
+        Mechanisms of sensing may use later rows, e.g. cameras with a late clock. The look-ahead is found from
         their response to positions that are NaN from some row on.
         """
         ahead = TimedSensingMechanism | CommandedSensingMechanism

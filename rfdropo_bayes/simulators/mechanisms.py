@@ -211,7 +211,7 @@ class SteppedActuation:
 
 
 class MemorylessActuation:
-    """Base of mechanisms of actuation that look at nothing but the command of the moment."""
+    """Base of mechanisms of actuation that depend on the present command only."""
 
     def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Return the command that reaches the cables, from the sent command."""

@@ -14,7 +14,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Result(IntEnum):
-    """How a rollout ended. Everything but OK is counted and reported, and gets no weight in any inference."""
+    """Result code of a rollout. Everything but OK is counted and reported, and gets no weight in any inference."""
 
     OK = 0
     DIVERGED = 1
@@ -94,7 +94,7 @@ class Simulator(Protocol):
 
     @property
     def lanes(self) -> int:
-        """How many rollouts it likes to be given at once."""
+        """Preferred number of rollouts per call."""
 
     def commands(
         self,

@@ -142,7 +142,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def discretised(self) -> dict[str, object]:
-        """How the body is cut, for the record."""
+        """Discretisation of the body, for records."""
         raise NotImplementedError
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Any, Array, Array]:
@@ -164,7 +164,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def unsolved(self) -> Result:
-        """How a rollout ends whose constraints were not all solved."""
+        """Result code of a rollout with unsolved constraints."""
         return Result.CONTACT_NOT_CONVERGED if self.pushes else Result.CABLE_LIMIT
 
     @property

@@ -1,1 +1,1 @@
-"""The verbs of the front door and of the command line, one module each, named after the verb."""
+"""Calls of the Python interface and of the command line: one module for each verb, named after it."""

@@ -67,41 +67,42 @@ MUCH_WORSE = 2.0**0.5  # above this, more than half of the squared error exceeds
 
 def adapt(
     fit: Calibration,
-    recording: Trajectory,
+    recording: Trajectory | RecordingEntry,
     *,
     seconds: float | None = None,
     group: str | None = None,
     test: Sequence[Trajectory] = (),
     draws: int = DRAWS,
-    seed: int = 0,
+    seed: int | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
-    """Move what a day changes to one short recording of it; the body keeps its posterior.
+    """Fit the parameters of a new session to one short recording; the body keeps its posterior.
 
-    What moves are the deviations of the parameters in [model.per_group], and those in [model.per_recording]. A
-    parameter may be put into [model.per_group] now that was shared in the fit. The noise is what the fitted recordings
-    showed the model to leave, for as long as it lasted.
+    The fitted parameters are deviations of [model.per_group] and parameters of [model.per_recording]. A parameter that
+    was shared in the fit may be added to [model.per_group]. The noise has the size and the correlation time of the
+    residuals of the fitted recordings.
 
     Args:
         fit: a calibration, with its model.
-        recording: of the new day.
-        seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
-            rest is predicted.
-        group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
-        test: other recordings of the day, of which nothing but the first row is looked at; the report says how well
-            they are predicted.
-        draws: of the posterior.
-        seed: of all that is random.
-        out: folder that gets what a calibration writes; None writes nothing.
-        overwrite: start anew whatever ``out`` holds.
+        recording: a recording of the new session, or its entry in [data].
+        seconds: length of the beginning that is used; all by default. The report then shows the prediction of the rest.
+        group: name of the session; by default the recording's group in [model.groups], or else its name.
+        test: other recordings of the session, of which only the first row is used; the report scores their predictions.
+        draws: number of posterior draws.
+        seed: seed of all random numbers; by default from the model's experiment.
+        out: folder for the files of a calibration; None writes nothing.
+        overwrite: replace an earlier run in ``out``.
         show: whether to show progress, see `Progress`.
 
     Raises:
-        InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
+        InputError: no parameter varies between sessions, or the fit has no residuals.
     """
-    model = model_of(given_fit(fit, "adapt"))
+    fit = given_fit(fit, "adapt")
+    if isinstance(recording, RecordingEntry):
+        fit, recording = _recorded(fit, recording)
+    model = model_of(fit)
     recording, test = given_recording(recording, "adapt"), given_recordings(test, "adapt, test")
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.spec.groups) if group is None else group
@@ -114,7 +115,7 @@ def adapt(
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
     asked = Day(fit, moved, scopes, own, head, tested, "" if rest is None else rest.name, day, left)
-    run = partial(_adapt, asked, draws, seed, show)
+    run = partial(_adapt, asked, draws, model.settings.seed if seed is None else seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -220,7 +221,7 @@ class Adapted(NamedTuple):
 
 
 def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
-    """Fit the day to as much of the recording as is looked at, and predict the rest."""
+    """Fit the session to the used part of the recording, and predict the rest."""
     fit, _, scopes, own, head, _, _, day, left = asked
     simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
@@ -339,41 +340,22 @@ def _own_of_day(fit: PosteriorRecord, scopes: Scopes, recording: str, day: str) 
     return own
 
 
-def run_adaptation(
-    run: Path,
-    model: Model,
-    entry: RecordingEntry,
-    out: Path,
-    *,
-    seconds: float | None = None,
-    group: str | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
-    show: bool | None = None,
-) -> Calibration:
-    """`adapt` a run's folder to a recording in the format of its experiment; lost markers are left out.
-
-    Args:
-        run: folder of a calibration, or of an earlier adaptation.
-        model: that was fitted, with the [data] of its experiment, see `fitted_model`.
-        entry: names the file of observations, that of the commands where the format has one, and the episode.
-        out, seconds, group, seed, overwrite, show: see `adapt`.
+def _recorded(fit: Calibration, entry: RecordingEntry) -> tuple[Calibration, Trajectory]:
+    """The recording of a file in the format of the fit's experiment, without lost markers, and the fit with it as data.
 
     Raises:
-        InputError: bad input.
+        InputError: an experiment without [data], or several recordings.
     """
+    model = model_of(fit)
     read = model.settings
     if read.data is None:
         where = model.name if model.file is None else str(model.file.path)
-        raise InputError("the experiment has no [data]", where=where, remedy="say in which format recordings are")
-    found = load_recordings(_alone(read.data, entry), model.folder)
+        raise InputError("the experiment has no [data]", where=where, remedy="name the format of the recordings")
+    data = _alone(read.data, entry)
+    found = load_recordings(data, model.folder)
     if len(found) > 1:
         raise one_at_a_time(read.data, entry.observations, len(found), "adapt to")
-    fit = Calibration.of_posterior(run, model)
-    fit = replace(fit, model=Model.of(model.spec, replace(read, data=_alone(read.data, entry))))
-    chosen = read.seed if seed is None else seed
-    options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
-    return adapt(fit, found[0], out=out, **options)
+    return replace(fit, model=Model.of(model.spec, replace(read, data=data))), found[0]
 
 
 def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
@@ -524,7 +506,7 @@ def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], B
 def _checks(
     before: Sequence[RecordingPrediction], after: Sequence[RecordingPrediction]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """How well recordings that were not looked at are predicted before and after, by recording."""
+    """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
         p.name: {
@@ -549,7 +531,7 @@ def _fared(prediction: RecordingPrediction) -> dict[str, float]:
 
 
 def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    """Before and after an adaptation in the same words, of each recording that it did not look at."""
+    """Sentence on each unused recording: its prediction error before and after the adaptation."""
     found = []
     for name, check in checks.items():
         words = [

@@ -191,7 +191,7 @@ def arcs_of(robot: Robot, markers: tuple[str, ...]) -> tuple[Arcs, list[Kind], l
 
 
 def arms(chain: Arcs, kind: Kind, azimuth: Float[np.ndarray, " guess"]) -> Float[np.ndarray, "guess cable 3 arc"]:
-    """By how much the cables of a channel of this kind shorten as the arcs bend and shorten, at each azimuth [rad]."""
+    """Shortening of the cables of a channel of this kind as the arcs bend and shorten, at each azimuth [rad]."""
     arcs = np.arange(len(chain.length))
     parts = []
     for radius, beside, end in zip(kind.radius, kind.azimuth, kind.end, strict=True):

@@ -1,4 +1,4 @@
-"""How commands reach a robot: which column drives which channel, which way round, and how sections are turned."""
+"""Mapping of commands to a robot: which column drives which channel, which way round, and how sections are turned."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rfdropo_bayes.robots.cable import Cable
 
 
 class Arrangement(NamedTuple):
-    """How commands reach a robot.
+    """Mapping of commands to a robot.
 
     Attributes:
         columns: channel k of the robot takes column ``columns[k]``.
@@ -111,10 +111,10 @@ def motion_of(position: Float[np.ndarray, "row marker 3"]) -> Moved:
 
 
 class Agreement(NamedTuple):
-    """How well two motions agree.
+    """Agreement of two motions.
 
     Attributes:
-        straight: their correlation as they are, -1 to 1.
+        straight: their correlation without rotation, -1 to 1.
         turned: the same after the turn about +z that agrees best.
         turn: turn from the simulated to the measured motion [rad].
         mirrored: the same as ``turned``, of the mirror image of the simulated motion.

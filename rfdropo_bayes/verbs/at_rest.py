@@ -34,12 +34,12 @@ class Rows(NamedTuple):
     time: Float[np.ndarray, " row"]  # [s] in its recording
 
     def of(self, index: np.ndarray) -> Rows:
-        """Some rows."""
+        """A subset of the rows."""
         return Rows(*(part[index] for part in self))
 
 
 def rows_of(recordings: Sequence[Trajectory], markers: Sequence[str], late: float = 0.0) -> Rows:
-    """All rows of recordings, with the commands that were in force so much earlier [s]."""
+    """All rows of recordings, with the commands in force a delay [s] earlier."""
     names = shared_markers(recordings, markers)
     parts = []
     for run in recordings:
@@ -73,7 +73,7 @@ def spread_rows(rows: Rows, most: int, seed: int = 0) -> np.ndarray:
 
 
 def resting(spec: ModelSpec) -> RestingRobot:
-    """The rod of a model's robot at rest, with those of its mechanisms that have no memory.
+    """The rod of a model's robot at rest, with its mechanisms without memory.
 
     Raises:
         InputError: a black box.
@@ -104,20 +104,20 @@ class RestingRobot:
     """A robot in which every row of commands is an equilibrium of its own.
 
     Args:
-        simulator: of a rod at rest, with mechanisms that have no memory.
-        shown: the markers that are told, in this order.
-        held: values of parameters that are not nominal.
+        simulator: simulator of a rod at rest, with mechanisms without memory.
+        shown: the predicted markers, in this order.
+        held: fixed parameter values; others are nominal.
     """
 
     def __init__(self, simulator: TrunkSimulator, shown: tuple[str, ...], held: Mapping[str, float]) -> None:
         self.simulator, self.shown, self.held = simulator, shown, dict(held)
 
     def showing(self, markers: Sequence[str]) -> RestingRobot:
-        """The same robot, which tells these markers alone."""
+        """The same robot with predictions of these markers alone."""
         return RestingRobot(self.simulator, tuple(markers), self.held)
 
     def with_cables(self, cables: Sequence[Cable]) -> RestingRobot:
-        """The same body, parameters and drives, with cables that run elsewhere; nothing is compiled anew."""
+        """The same body, parameters and drives, with other cables; nothing is recompiled."""
         own = self.simulator
         robot = own.robot.with_changes(cables=tuple(cables))
         assembly = assemble(robot, own.discretisation)

@@ -164,7 +164,7 @@ def nominal_paths(problem: AuditProblem) -> list[Paths]:
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
-    values = {**problem.coordinates.nominal, **problem.coordinates.fixed}
+    values = problem.coordinates.nominal
     theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
     found, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
     valid = np.asarray(recordings.line.valid)
@@ -246,8 +246,7 @@ def build_problem(
         plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
         candidates = [c for c in candidates if c.name not in table.exclude]
-    nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
-    coordinates = Coordinates(model.scopes, base, tuple(nominal), nominal, model.scopes.fixed, limits)
+    coordinates = Coordinates(model.scopes, base, tuple(spec.name for spec in specs))
     workshop = {} if workshop is None else workshop
     lanes = partial(_lanes, names=names, model=model, coordinates=coordinates, workshop=workshop)
 
@@ -380,7 +379,7 @@ def _lanes(
     """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
-    key = repr((*made, markers.tolist(), coordinates.fixed, fields))
+    key = repr((*made, markers.tolist(), coordinates.space.fixed, fields))
     if key not in workshop:
         every = _brisk(whole, markers, fields)
         slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
@@ -388,7 +387,7 @@ def _lanes(
         kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
         if len(kept) < len(names):
             fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), markers, fields)
-            null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
+            null = coordinates.nominal | coordinates.named(coordinates.null)
             every = RoutedLanes(fast, every, null)
         workshop[key] = every
     return workshop[key]
@@ -529,7 +528,7 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
         table = dict(parameter.table)
         for key in ("loc", "low", "high"):  # a size in one group is measured from null
             if key in table and parameter.scope.added_to:
-                table[key] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
+                table[key] += coordinates.space.specs[parameter.physical].nominal - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
         found[parameter.spec.name] = table

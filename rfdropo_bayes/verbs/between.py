@@ -96,7 +96,7 @@ def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> 
 def _matching(
     group: str, given: Sequence[str | Trajectory] | str | Trajectory, names: Sequence[str]
 ) -> tuple[str, ...]:
-    """Recordings that names, wildcards or recordings themselves stand for."""
+    """Recordings of names, wildcards or recordings."""
     chosen: list[str] = []
     for entry in [given] if isinstance(given, str | Trajectory) else given:
         pattern = entry.name if isinstance(entry, Trajectory) else entry

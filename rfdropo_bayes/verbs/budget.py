@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from rfdropo_bayes.bayes.batches import chunk_sizes
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 
 FIT, PREDICTIONS = 0.5, 0.2
@@ -46,11 +47,12 @@ def budget_within(minutes: float, rollout_seconds: float, predicted: float) -> B
 
 def rollout_seconds(problem: CalibrationProblem, key: PRNGKeyArray) -> float:
     """Seconds per parameter set in a batch of the prior, for all recordings, without compilation."""
-    drawn = {name: np.asarray(values) for name, values in problem.sample_prior(key, problem.chunk).items()}
+    count = chunk_sizes(problem.chunk)[0]
+    drawn = {name: np.asarray(values) for name, values in problem.sample_prior(key, count).items()}
     problem.row_log_likelihood(drawn, problem.n_rows)
     begun = time.perf_counter()
     problem.row_log_likelihood(drawn, problem.n_rows)
-    return (time.perf_counter() - begun) / problem.chunk
+    return (time.perf_counter() - begun) / count
 
 
 def timing_key(seed: int) -> PRNGKeyArray:

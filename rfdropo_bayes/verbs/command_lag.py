@@ -42,7 +42,7 @@ def left_by_rows(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)
 
 
 def best_delay(runs: Sequence[Trajectory]) -> float:
-    """How long [s] after its commands the markers move, as a quadratic map explains most."""
+    """Delay [s] of the markers behind the commands at which a quadratic map fits best."""
     step = sample_time(*(run.time for run in runs))
     delays = sorted({*DELAYS, step})
     left = [
@@ -61,7 +61,7 @@ def _positions(run: Trajectory) -> Float[np.ndarray, "row coordinate"]:
 
 
 def _shifted(command: Float[np.ndarray, "row channel"], lag: int) -> Float[np.ndarray, "row channel"]:
-    """Commands of another row, not a number beyond the ends."""
+    """Commands of another row, NaN beyond the ends."""
     moved = np.full(command.shape, np.nan)
     rows = np.arange(len(command)) - lag
     inside = (rows >= 0) & (rows < len(command))
@@ -96,7 +96,7 @@ def _quadratic(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "
 
 
 class LagWords(NamedTuple):
-    """Which row's command a pose shows, in words; and a doubt if it is another than the one that is simulated."""
+    """The row of the command that a pose shows, in words; and a doubt if the simulation uses another row."""
 
     words: str
     doubt: str | None
@@ -111,7 +111,7 @@ NAMES = {-1: "the next row", 0: "its own row", 1: "the row before", 2: "two rows
 
 
 def lag_words(runs: Sequence[Trajectory], columns: CsvColumns | None) -> LagWords:
-    """Say which row's command poses at rest show."""
+    """Find the row of the command that poses at rest show."""
     left = {each.rows: each.error for each in left_by_rows(runs)}
     best = min(left, key=lambda rows: left[rows])
     taken = 0 if columns is None or columns.commands_with_poses else 1

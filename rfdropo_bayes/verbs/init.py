@@ -18,19 +18,24 @@ from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_text
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, rows_to_fit
-from rfdropo_bayes.verbs.placement import frame_lines
+from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
+from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
 from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
+NO_MOTION = "rows have no times, so each is taken for a robot at rest"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
 """Formats that come from motion capture, which loses markers now and then."""
+FAR_ORIGIN = 0.1
+"""Share of the body's length: a frame whose origin lies farther from the base is moved there."""
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
 
@@ -152,9 +157,11 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
 
-    def write(data: list[str], slow: str | None = None, first: Trajectory | None = None) -> Experiment:
-        rests = slow is not None
-        lines = [*_head(outline.name), *data, *_simulator(slow), *_model(made, guess, first, rests=rests)]
+    def write(
+        data: list[str], slow: str | None = None, first: Trajectory | None = None, seen: Frame | None = None
+    ) -> Experiment:
+        model = _model(made, outline, guess, first, seen, rests=slow is not None)
+        lines = [*_head(outline.name), *data, *_simulator(slow), *model]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
@@ -167,19 +174,41 @@ def write_first_files(
         outline.markers,
         recordings,
         commands,
-        guess,
-        outline.gravity,
+        guess=guess,
+        gravity=outline.gravity,
         cables=outline.cable_names(),
     )
     plain = write(tables())
     first = _first_recording(plain, folder)
-    if first is not None:
-        usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
-        if usual > 0.0:
-            robot.write_text(robot_text(replace(outline, usual_command=usual)), encoding="utf-8")
-            made = Robot.load(robot)
-        slow, rows = slow_motion(made, first), rows_to_fit(first) if len(recordings) == 1 else None
-        write(tables(frame=_frame(plain, made, guess), rows=rows), slow, first)
+    if first is None:
+        return robot, experiment
+    usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
+    outline = replace(outline, usual_command=usual or None)
+    robot.write_text(robot_text(outline), encoding="utf-8")
+    made = Robot.load(robot)
+    timed = guess.time is not None or guess.sample_time is not None
+    frame, slow = _frame(plain, made, guess), slow_motion(made, first) if timed else NO_MOTION
+    rows = rows_to_fit(first) if len(recordings) == 1 else None
+    placed = write(tables(frame=frame, rows=rows), slow, first)
+    seen = _first_recording(placed, folder)
+    columns = None if placed.data is None else placed.data.columns
+    if seen is None or columns is None or not usual:
+        return robot, experiment
+    found = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed)
+    ordered = guess
+    if found.arrangement is not None:
+        turns = np.degrees(found.arrangement.turns)
+        azimuths = tuple(round(float(a + t), 1) % 360.0 for a, t in zip(outline.first_azimuths(), turns, strict=True))
+        outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=found.evidence)
+        robot.write_text(robot_text(outline), encoding="utf-8")
+        made = Robot.load(robot)
+        ordered = guess._replace(commands=[guess.commands[column] for column in found.arrangement.columns])
+    if found.frame is not None:
+        turned = found.frame.quarter.T
+        if not np.allclose(turned, np.eye(3)) or np.linalg.norm(found.frame.shift) > FAR_ORIGIN * made.length:
+            frame = moved_frame(columns, turned, -turned @ found.frame.shift)
+            found = found._replace(frame=found.frame._replace(shift=np.zeros(3)))
+    write(tables(guess=ordered, frame=frame, rows=rows), slow, first, found.frame)
     return robot, experiment
 
 
@@ -377,11 +406,19 @@ def _simulator(slow: str | None) -> list[str]:
     ]
 
 
-def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests: bool) -> list[str]:
-    """The tables [model] and [inference]."""
-    mechanisms, tensions = installed_mechanisms(robot), guess is not None and bool(guess.tensions)
+def _model(
+    robot: Robot,
+    outline: RobotOutline,
+    guess: Guess | None,
+    first: Trajectory | None,
+    seen: Frame | None,
+    *,
+    rests: bool,
+) -> list[str]:
+    """The tables [model] and [inference]; ``seen`` is the frame in which a rod at rest explains the recording."""
+    mechanisms, tensions = installed_mechanisms(robot, outline.assumed), guess is not None and bool(guess.tensions)
     wanted = ["young_modulus = {}  # over the body's weight: how stiff it is"]
-    if tensions:
+    if tensions or robot.command_unit in ("N", "N m"):
         wanted.append("trunk_mass = {}  # weigh it, and state it under [[model.weighed]]")
     if robot.command_unit == "rad":
         wanted.append("spool_radius = {}  # cable wound up per angle")
@@ -399,7 +436,7 @@ def _model(robot: Robot, guess: Guess | None, first: Trajectory | None, *, rests
         "",
         "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
         *wanted,
-        *installed_priors(robot, first),
+        *installed_priors(robot, first, seen, outline.assumed),
         "",
         "[inference]",
         'method = "laplace"      # rfdropo methods lists them',

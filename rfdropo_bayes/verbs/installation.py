@@ -6,10 +6,13 @@ shares of the largest pull and of the body's length, and angles of a frame that 
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.registration import Frame
 
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
@@ -21,6 +24,8 @@ TILT, TURN = 0.1, 0.5
 0.3 rad."""
 GAIN = 0.1
 """Standard deviation of the relative error of a command in metres of cable."""
+UNKNOWN = 0.5
+"""The same of a robot whose cables' distance from the axis, or whose length, was not given."""
 FEWEST_ROWS = 60
 """Rows of a recording whose last third, 20 rows, is worth a test."""
 
@@ -31,29 +36,46 @@ def largest_pull(robot: Robot, recording: Trajectory) -> float:
     return float(np.max(np.abs(commands @ np.asarray(robot.channel_matrix(robot.nominal())).T)))
 
 
-def installed_mechanisms(robot: Robot) -> list[str]:
-    """Mechanisms of the base model: the measuring frame, the body's stiffness in tension, the gain of the drives."""
+def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[str]:
+    """Mechanisms of the base model: the measuring frame, the body's stiffness in tension, the gain of the drives, and
+    the scale of lengths if the body's length was ``assumed``."""
     gain = ["command_gain"] if robot.command_unit == "m" else []
-    return ["axial_stiffness", "camera_rotation", *gain]
+    return ["axial_stiffness", "camera_rotation", *gain, *(["camera_scale"] if "length" in assumed else [])]
 
 
-def installed_priors(robot: Robot, recording: Trajectory | None) -> list[str]:
-    """Lines of [model.priors] of a robot as it is installed, from its sizes and its first recording."""
+def installed_priors(
+    robot: Robot, recording: Trajectory | None, frame: Frame | None = None, assumed: Collection[str] = ()
+) -> list[str]:
+    """Lines of [model.priors] of a robot as it is installed.
+
+    Args:
+        robot: whose lengths they are measured by.
+        recording: whose commands zeros of cables are measured by.
+        frame: in which a rod at rest explains that recording: priors are centred there.
+        assumed: answers of the robot's outline that were not given, which have wide priors.
+    """
     lines = []
 
-    def normal(name: str, scale: float, words: str) -> None:
-        lines.append(f'{name} = {{ distribution = "Normal", loc = 0.0, scale = {scale:.2g} }}  # {words}')
+    def normal(name: str, scale: float, words: str, loc: float = 0.0) -> None:
+        lines.append(f'{name} = {{ distribution = "Normal", loc = {loc:.3g}, scale = {scale:.2g} }}  # {words}')
 
     if robot.initial_displacement_names:
         pull = robot.stroke if recording is None else largest_pull(robot, recording)
         if pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
-    normal("offset", ORIGIN * robot.length, f"origin of the measuring frame: {ORIGIN:g} of the body's length")
-    for axis in "xy":
-        normal(f"camera_rotation_{axis}", TILT, "tilt of the measuring frame")
-    normal("camera_rotation_z", TURN, "its turn about the body's axis")
+    turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.left_over, frame.shift)
+    found = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.0f} % of the motion there"
+    for axis, place in zip("xyz", shift, strict=True):
+        words = f"origin of the measuring frame: {ORIGIN:g} of the body's length"
+        normal(f"offset_{axis}", ORIGIN * robot.length, words, place)
+    for axis, angle, wide in zip("xyz", turn, (TILT, TILT, TURN), strict=True):
+        normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{found}", angle)
     if robot.command_unit == "m":
-        normal("command_gain_error", GAIN, "travel of a cable over its command, less 1")
+        wide = UNKNOWN if "cable_radius" in assumed else GAIN
+        normal("command_gain_error", wide, "travel of a cable over its command, less 1")
+    if "length" in assumed:
+        scale = 0.0 if frame is None else frame.scale - 1.0
+        normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1", scale)
     lines.append("axial_stiffness = {}  # in tension, over that which the profile has for its bending")
     return lines
 

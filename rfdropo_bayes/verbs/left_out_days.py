@@ -94,7 +94,7 @@ def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[Recordi
 
 
 def openings_of(runs: Sequence[Trajectory]) -> dict[str, dict[str, str]]:
-    """How the commands of each recording begin, by name; see `command_openings`."""
+    """First commands of each recording, by name; see `command_openings`."""
     return {recording.name: command_openings(recording) for recording in runs}
 
 

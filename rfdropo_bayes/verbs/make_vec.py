@@ -68,7 +68,7 @@ def make_vec(
         options: further keys of [training], such as ``observation`` or ``period``.
         fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws;
             nominal values without.
-        n: how many environments.
+        n: number of environments.
 
     Raises:
         InputError: an unknown task or key, or a posterior of another robot.
@@ -141,7 +141,7 @@ def episode_settings(table: TrainingTable) -> Settings:
 
 
 def steps_of(simulator: AnySimulator) -> str:
-    """How time steps are taken: the integrator, or the engine of a black box."""
+    """Integrator of time steps: the integrator, or the engine of a black box."""
     return simulator.integrator or str(simulator.description["engine"])
 
 

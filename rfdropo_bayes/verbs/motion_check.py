@@ -59,7 +59,7 @@ class Motion(NamedTuple):
     """Recordings beside the nominal model.
 
     Attributes:
-        direction, size: of the motion.
+        direction, size: direction and size of the motion.
         proposal: another arrangement of the commands that explains the motion much better; None without.
         unit: another unit of the commands and the size of the motion under it; None without.
     """
@@ -119,7 +119,7 @@ class Compared(NamedTuple):
     Attributes:
         words: summary.
         cautions: on frame, order and unit of the commands.
-        arrangement: of the commands under which the robot agrees; None if it has no equilibrium under them.
+        arrangement: best arrangement of the commands; None without equilibria under them.
     """
 
     words: str
@@ -132,7 +132,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
 
     Args:
         spec: model of a robot; values are nominal or fixed.
-        recordings: in the frame of the base; the first `MOST` are used.
+        recordings: recordings in the base's frame; the first `MOST` are used.
         columns: table used to read them.
 
     Raises:
@@ -170,7 +170,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
 
 
 def _paths(robot: RestingRobot, rows: Rows, factor: float = 1.0) -> Paths:
-    """Rows beside the robot at rest, under commands times a factor; rows without an equilibrium are not seen."""
+    """Rows beside the robot at rest, under commands times a factor; rows without an equilibrium are masked."""
     nominal = robot.markers(factor * rows.command)[0]
     seen = np.isfinite(nominal).all(axis=2) & np.isfinite(rows.position).all(axis=2)
     return Paths(np.nan_to_num(nominal), np.nan_to_num(rows.position), seen)
@@ -187,8 +187,7 @@ def _explained(robot: RestingRobot, rows: Rows, units: Sequence[Unit]) -> tuple[
 
 
 def _proposal(found: Finding, robot: Robot, columns: CsvColumns | None, names: Sequence[str]) -> Proposal | None:
-    """The found arrangement, if it has another order, another sign, or sections turned against each other, and is
-    clearly better.
+    """The found arrangement, if it has another order, another sign or rotated sections, and is clearly better.
 
     A turn of the whole is reported as a turn of the frame, see `direction_doubt`.
     """

@@ -12,9 +12,9 @@ from rfdropo_bayes.data.named_columns import axes_matrix, axes_words
 
 AGREEING = 0.8
 """Least agreement of a reported turn. Nominal models of the arm, SOFA's trunk and the paper's trunk agree with their
-recordings to 0.88 to 0.96, and the turn between them is at most 6 degrees. Among 632 recordings of 3 s by five robots
-in the right frame, with prior parameters, 2 are reported as turned and none as mirrored (`benchmarks/frame_check.py`);
-25 agree less.
+recordings to 0.88 to 0.96, and the turn between them is at most 6 degrees. With prior parameters, 2 of 632 recordings
+of 3 s by five robots in the right frame are reported as turned and none as mirrored (`benchmarks/frame_check.py`); 25
+agree less.
 """
 TURNED = np.pi / 4.0
 QUARTER = np.pi / 12.0
@@ -22,7 +22,7 @@ QUARTER = np.pi / 12.0
 
 
 class Direction(NamedTuple):
-    """How the measured motion across the body lies to the nominal one.
+    """Direction of the measured motion across the body relative to the nominal motion.
 
     Attributes:
         turn: angle [rad] about +z from the simulated motion to the measured one.

@@ -41,7 +41,7 @@ class Size(NamedTuple):
 
 
 def size_of(recordings: Iterable[Paths]) -> Size:
-    """How far markers move in recordings, and under the nominal model at the same rows."""
+    """Size of the markers' motion in recordings, and under the nominal model at the same rows."""
     squares, count = np.zeros(2), 0
     for paths in recordings:
         for k in range(paths.mask.shape[1]):

@@ -1,4 +1,4 @@
-"""How far time step, elements and kind of motion of an experiment move its markers, measured on its own commands."""
+"""Numerical error of the markers by time step, elements and kind of motion, measured on the experiment's commands."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def unexplained(correlation: float) -> float:
 
 
 def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
-    """Look for the arrangement of a robot's commands.
+    """Find the arrangement of a robot's commands.
 
     Args:
         resting: the robot as it is written, showing the markers of the rows.
@@ -195,7 +195,7 @@ def arranged(resting: RestingRobot, arrangement: Arrangement) -> RestingRobot:
 
 
 def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key: str) -> list[str]:
-    """Lines that bring an arrangement about.
+    """Lines of an experiment file for an arrangement.
 
     Args:
         arrangement: found arrangement.

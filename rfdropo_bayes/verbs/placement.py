@@ -122,10 +122,15 @@ def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: Csv
     start, length = _start(robot, marker_names(columns), in_base(first, columns)), robot.length
     if not start.names or _rms(start.first - start.rest) <= FAR * length:
         return []
-    found, read = _frame(start, length), Read.by(columns)
+    found = _frame(start, length)
     if found is None:
         return []
-    turn, shift = found
+    return moved_frame(columns, *found)
+
+
+def moved_frame(columns: CsvColumns, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> list[str]:
+    """Lines of [data.columns], axes and origin, that turn positions in the base's frame, then shift them [m]."""
+    read = Read.by(columns)
     axes = f"axes = {axes_words(turn @ read.turn)}"
     return [axes, read.shifted(turn, shift)] if np.any(shift) else [axes]
 

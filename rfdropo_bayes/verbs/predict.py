@@ -28,7 +28,6 @@ from rfdropo_bayes.data import (
 from rfdropo_bayes.data.given_recordings import given_recording
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_json
 from rfdropo_bayes.groups import Patterns, group_of, in_group
 from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
@@ -47,7 +46,7 @@ from rfdropo_bayes.prediction.predictive import (
     predict_new,
     thin,
 )
-from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
+from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -62,24 +61,31 @@ POSE_UNITS = "m, m, m, and unit quaternion x, y, z, w"
 
 def predict(
     fit: Calibration,
-    commands: Trajectory | tuple[Any, Any],
+    commands: Trajectory | tuple[Any, Any] | Path | str,
     *,
     start: Any = None,
+    episode: int | None = None,
     draws: int = DRAWS,
-    seed: int = 0,
+    seed: int | None = None,
     group: str | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
 ) -> Prediction:
     """Predict the motion of the markers under given commands, from at most the start pose.
 
     Args:
         fit: a calibration, with its model.
-        commands: a recording, of which only the commands and the first row are used; or a pair of times [s] and
-            commands (time, channel), in the robot's unit.
-        start: positions of the markers in the first row [m], (marker, 3), for such a pair; unknown by default.
+        commands: a recording, of which only the commands and the first row are used; the name of a file in the format
+            of the model's experiment; or a pair of times [s] and commands (time, channel), in the robot's unit.
+        start: positions of the markers in the first row [m], (marker, 3), for such a pair; for a file, the file of
+            observations, if it is another file (see `load_unseen`); unknown by default.
+        episode: number of the episode, if the file is a LeRobotDataset.
         draws: number of posterior draws to simulate.
-        seed: seed of random numbers.
+        seed: seed of random numbers; by default from the model's experiment.
         group: session, robot or other group of the commands; by default the session of `adapt`, or else from
             [model.groups].
+        out: folder for prediction.nc, prediction.csv and prediction.json, see `Prediction.save`; None writes nothing.
+        overwrite: replace earlier files in ``out``.
 
     Raises:
         InputError: a calibration without its model, or commands of another robot.
@@ -90,8 +96,11 @@ def predict(
     _check_noise(record, spec.noise)
     if isinstance(commands, tuple) and len(commands) == 2 and not isinstance(commands[0], Trajectory):
         unseen = _commanded(model, commands[0], commands[1], start)
+    elif isinstance(commands, str | Path):
+        unseen = _unseen(model, str(commands), start, record.attrs.get(BEGUN), episode)
     else:
         unseen = first_row_only(given_recording(commands, "predict"))
+    asked = {"group": group, "seed": seed, "episode": episode}
     group = record.attrs.get(ADAPTED_TO) if group is None else group
     groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
     simulator = with_groups(model.simulator, groups)
@@ -105,7 +114,7 @@ def predict(
         program,
         [unseen],
         values,
-        jax.random.key(seed),
+        jax.random.key(model.settings.seed if seed is None else seed),
         chunk=simulator.lanes,
         fitted=fitted,
         left=recorded_model_error(record),
@@ -122,7 +131,37 @@ def predict(
     if isinstance(simulator, RobotSimulator):
         cautions += simulator.robot.unstated([unseen.name])
     said = [day_sentence(error) for error in slow.values() if not error.shown and group not in known]
-    return Prediction(bands, predicted, group, group in known if known else None, cautions, "".join(said))
+    named = str(commands) if isinstance(commands, str | Path) else unseen.name
+    facts = {
+        "schema_version": SCHEMA_VERSION,
+        "experiment": _path(model),
+        "posterior": None if fit.folder is None else str(fit.folder),
+        "commands": named,
+        "episode": episode,
+        "start_pose_known": start_is_known(unseen),
+        "first_command": unseen.first_command,
+        "simulator": model.simulator.description,
+    }
+    prediction = Prediction(bands, predicted, group, group in known if known else None, cautions, "".join(said), facts)
+    if out is None:
+        return prediction
+    options = {"posterior": fit.folder, "commands": named, "start": start, **asked}
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes([unseen])}
+    with run_folder(Path(out), "predict", **settings, options=options, overwrite=overwrite) as folder:
+        prediction.save(folder)
+    return prediction
+
+
+def _path(model: Model) -> str:
+    return model.name if model.file is None else str(model.file.path)
+
+
+def _unseen(model: Model, commands: str, start: Any, begun: str | None, episode: int | None) -> Trajectory:
+    """The commands of a file in the format of the model's experiment."""
+    data = model.settings.data
+    if data is None:
+        raise InputError("the experiment has no [data]", where=_path(model), remedy="name the format of the commands")
+    return load_unseen(data, model.folder, commands, start, begun=begun, episode=episode)
 
 
 def _slow_error(record: PosteriorRecord, unseen: Trajectory, groups: Patterns, scopes: Scopes) -> dict[str, DayError]:
@@ -179,78 +218,6 @@ def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
         simulator.marker_names,
         start=None if start is None else np.asarray(start, dtype=float)[None],
     )
-
-
-def run_prediction(
-    model: Model,
-    posterior: Path,
-    commands: str,
-    out: Path,
-    *,
-    start: str | None = None,
-    episode: int | None = None,
-    seed: int | None = None,
-    group: str | None = None,
-    overwrite: bool = False,
-) -> dict[str, Any]:
-    """Predict the motion of the markers under the commands of a file, from at most the start pose.
-
-    Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of the measurement, in metres, in the robot's
-    base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. A pushed object starts from
-    its measured pose; its centre is in both files, every draw of its pose in the first.
-
-    Args:
-        model: model of the calibrated experiment file.
-        posterior: folder of the calibration.
-        commands, start: see `data.load_unseen`.
-        out: folder to write to.
-        episode: number of the episode in a LeRobotDataset.
-        seed: seed of the draws; by default from the experiment.
-        group: see `predict`.
-        overwrite: replace earlier files in ``out``.
-
-    Raises:
-        InputError: bad input, or a posterior that does not belong to the experiment.
-    """
-    read, folder = model.settings, model.folder
-    path = model.name if model.file is None else str(model.file.path)
-    if read.data is None:
-        raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
-    record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(read.data, folder, commands, start, begun=record.attrs.get(BEGUN), episode=episode)
-    fit = Calibration(record, {}, "", model, Path(posterior))
-    found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
-    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "seed": seed}
-    options |= {"group": group, "episode": episode}
-    settings: dict[str, Any] = {
-        "tables": model.tables(),
-        "folder": folder,
-        "options": options,
-        "data": hashes([unseen]),
-    }
-    with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
-        facts = {
-            "schema_version": SCHEMA_VERSION,
-            "experiment": path,
-            "posterior": str(posterior),
-            "commands": commands,
-            "episode": episode,
-            "start_pose_known": start_is_known(unseen),
-            "first_command": unseen.first_command,
-            "group": found.group,
-            "group_fitted": found.group_fitted,
-            "unseen_day": found.unseen or None,
-            "rows": len(found.drawn.time),
-            "draws": int(found.drawn.predicted.shape[0]),
-            "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
-            "cautions": [caution.as_dict() for caution in found.cautions],
-            "unit": "m",
-            "frame": unseen.dataset.attrs["frame"],
-            "simulator": model.simulator.description,
-            "files": [str(file) for file in found.save(out)],
-        }
-        write_json(out / "prediction.json", facts)
-    return facts
 
 
 def _check_noise(record: PosteriorRecord, noise: str) -> None:

@@ -164,7 +164,7 @@ def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows 
 
 
 def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
-    """Cables that are asked for more than they are allowed, in words; empty if there are none."""
+    """Cables with commands beyond their limits, in words; empty if there are none."""
     low, high = asked.min(axis=0), asked.max(axis=0)
     least, most = np.array(robot.drive_limits()).T
     factor, unit = SHOWN[robot.cables[0].unit]
@@ -176,7 +176,7 @@ def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
 
 
 def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
-    """Cables that are asked for more than a body has."""
+    """Cables with commands longer than the body."""
     asked = asked_pulls(robot, recording)
     length = robot.length
     if (

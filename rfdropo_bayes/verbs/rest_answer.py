@@ -29,8 +29,8 @@ def first_answer(
     Args:
         spec: the model.
         fit: recordings to fit.
-        test: recordings that are kept apart; none if there are none.
-        arrangement: of the commands.
+        test: unseen recordings, possibly none.
+        arrangement: arrangement of the commands.
     """
     model = build_model(spec, build_simulator(spec), fit)
     robot = arranged(resting(spec), arrangement)
@@ -39,7 +39,7 @@ def first_answer(
 
 
 def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
-    """Error beside predictors without physics, every marker, and the size of every parameter."""
+    """Lines on errors, with predictors without physics and for every marker, and on every parameter."""
     without = {name: value for name, value in fit.unseen.items() if name != OWN}
     told = ", ".join(f"{name} {_millimetres(value)}" for name, value in without.items())
     marker = fit.markers[-1]
@@ -57,7 +57,7 @@ def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
 
 
 def rest_notes(fit: RestFit) -> list[str]:
-    """What the residuals of poses at rest say: worse than without physics, a drift, a difference between ways."""
+    """Notes on residuals at rest: worse than without physics, a drift, or hysteresis."""
     notes = []
     best = min((name for name in fit.unseen if name != OWN), key=lambda name: fit.unseen[name])
     if fit.unseen[OWN] > fit.unseen[best]:
@@ -69,7 +69,7 @@ def rest_notes(fit: RestFit) -> list[str]:
 
 
 def _drifts(fit: RestFit) -> list[str]:
-    """Recordings in which what is left changes steadily over time."""
+    """Recordings whose residual changes steadily over time."""
     found = []
     for number in np.unique(fit.recording):
         own = fit.recording == number
@@ -88,7 +88,7 @@ def _drifts(fit: RestFit) -> list[str]:
 
 
 def _ways(fit: RestFit) -> list[str]:
-    """The channel whose way, up or down, explains most of what is left."""
+    """The channel whose direction of motion explains most of the residual."""
     left = fit.residual[:, -1]
     whole = np.isfinite(left).all(axis=1)
     if whole.sum() < 8:
@@ -105,7 +105,7 @@ def _ways(fit: RestFit) -> list[str]:
 
 
 def estimate_words(estimate: Estimate) -> str:
-    """A parameter with its standard deviation, in the unit in which it is shown."""
+    """A parameter with its standard deviation, in its displayed unit."""
     if estimate.logarithmic:
         return f"{display_name(estimate.name)} {estimate.value:.3g} {estimate.unit} (to {100.0 * estimate.sd:.2g} %)"
     factor, unit = SHOWN_UNITS.get(estimate.unit, (1.0, "" if estimate.unit == "-" else estimate.unit))

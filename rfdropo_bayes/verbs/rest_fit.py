@@ -1,7 +1,7 @@
-"""A first answer in seconds: the model's own parameters fitted to some rows by a robot at rest, with their priors.
+"""A first fit in seconds: the model's parameters with their priors, fitted to some rows of a robot at rest.
 
-Least squares by Gauss and Newton: the step from the derivatives of all markers in all rows, and of several lengths the
-one that fits best. The noise is what is left over, so that a prior counts for little where rows say much.
+Least squares by Gauss-Newton steps with a line search. The noise is estimated from the residuals, so that a prior has
+little weight if the rows are informative.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, rows_of, spread_rows
 FITTED, SHOWN = 60, 240
 """Rows that are fitted, and rows whose residuals are shown."""
 ITERATIONS, SETTLED = 10, 1e-3
-"""Most steps, and the share of the cost that the last one must gain."""
+"""Most steps, and the least relative decrease of the cost by a step."""
 STEP = 0.01
-"""Of derivatives, in standard deviations of the prior."""
+"""Step of derivatives, in standard deviations of the prior."""
 DRAWS = 400
-"""Of the prior, for its location and size."""
+"""Number of prior draws for its location and size."""
 SHORTEST = 1e-2
-"""Shortest step that is tried, over the whole one."""
+"""Shortest trial step, relative to the full step."""
 KEPT = 0.7
 """Share of its prior standard deviation from which on a parameter counts as undetermined."""
 SMALLEST = 1e-5
@@ -47,18 +47,18 @@ class Scale(NamedTuple):
     high: float
 
     def value(self, z: Float[np.ndarray, " set"]) -> Float[np.ndarray, " set"]:
-        """The values that are so many standard deviations from the middle of the prior."""
+        """Values at a distance from the middle of the prior, in standard deviations."""
         x = self.mean + self.sd * np.asarray(z, float)
         return np.clip(np.exp(x) if self.logarithmic else x, self.low, self.high)
 
 
 class Estimate(NamedTuple):
-    """What a fit says of a parameter.
+    """Result of a fit for a parameter.
 
     Attributes:
-        value: and the value at the middle of its prior, in its unit.
+        value, prior: estimate, and middle of the prior, in its unit.
         sd: its standard deviation, relative if ``logarithmic``.
-        kept: share of the prior's standard deviation that is left.
+        kept: posterior over prior standard deviation.
     """
 
     name: str
@@ -74,12 +74,12 @@ class RestFit(NamedTuple):
     """A fit at rest.
 
     Attributes:
-        estimates: of the parameters.
-        markers: names; errors below are of the last one, root mean square [m].
+        estimates: results for the parameters.
+        markers: names; the errors are those of the last marker, root mean square [m].
         before, after: errors on the fitted rows.
-        unseen: error on rows that were not fitted, and of predictors without physics on the same rows, by their names.
-        each: error of every marker on these rows.
-        fitted, other: number of the rows of both kinds.
+        unseen: errors on unfitted rows of the fit and of predictors without physics, by name.
+        each: error of every marker on the unfitted rows.
+        fitted, other: numbers of fitted and unfitted rows.
         rows: that are shown, of all recordings; residual: measured less computed [m]; ways: whether each command was
             last changed upwards (1) or downwards (-1); recording: number of each row's recording.
     """
@@ -103,7 +103,7 @@ OWN = "own"
 
 
 def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
-    """Priors of the inferred parameters that a robot at rest has, those of single recordings left out."""
+    """Priors of the inferred parameters of a robot at rest, without parameters of single recordings."""
     drawn = scopes.sample(jax.random.key(0), DRAWS)
     found = []
     for parameter in scopes.parameters:
@@ -126,9 +126,9 @@ def least_squares(
     """Parameters in standard deviations of their priors, and their covariance.
 
     Args:
-        predict: numbers for sets of parameters, one more set than parameters; not a number if there is none.
-        measured: the same numbers as they were measured; not a number if they were not.
-        count: of parameters.
+        predict: predictions for sets of parameters, one set more than parameters; NaN without an equilibrium.
+        measured: the measured values; NaN if missing.
+        count: number of parameters.
     """
     z, information = np.zeros(count), np.eye(count)
     seen = np.isfinite(measured)
@@ -166,12 +166,12 @@ def fit_at_rest(
     """Fit a robot at rest.
 
     Args:
-        robot: showing the markers that all recordings have.
-        scopes: of the inferred parameters.
-        fit: recordings that a fit may see.
-        test: recordings that it may not; errors are those of the fitted ones if there are none.
-        late: how long [s] after its commands the body is where they ask.
-        sent: what the channels are sent, given the commands as they were recorded.
+        robot: robot with the markers of all recordings.
+        scopes: scopes of the inferred parameters.
+        fit: recordings to fit.
+        test: unseen recordings; without any, errors are those of the fitted recordings.
+        late: delay [s] of the body behind its commands.
+        sent: commands of the channels from the recorded commands.
     """
     scales = scales_of(scopes, [spec.name for spec in robot.simulator.parameters])
     every = rows_of(fit, robot.shown, late)
@@ -216,7 +216,7 @@ def fit_at_rest(
 def _without_physics(
     fit: Sequence[Trajectory], test: Sequence[Trajectory], robot: RestingRobot
 ) -> dict[str, Float[np.ndarray, "row marker 3"]]:
-    """What predictors without physics make of all rows, by their names."""
+    """Predictions of all rows without physics, by name of the predictor."""
     groups = [list(group) for group in group_repeats(fit)]
     predictors = {
         "cubic FIR": fit_fir(fit, groups, degree=3).predict,
@@ -239,19 +239,19 @@ def _estimate(scale: Scale, z: float, kept: float) -> Estimate:
 
 
 def _ways(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row channel"]:
-    """Which way each command last changed; zero before its first change."""
+    """Direction of each command's last change; zero before its first change."""
     change = np.sign(np.diff(command, axis=0, prepend=command[:1]))
     last = np.maximum.accumulate(np.where(change != 0.0, np.arange(len(command))[:, None], 0), axis=0)
     return np.take_along_axis(change, last, axis=0)
 
 
 def _even(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the rows, evenly."""
+    """At most ``most`` of the rows, evenly spaced."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int))] if len(rows) else rows
 
 
 def _rms(residual: Float[np.ndarray, "row marker 3"], counted: Bool[np.ndarray, " row"]) -> float:
-    """Root mean square distance of the last marker [m] over rows that count."""
+    """Root mean square distance of the last marker [m] over the given rows."""
     square = np.sum(residual[counted, -1] ** 2, axis=-1)
     square = square[np.isfinite(square)]
     return float(np.sqrt(np.mean(square))) if len(square) else float("nan")

@@ -48,7 +48,7 @@ def slow_motion(robot: Robot, recording: Trajectory) -> str | None:
 
 
 def command_rate(recording: Trajectory) -> float | None:
-    """How fast commands change from row to row over their size [1/s]; None for commands that never change."""
+    """Rate of change of commands from row to row, relative to their size [1/s]; None for commands that never change."""
     at = np.searchsorted(recording.command_time, recording.time, side="right")
     held: Float[np.ndarray, "time channel"] = np.vstack([recording.initial_command, recording.command])[at]
     size = np.sqrt(np.mean(np.sum((held - held.mean(axis=0)) ** 2, axis=1)))

@@ -189,7 +189,7 @@ def _plain(row: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def learnt(summary: Mapping[str, Any]) -> str:
-    """How the policy that was kept did in its evaluation, in a sentence or two."""
+    """Evaluation of the kept policy, in one or two sentences."""
     best = summary["evaluation"]
     half, most = (best[f"distance_{name}"] for name in ("median", "q95"))
     counts = without_end(best.get("tension_stopped", 0), best.get("failed", 0))

@@ -44,7 +44,7 @@ def driven_motion(
 def _turns(
     robot: Robot, pull: Float[np.ndarray, "row cable"], place: Float[np.ndarray, " place"]
 ) -> Float[np.ndarray, "place row 2"]:
-    """How far the body has turned at each height, towards x and y [rad]."""
+    """Rotation of the body at each height, towards x and y [rad]."""
     ends = np.array([cable.guide_z_m[-1] for cable in robot.cables])
     azimuth = np.radians([cable.azimuth_deg for cable in robot.cables])
     radius = np.array([np.mean([cable.anchor_radius_m, *cable.guide_radius_m]) for cable in robot.cables])
@@ -60,7 +60,7 @@ def _turns(
 
 
 def _pulls(robot: Robot, command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row cable"]:
-    """How far each cable is asked to be pulled [m]."""
+    """Commanded pull of each cable [m]."""
     return command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
 
 
@@ -109,5 +109,5 @@ def unit_of_motion(
 
 
 def _driven_words(size: Size | None, unit: str) -> str:
-    """How far the cables move the markers, in words."""
+    """Displacement of the markers by the cables, in words."""
     return f"in {unit} " + ("farther than any body bends" if size is None else f"{1e3 * size.nominal:.3g} mm")

@@ -76,7 +76,8 @@ def test_a_prediction_says_what_it_does_before_it_has_done_it(tmp_path, monkeypa
     monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.look_through", lambda *_: None)
     monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.show_prediction", lambda *_, **__: None)
     monkeypatch.setattr("rfdropo_bayes.model.model.Model.read", lambda *_: None)
-    monkeypatch.setattr("rfdropo_bayes.verbs.predict.run_prediction", lambda *_, **__: {})
+    monkeypatch.setattr("rfdropo_bayes.results.calibrated.Calibration.of_posterior", lambda *_: None)
+    monkeypatch.setattr("rfdropo_bayes.verbs.predict.predict", lambda *_, **__: SimpleNamespace(content={}))
     asked = ["predict", str(tmp_path), "--commands", "next.csv", "--out", str(tmp_path / "out")]
     spoken = CliRunner().invoke(app, asked)
     assert spoken.stderr == f"predicting next.csv with draws of {tmp_path}\n"

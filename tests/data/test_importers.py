@@ -173,6 +173,21 @@ def test_plain_csv_converts_through_its_mapping(plain):
     assert recording.cable_names == ("motor",)
 
 
+def test_positions_are_counted_from_a_marker_of_a_base_that_was_moved(plain):
+    """A camera that is moved from row to row changes nothing beside the marker of the base."""
+    still = read_plain_csv(plain, CsvColumns.model_validate(MAPPING)).position
+    header, *lines = plain.read_text().splitlines()
+    away = np.random.default_rng(0).normal(scale=100.0, size=(len(lines), 3))
+    moved = [f"{header},base_x,base_y,base_z"]
+    for line, base in zip(lines, away, strict=True):
+        time, *rest = line.split(",")
+        place = [float(value) + b for value, b in zip(rest[:3], base, strict=True)]
+        moved.append(",".join([time, *(f"{value:.9f}" for value in place), *rest[3:], *(f"{b:.9f}" for b in base)]))
+    plain.write_text("\n".join(moved))
+    beside = CsvColumns.model_validate(MAPPING | {"base_marker": ["base_x", "base_y", "base_z"]})
+    np.testing.assert_allclose(read_plain_csv(plain, beside).position, still, atol=1e-10)
+
+
 def test_the_origin_of_the_base_is_taken_off_in_the_frame_and_unit_of_the_file(plain):
     """The base is 100, 20 and -30 mm along the file's axes, which the base frame calls x, -z and y."""
     read = read_plain_csv(plain, CsvColumns.model_validate(MAPPING))

@@ -25,7 +25,7 @@ def test_a_recording_is_given_the_shared_value_and_its_group_s_deviation():
     """As the calibration gives it, and with the derivatives of that."""
     groups = gather_groups(RECORDINGS[:2], {"a": "a*"}) | {"a": ("a1", "a2")}
     space = build_scopes(SPECS, {"modulus": {}, "zero": {}}, {}, RECORDINGS[:2], pooled={"zero": Pooled(0.02, groups)})
-    coordinates = Coordinates(space, len(space.names), ("zero", "modulus"), {"zero": 0.0, "modulus": 1.0}, {})
+    coordinates = Coordinates(space, len(space.names), ("zero", "modulus"))
     drawn = {name: np.asarray(v) for name, v in space.sample(jax.random.key(0), 5).items()}
     x = np.stack([coordinates.encode({n: v[k] for n, v in drawn.items()}) for k in range(5)])
     slots = coordinates.slots(RECORDINGS)
@@ -46,7 +46,7 @@ def test_the_prior_is_the_calibration_s_own_density_with_its_derivatives():
     which is half a normal's twice as high."""
     half = ParameterSpec("play", "rad", 0.0, 9.0, 0.0, {"distribution": "HalfNormal", "scale": 0.5}, "")
     space = build_scopes((*SPECS, half), {"modulus": {}, "zero": {}, "play": {}}, {}, RECORDINGS)
-    coordinates = Coordinates(space, 2, ("modulus", "zero", "play"), {"modulus": 1.0, "zero": 0.0, "play": 0.0}, {})
+    coordinates = Coordinates(space, 2, ("modulus", "zero", "play"))
     x = np.array([0.4, -0.3, 1.2])
     base = build_scopes(SPECS, {"modulus": {}, "zero": {}}, {}, RECORDINGS)
     expected = float(base.log_prior_unconstrained(jnp.asarray(x[None, :2]))[0])

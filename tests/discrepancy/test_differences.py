@@ -48,7 +48,7 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
     )
     nominal = {spec.name: spec.nominal for spec in toy.parameters}
     if repr(groups) not in COORDINATES:
-        COORDINATES[repr(groups)] = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
+        COORDINATES[repr(groups)] = Coordinates(space, len(BASE), tuple(nominal))
     return replace(
         asked,
         coordinates=COORDINATES[repr(groups)],

@@ -267,7 +267,7 @@ PRIORS = (
 def test_coordinates_are_those_of_the_prior_s_own_transform(prior, low, high):
     spec = ParameterSpec("size", "m", low, high, 0.5, prior, "a size")
     space = build_scopes([spec], {"size": prior}, {}, ["r"])
-    own = Coordinates(space, 1, ("size",), {"size": 0.5}, {})
+    own = Coordinates(space, 1, ("size",))
     x = np.linspace(-2.0, 2.0, 9)[:, None]
     values = np.asarray(space.parameters[0].transform(x))
     np.testing.assert_allclose(own.values(x), values, rtol=1e-12)

@@ -216,9 +216,7 @@ def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProbl
     space = build_scopes(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     coordinates = COORDINATES.setdefault(
         gathered.names,
-        Coordinates(
-            space, len(BASE), tuple(s.name for s in toy.parameters), {s.name: s.nominal for s in toy.parameters}, {}
-        ),
+        Coordinates(space, len(BASE), tuple(s.name for s in toy.parameters)),
     )
     model = TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),))
     place = {name: i for i, name in enumerate(space.names)}
@@ -248,7 +246,7 @@ def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weig
     channels += (Tension.gather(toy, trajectories, ROWS),) if tension else ()
     channels += (WeighedParts(weighed),) if weighed else ()
     nominal = {s.name: s.nominal for s in toy.parameters}
-    coordinates = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
+    coordinates = Coordinates(space, len(BASE), tuple(nominal))
     drag = Candidate("drag", (len(space.names) - 1,), Named("drag"), "drag")
     return replace(
         asked,
@@ -273,7 +271,7 @@ def problem_of(toy: Opposed | Geared, truth: dict, seed: int, base: int = len(BA
     return replace(
         asked,
         lanes=Lanes(toy, np.arange(4)),
-        coordinates=Coordinates(space, base, tuple(nominal), nominal, {}),
+        coordinates=Coordinates(space, base, tuple(nominal)),
         model=TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),)),
         trajectories=trajectories[:4],
         candidates=[

@@ -18,6 +18,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
 from rfdropo_bayes.data import RecordingEntry
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.posteriors import SHARED, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
@@ -345,9 +346,10 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
 
     monkeypatch.setattr(adaptation, "load_recordings", read)
     (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
-    entry = RecordingEntry(observations="b.nc")
+    record = replace(known.record, attrs={**known.record.attrs, INTEGRATOR: "sdirk2"})
+    fit = rb.Calibration(record, {}, "", adaptation.fitted_model(tmp_path), tmp_path)
     with pytest.raises(rb.InputError, match="read"):
-        adaptation.run_adaptation(tmp_path, adaptation.fitted_model(tmp_path), entry, tmp_path / "out")
+        rb.adapt(fit, RecordingEntry(observations="b.nc"), out=tmp_path / "out")
     assert asked["missing"] == "mask"
 
 

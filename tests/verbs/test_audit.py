@@ -23,7 +23,7 @@ def answered(candidate: Candidate, x: list[float]) -> Any:
     creep = REGISTRY["drive_creep"]()
     space = build_scopes(creep.parameters, {spec.name: {} for spec in creep.parameters}, {}, ())
     names = tuple(spec.name for spec in creep.parameters)
-    coordinates = Coordinates(space, 0, names, {spec.name: spec.nominal for spec in creep.parameters}, {})
+    coordinates = Coordinates(space, 0, names)
     return SimpleNamespace(
         law=None,
         adopted=[SimpleNamespace(name=candidate.name)],
@@ -70,7 +70,7 @@ def test_a_mechanism_of_one_group_has_the_priors_of_its_own_parameters(tmp_path:
     found = [candidate for candidate in candidates if candidate.group == "april"]
     answer = answered(found[0], np.zeros(len(space.names)).tolist())
     answer.extended.free = np.array([0])
-    answer.problem.coordinates = Coordinates(space, 0, tuple(nominal), nominal, {})
+    answer.problem.coordinates = Coordinates(space, 0, tuple(nominal))
     (priors,) = [sized_priors(answer, each) for each in found if each.title == "stretch"]
     assert priors["stretch"] == pytest.approx(factor)
     answer.adopted[:] = [SimpleNamespace(name="blur@april")]

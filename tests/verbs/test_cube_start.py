@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
@@ -18,7 +19,6 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.predictive import with_measured_starts
 from rfdropo_bayes.simulators.cube import push_table
-from rfdropo_bayes.verbs.predict import run_prediction
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 YAW, SHIFT = 0.2, np.array([0.003, -0.002, 0.004])
@@ -85,12 +85,8 @@ def test_a_prediction_holds_every_draw_of_the_cube_in_the_measuring_frame(simula
     draws = {"offset_x": rng.normal(0, 0.005, (1, 8)), "observation_noise": np.full((1, 8), 1e-3)}
     PosteriorRecord(tuple(infos), draws, attrs={"integrator": "sdirk2"}).save(tmp_path / "posterior.nc")
     changes = ["simulator.push=true", "simulator.time_step=0.02", "data.format='netcdf'"]
-    run_prediction(
-        Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes),
-        tmp_path,
-        str(tmp_path / "commands.nc"),
-        tmp_path / "out",
-    )
+    model = rb.Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes)
+    rb.predict(rb.Calibration.of_posterior(tmp_path, model), tmp_path / "commands.nc", out=tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         assert opened["object"].shape == (8, 4, 7)
         np.testing.assert_allclose(opened["object"].values[..., 0], 0.012, atol=2e-4)

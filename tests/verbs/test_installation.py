@@ -52,7 +52,7 @@ def test_sizes_follow_the_robot_and_its_commands(scale):
     assert largest_pull(robot, sent) == pytest.approx(0.01 * size)
     found = priors_of(installed_priors(robot, sent))
     assert found["initial_displacement"] == pytest.approx(ZERO * 0.01 * size, rel=0.05)
-    assert found["offset"] == pytest.approx(ORIGIN * 0.2 * scale, rel=0.05)
+    assert found["offset_x"] == pytest.approx(ORIGIN * 0.2 * scale, rel=0.05)
     assert "command_gain_error" not in found
 
 

@@ -15,6 +15,7 @@ import pytest
 import tomli_w
 import xarray as xr
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.data import Trajectory, first_row_only
@@ -30,9 +31,9 @@ from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPr
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
 from rfdropo_bayes.prediction.predictive import NOISE, draw_extended
+from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.verbs.predict import run_prediction
 from rfdropo_bayes.verbs.simulate import simulate_all
 
 FITTED_WITH = {INTEGRATOR: "sdirk2"}
@@ -70,7 +71,7 @@ def predict(posterior: Path, commands: str, out: Path, rows: tuple[int, int] = (
     piece = Trajectory.load(EXPERIMENTS / commands).slice_rows(*rows)
     piece.save(out / "commands.nc")
     model = Model.read(EXPERIMENTS / "demo.toml", COARSE)
-    run_prediction(model, posterior, str(out / "commands.nc"), out, **options)
+    rb.predict(Calibration.of_posterior(posterior, model), out / "commands.nc", out=out, **options)
     with xr.open_dataset(out / "prediction.nc") as opened:
         return opened.load()
 
@@ -181,7 +182,7 @@ def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
     for group in (None, "april"):
         out = tmp_path / str(group)
         model = Model.read(EXPERIMENTS / "demo.toml", overrides)
-        facts = run_prediction(model, posterior, COMMANDS, out, group=group)
+        facts = rb.predict(Calibration.of_posterior(posterior, model), COMMANDS, out=out, group=group).content
         moved[group] = np.ptp(pd.read_csv(out / "prediction.csv")["m4_x_mean"])
         said[group] = [caution["code"] for caution in facts["cautions"]]
     assert said == {None: ["drives_unstated"], "april": []}
@@ -191,8 +192,9 @@ def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
 def test_wrong_requests_are_named(posterior, tmp_path):
     with pytest.raises(InputError, match="one file"):
         predict(posterior, COMMANDS, tmp_path, start=COMMANDS)
+    fit = Calibration.of_posterior(posterior, Model.read(EXPERIMENTS / "demo.toml", COARSE))
     with pytest.raises(InputError, match="no such file"):
-        run_prediction(Model.read(EXPERIMENTS / "demo.toml", COARSE), posterior, "demo/none.nc", tmp_path)
+        rb.predict(fit, "demo/none.nc", out=tmp_path)
     stranger = PosteriorRecord.load(posterior / "posterior.nc")
     infos = (*stranger.parameters, ParameterInfo("delay", "s", 0.0, 1.0, prior_of(0.1)))
     draws = {**stranger.posterior, "delay": np.full((1, 40), 0.1)}
@@ -362,7 +364,8 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     infos += [ParameterInfo(f"offset_{axis}", "m", -0.5, 0.5, normal, scope=Scope("old")) for axis in "xyz"]
     draws = {n: np.full((1, 4), v) for n, v in fixed.items()} | offset
     PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(tmp_path / "posterior.nc")
-    run_prediction(Model.read(tmp_path / "own.toml"), tmp_path, "trajectory.nc", tmp_path / "out")
+    fit = Calibration.of_posterior(tmp_path, Model.read(tmp_path / "own.toml"))
+    rb.predict(fit, "trajectory.nc", out=tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         predicted = opened["mean"].values
     measured = Trajectory.load(tmp_path / "trajectory.nc").position

@@ -275,6 +275,8 @@ def size_residuals(
 class FeatureChannel(Protocol):
     """A channel that methods without a likelihood compare rollouts by: features in metres, side by side."""
 
+    name: ClassVar[str]
+
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
         """True for measured features."""

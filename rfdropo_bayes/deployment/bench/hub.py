@@ -1,7 +1,7 @@
 """A CAN bus between processes that needs no kernel CAN: every client sees the frames of all others, in one order.
 
 Frames travel as the kernel's own ``struct can_frame`` (16 bytes, little-endian: identifier with flags, length, three
-bytes of padding, eight of data) over TCP, or over a Unix socket. Any language speaks it in a few lines.
+bytes of padding, eight of data) over TCP, or over a Unix socket. A client takes a few lines in any language.
 """
 
 from __future__ import annotations

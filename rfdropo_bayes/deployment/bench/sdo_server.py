@@ -84,7 +84,7 @@ class StrictServer(SdoServer):
             self._running = REQUEST_SEGMENT_UPLOAD
 
     def segmented_upload(self, command: int) -> None:
-        """Go on with it."""
+        """Send the next segment."""
         super().segmented_upload(command)
         if not self._buffer:
             self._running = None

@@ -23,7 +23,7 @@ TESTED = ((0, 68),)
 
 
 class Compilers(NamedTuple):
-    """How functions are compiled that only kernels call, and the kernel at the top; both take options of `njit`."""
+    """Compilers of kernels, and of functions that only kernels call; both take options of `njit`."""
 
     name: str
     part: Callable[..., Any]

@@ -113,7 +113,7 @@ def _within(gap, reach, token):
 
 @kernel
 def _place_spheres(scene, touch, position, velocity, time_step, token):
-    """The spheres' centres, and how far they may reach."""
+    """The spheres' centres, and their reach."""
     for sphere in range(scene.spheres):
         x, y, z = centre_of(scene, scene.gradient, scene.arm, touch, sphere, position, token)
         store(touch.middle, 3 * sphere, x, y, z)
@@ -123,7 +123,7 @@ def _place_spheres(scene, touch, position, velocity, time_step, token):
 
 @kernel
 def _cube_reach(touch, time_step, token):
-    """How far any point of the cube moves in two steps."""
+    """Largest displacement of a point of the cube in two steps."""
     x, y, z = load3(touch.cube, 7, token)
     u, v, w = load3(touch.cube, 10, token)
     return 2.0 * time_step * fma(load(touch.values, 1, token), _length(u, v, w), _length(x, y, z))
@@ -286,7 +286,7 @@ def _near(touch, slot, value, token):
 
 @kernel
 def impact(change, token):
-    """How much of an impact a change of the closing speed is, from 0 to 1."""
+    """Degree to which a change of the closing speed is an impact, from 0 to 1."""
     square = change * change
     return square / (square + REBOUND * REBOUND)
 

@@ -31,6 +31,7 @@ from rfdropo_bayes.fem.native.rod_records import (
     DIRECTOR,
     GRADIENT,
     HELD,
+    NET,
     RATE,
     SLOPE,
     STRAIN,
@@ -287,6 +288,7 @@ def _across(a):
 def _measure_held(tables, factors, element, work, token):
     """How taut cables hold an element, times the factor in the matrix; see `cables.held`. Returns whether any does."""
     rows, zero, taut_any = work.element, fill(0.0, work.element, token), False
+    net = net_moment = zero, zero, zero
     force = moment = zero, zero, zero, zero, zero, zero
     one, two, three = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
     for k in range(tables.beside_first[element], tables.beside_first[element + 1]):
@@ -302,7 +304,8 @@ def _measure_held(tables, factors, element, work, token):
             force = _sum(_sum(force, _symmetric(way, -b)), (a, zero, zero, a, zero, a))
             moment = _sum(_sum(moment, _symmetric(turn, -b)), _symmetric(arm, -a))
             moment = _sum(moment, (ball, zero, zero, ball, zero, ball))
-            way = scaled(way, b)
+            pull = scaled(way, load(work.tension, tables.beside_cable[k], token) * tables.beside_part[k])
+            net, net_moment, way = plus(net, pull), plus(net_moment, cross(arm, pull)), scaled(way, b)
             one = added(way, turn[0], plus(one, (zero, -z, y)))
             two = added(way, turn[1], plus(two, (z, zero, -x)))
             three = added(way, turn[2], plus(three, (-y, x, zero)))
@@ -310,6 +313,8 @@ def _measure_held(tables, factors, element, work, token):
         store(rows, HELD + i, force[i])
         store(rows, HELD + 15 + i, moment[i])
     _put_tile(rows, HELD + 6, (one, two, three))
+    put(rows, NET, net)
+    put(rows, NET + 3, net_moment)
     return taut_any
 
 
@@ -355,11 +360,11 @@ def _section_force(rows, elasticity, token):
 
 
 @kernel
-def _section_moment(rows, elasticity, lawful, token):
-    """Lower half of the moment by bending and twist in space, between W and W."""
+def _section_moment(rows, elasticity, bow, lawful, token):
+    """Lower half of the moment by bending and twist in space, between W and W; ``bow``: added stiffness of bending."""
     x, y, z = load3(rows, TILTED, token), load3(rows, TILTED + 3, token), load3(rows, TILTED + 6, token)
-    moment = _symmetric(x, elasticity * load(rows, SLOPE + 2, token))
-    moment = _sum(moment, _symmetric(y, elasticity * load(rows, SLOPE + 5, token)))
+    moment = _symmetric(x, fma(elasticity, load(rows, SLOPE + 2, token), bow))
+    moment = _sum(moment, _symmetric(y, fma(elasticity, load(rows, SLOPE + 5, token), bow)))
     moment = _sum(moment, _symmetric(z, elasticity * load(rows, SLOPE + 7, token)))
     if lawful:
         moment = _sum(moment, _both(x, scaled(y, elasticity * load(rows, SLOPE + 3, token))))
@@ -376,12 +381,36 @@ def _less_turn(rows, matrix, token):
 
 
 @kernel
-def add_element_tangent(factors, element, work, whole, held, lawful, token):
+def _turning(rows, factor, token):
+    """How the forces of a section and of its cables turn with it: force by rotation of the middle, moment by that
+    (lower half), and moment by the rotations of both sections; in leading order."""
+    force = plus(load3(rows, NET, token), combined(rows, DIRECTOR, load3(rows, STRESS, token), token))
+    moment = plus(load3(rows, NET + 3, token), combined(rows, DIRECTOR, load3(rows, STRESS + 3, token), token))
+    force, moment = scaled(force, 0.5 * factor), scaled(moment, 0.5 * factor)
+    chord, zero = load3(rows, CHORD, token), factor - factor
+    ball = -0.5 * dot(force, chord)
+    swing = _sum(_both(force, scaled(chord, 0.25)), (ball, zero, zero, ball, zero, ball))
+    return _skew(force), _columns(swing), _skew(moment)
+
+
+@inlined
+def _skew(a):
+    """[a]x, its columns."""
+    zero = a[0] - a[0]
+    return (zero, a[2], -a[1]), (-a[2], zero, a[0]), (a[1], -a[0], zero)
+
+
+@kernel
+def add_element_tangent(tables, factors, element, work, whole, held, lawful, still, token):
     """Add the tangent of an element to the pivot of its upper station; ``whole``: set the coupling, and start the pivot
-    of the lower one; ``held`` by cables; ``lawful``: with a bending law."""
+    of the lower one; ``held`` by cables; ``lawful``: with a bending law; ``still``: of an equilibrium."""
     rows, upper, elasticity = work.element, (element + 1) * BLOCK, load(factors.elasticity, 0, token)
     lower, tile, (first, second) = upper - BLOCK, upper + PANEL, _levers(rows, token)
-    force, bent = _section_force(rows, elasticity, token), _columns(_section_moment(rows, elasticity, lawful, token))
+    bow = elasticity - elasticity
+    if still:
+        bow = load(factors.turning, 0, token) * load(rows, STRESS + 2, token) * (tables.length[element] / 12.0)
+    force = _section_force(rows, elasticity, token)
+    bent = _columns(_section_moment(rows, elasticity, bow, lawful, token))
     if held:
         force = _sum(force, _load_lower(rows, HELD, token))
         moment = _less_turn(rows, _columns(_load_lower(rows, HELD + 15, token)), token)
@@ -393,32 +422,38 @@ def add_element_tangent(factors, element, work, whole, held, lawful, token):
         a, b, back = _minus(a, mixed), _plus(b, mixed), _back_product(mixed, second)
         turned, across = _plus(bent, back), _minus(across, back)
         bent = _minus(bent, _back_product(mixed, first))
+    turned, bent = _plus(_back_product(second, b), turned), _plus(_back_product(first, a), bent)
+    across = _plus(_back_product(first, b), across)
+    if still:
+        tilt, swing, roll = _turning(rows, load(factors.turning, 0, token), token)
+        a, b, turned, bent = _minus(a, tilt), _minus(b, tilt), _plus(turned, swing), _plus(bent, swing)
+        across = _plus(_plus(across, swing), roll)
     _put_lower(work.pivot, upper, force, True, token)
     back = _across(b)
     for c in range(3):
         add_to(work.pivot, tile + 3 * c, back[c], token)
-    _put_lower(work.pivot, tile + 9, _lower(_plus(_back_product(second, b), turned)), True, token)
+    _put_lower(work.pivot, tile + 9, _lower(turned), True, token)
     if whole:
         back = _across(a)
         _put_lower(work.pivot, lower, force, False, token)
         _put_tile(work.pivot, lower + PANEL, _negative(back))
-        _put_lower(work.pivot, lower + PANEL + 9, _lower(_plus(_back_product(first, a), bent)), False, token)
+        _put_lower(work.pivot, lower + PANEL + 9, _lower(bent), False, token)
         _put_tile(work.coupling, upper, _negative(stiff))
         _put_tile(work.coupling, upper + 9, _negative(b))
         _put_tile(work.coupling, tile, back)
-        _put_tile(work.coupling, tile + 9, _plus(_back_product(first, b), across))
+        _put_tile(work.coupling, tile + 9, across)
 
 
 @kernel
-def assemble_element(tables, samples, factors, element, work, whole, predicted, token):
+def assemble_element(tables, samples, factors, element, work, whole, predicted, still, token):
     """Force of an element and its part of the matrix; see `add_element_tangent` for ``whole``."""
     measure_element(tables, element, work, token)
     held = _measure_held(tables, factors, element, work, token)
     place_stress(tables, samples, factors, element, work, token)
-    if held and not predicted:
+    if held and not predicted and not still:
         _hold_rates(work.element, token)
     add_forces(element, work.element, work.field, token)
-    add_element_tangent(factors, element, work, whole, held, samples.present[BENDING], token)
+    add_element_tangent(tables, factors, element, work, whole, held, samples.present[BENDING], still, token)
 
 
 @kernel

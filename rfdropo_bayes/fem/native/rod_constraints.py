@@ -230,7 +230,7 @@ def constrained_stage(tables, runs, scene, samples, factors, work, friction, tou
             set_factors(samples, factors, work, stage, wide, token)
         going, narrow = load(factors.going, 0, token), load(factors.narrow, 0, token)
         choose_closing(touch, samples.gravity, samples.damping, stage, wide, narrow, going, token)
-    condense_increment(tables, samples, factors, work, stage, token)
+    condense_increment(tables, samples, factors, work, stage, False, token)
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
         start_sliding(friction, slips, token)

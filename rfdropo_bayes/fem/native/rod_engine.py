@@ -53,7 +53,7 @@ from rfdropo_bayes.fem.section_loads import SectionLoads
 from rfdropo_bayes.runtime import available_processors
 
 Precision = Literal["float64", "float32"]
-AT_REST = {"float64": (1e-9, 1e-6), "float32": (1e-5, 1e-5)}
+AT_REST = {"float64": (1e-10, 1e-6), "float32": (1e-5, 1e-5)}
 """Increment of a static iteration, over the body's length, and turn [rad], below which a body is at rest: at the start,
 and in a row of a quasi-static motion. The remaining error is at most a tenth of it, as convergence is superlinear.
 """

@@ -30,8 +30,10 @@ DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM, HELD 
 """First rows of an element's scratch: directors in its middle, these times W, chord, g, b, strains, their rates and the
 stresses; the section's tangent, of shear, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six
 without the law of fibres; and how taut cables hold it in space: its force by stretch and shear (lower half, by
-columns), that by bending and twist (columns), and the moment by these (lower half)."""
-ELEMENT = HELD + 21
+columns), that by bending and twist (columns), and the moment by these (lower half); and the force and moment of the
+section and of these cables in space."""
+NET = HELD + 21
+ELEMENT = NET + 6
 
 
 class RodSamples(NamedTuple):
@@ -54,6 +56,7 @@ class Factors(NamedTuple):
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
     held: Float[np.ndarray, "1 lanes"]  # of what taut cables hold there
+    turning: Float[np.ndarray, "1 lanes"]  # of how forces turn with the sections there, for equilibria
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
@@ -96,14 +99,10 @@ class RodWork(NamedTuple):
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses, or an equilibrium, were not found
     points: Float[np.ndarray, "point_values lanes"]
-    before: Float[np.ndarray, "values lanes"]  # the increment of the stage or static iteration before
+    before: Float[np.ndarray, "values lanes"]  # the change of velocity in the stage before
     sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
-    way: Float[np.ndarray, "values lanes"]  # that a static iteration goes
-    change: Float[np.ndarray, "values lanes"]  # of the increment in the iteration before
-    went: Float[np.ndarray, "values lanes"]  # way that made this change
-    older: Float[np.ndarray, "values lanes"]  # the same of an iteration earlier
-    earlier: Float[np.ndarray, "values lanes"]
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
+    largest: Float[np.ndarray, "1 lanes"]  # increment of the static iteration before [m]
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]
     softness: Float[np.ndarray, "1 lanes"]  # remaining share of the moduli after the time

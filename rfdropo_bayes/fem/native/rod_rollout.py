@@ -19,7 +19,6 @@ from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, 
 from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
 from rfdropo_bayes.fem.native.rod_statics import (
     come_to_rest,
-    forget_iterations,
     keep_found,
     measure_imbalance,
     put_at_rest,
@@ -100,18 +99,20 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
     state = dict.fromkeys(
-        ("velocity", "solution", "field", "before", "sudden", "way", "change", "went", "older", "earlier", "branch"),
+        ("velocity", "solution", "field", "before", "sudden", "branch"),
         stations * SIZE,
     )
-    once = dict.fromkeys(
-        ("unsolved", "accepted", "lost", "failed", "moving", "solves", "imbalance", "softness", "firmness", "loss"), 1
-    )
+    once = (
+        "unsolved", "accepted", "lost", "failed", "moving", "largest", "solves", "imbalance", "softness", "firmness",
+        "loss",
+    )  # fmt: skip
     work = rows(
         turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
         border=PANEL * panels * stations, condensed=9 * panels**2, weight=3 * panels, element=ELEMENT,
         lever=3 * len(tables.guide_station), offset=3 * guides, direction=3 * guides,
         course=guides, inverse=guides, sharp=guides, slack=cables, tension=cables,
-        commanded=cables, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state, **once,
+        commanded=cables, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state,
+        **dict.fromkeys(once, 1),
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
     return RodSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, RodWork(**work)
@@ -145,7 +146,6 @@ def start_rollouts(tables, batch, samples, work, first, token):
         samples.present[flag] = batch.present[flag]
     _prepare(tables, samples, token)
     put_at_rest(tables, nothing, work, token)
-    forget_iterations(tables, work, token)
     clear(work.tension, 0, tables.cables, token)
     clear(work.velocity, 0, values, token)
     clear(work.branch, 0, values, token)

@@ -35,8 +35,6 @@ KEPT = {
     "touch": ("cube", "values", "memory"),
 }
 """Fields of the kernels' records that outlive a step."""
-MIXED = ("change", "went", "older", "earlier")
-"""Further fields of the work of a quasi-static motion."""
 GIVEN = ("moduli", "density", "damping", "gravity", "scale", "point_mass", "law", "effects", "start", "loads")
 """Fields of a batch that an initial state depends on."""
 PITCHED = ("start", "loads")
@@ -58,11 +56,11 @@ GRAVITY = 3
 """Last values of a lane's memory: gravity without the changes from step to step [m/s2]."""
 
 
-def _places(records: Records, still: bool) -> list[_Place]:
+def _places(records: Records) -> list[_Place]:
     places, last = [], 0
     for record, names in KEPT.items():
         if getattr(records, record) is not None:
-            for name in names + (MIXED if still and record == "work" else ()):
+            for name in names:
                 first, last = last, last + len(getattr(getattr(records, record), name))
                 places.append(_Place(record, name, first, last))
     return places
@@ -200,8 +198,7 @@ class RodSession:
     def _admit(self, run: Run, rubs: bool) -> None:
         """Lay out the memory for the effects that the first lanes have; later lanes must have the same."""
         if self._run is None:
-            still = self.engine.integrator == "quasi-static"
-            self._places, self._rubs = _places(self.engine.records(rubs), still), rubs
+            self._places, self._rubs = _places(self.engine.records(rubs)), rubs
             blocks = -(-self.count // self.engine.lanes)
             values = self._places[-1].last + GRAVITY
             self.memory = aligned_zeros((blocks, values, self.engine.lanes), self.engine.dtype)

@@ -1,8 +1,7 @@
 """Static equilibrium of a rod in SIMD lanes: where a rollout starts, and every row of a quasi-static motion.
 
-Newton's method without geometric stiffness, neither of the rod nor of its cables, whose parts nearly cancel; what they
-leave is made up for by mixing iterations. A lane that has come to rest is not moved again: how long others take changes
-nothing of it.
+Newton's method, with all that turns with the sections in leading order. A lane that has come to rest is not moved
+again: how long others take changes nothing of it.
 """
 
 from __future__ import annotations
@@ -32,10 +31,8 @@ UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
 LARGEST_TURN = 0.5
 """[rad] No section turns further in an iteration."""
-DISTINCT = 1e-6
-"""Squared sine of the least angle between two changes of the increment that count as two."""
-ROUNDING = 1e-2
-"""Squared changes of the increment below this, relative to an increment at rest, are rounding."""
+SLOWER = 0.5
+"""Share of the next way that a lane goes whose increments do not shrink."""
 
 
 @kernel
@@ -63,66 +60,26 @@ def _largest(tables, first, field, token):
 
 
 @kernel
-def _keep(rows, row, value, moving, token):
-    """Write a value in the lanes that move."""
-    store(rows, row, where_greater(moving, fill(0.0, rows, token), value, load(rows, row, token)))
+def _choose_way(tables, work, moving, token):
+    """Limit ``solution``, and take less of it if increments do not shrink; returns what those after it may add up to.
 
-
-@kernel
-def _remember(tables, work, again, moving, token):
-    """Keep the increment, and if there was one before it its change, the way that made it, and the pair before that."""
-    for row in range(SIZE * tables.held, SIZE * tables.stations):
-        now = load(work.solution, row, token)
-        if again:
-            _keep(work.older, row, load(work.change, row, token), moving, token)
-            _keep(work.earlier, row, load(work.went, row, token), moving, token)
-            _keep(work.change, row, now - load(work.before, row, token), moving, token)
-            _keep(work.went, row, load(work.way, row, token), moving, token)
-        _keep(work.before, row, now, moving, token)
-
-
-@kernel
-def _mixing(tables, work, least, token):
-    """Shares of the last two changes of the increment that cancel it best; of those that are no rounding."""
-    zero, one, change, older = fill(0.0, work.frame, token), fill(1.0, work.frame, token), work.change, work.older
-    first, second = _product(tables, change, change, token), _product(tables, older, older, token)
-    along, beside = _product(tables, change, work.solution, token), _product(tables, older, work.solution, token)
-    mixed = _product(tables, change, older, token)
-    alone = along / where_greater(first, least, first, one)
-    alone = where_greater(first, least, alone, zero)
-    area = fnma(mixed, mixed, first * second)
-    apart = where_greater(area, DISTINCT * first * second, one, zero)
-    apart = where_greater(first, least, where_greater(second, least, apart, zero), zero)
-    inverse = one / where_greater(apart, zero, area, one)
-    a, b = fnma(beside, mixed, along * second) * inverse, fnma(along, mixed, beside * first) * inverse
-    return where_greater(apart, zero, a, alone), where_greater(apart, zero, b, zero)
-
-
-@kernel
-def _choose_way(tables, work, again, small, moving, token):
-    """Turn ``solution`` into the way that an iteration goes; returns the largest increment.
-
-    Anderson's mixing (1965, J. ACM 12:547) with two iterations before, or in the first one of a row with those of the
-    row before; limited in length.
+    All that are left are no more than a geometric series that goes on as the last two did: Newton's method converges
+    faster.
     """
-    one, turning = fill(1.0, work.frame, token), fill(tables.total, work.frame, token)
-    size, turn = _largest(tables, 0, work.solution, token), turning * _largest(tables, 3, work.solution, token)
-    size = where_greater(size, turn, size, turn)
-    _remember(tables, work, again, moving, token)
-    a, b = _mixing(tables, work, ROUNDING * small * small, token)
-    for row in range(SIZE * tables.held, SIZE * tables.stations):
-        way = fnma(a, load(work.went, row, token) + load(work.change, row, token), load(work.solution, row, token))
-        way = fnma(b, load(work.earlier, row, token) + load(work.older, row, token), way)
-        store(work.solution, row, way)
+    zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     far, wide = _largest(tables, 0, work.solution, token), _largest(tables, 3, work.solution, token)
     longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), fill(LARGEST_TURN, work.frame, token)
+    turn, before = wide * tables.total, load(work.largest, 0, token)
+    size = where_greater(far, turn, far, turn)
+    grown = where_greater(size, before, one, zero)
     share = where_greater(far, longest, longest / far, one)
     share = where_greater(share * wide, widest, widest / wide, share)
+    share = where_greater(grown, zero, SLOWER * share, share)
     for row in range(SIZE * tables.held, SIZE * tables.stations):
-        way = share * load(work.solution, row, token)
-        store(work.solution, row, way)
-        _keep(work.way, row, way, moving, token)
-    return size
+        store(work.solution, row, share * load(work.solution, row, token))
+    store(work.largest, 0, where_greater(moving, zero, size, before))
+    alone = where_greater(before, fill(0.5 * UNBOUNDED, work.frame, token), one, grown)
+    return where_greater(alone, zero, size, size * (size / (before - size)))
 
 
 @kernel
@@ -135,26 +92,39 @@ def _take_tensions(tables, work, moving, token):
 
 
 @kernel
-def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, number, bound, schedule, token):
+def _found(tables, factors, work, moving, token):
+    """The lanes that move whose matrix had a solution, and those that try again without the forces that turn, which
+    near a loss of stability leave the matrix indefinite."""
+    zero, bound = fill(0.0, work.frame, token), fill(UNBOUNDED, work.frame, token)
+    total, turning = _product(tables, work.solution, work.solution, token), load(factors.turning, 0, token)
+    found = where_greater(bound, total, moving, zero)
+    again = where_greater(turning, zero, moving - found, zero)
+    store(factors.turning, 0, where_greater(again, zero, zero, turning))
+    return moving - again, again
+
+
+@kernel
+def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bound, schedule, token):
     """One iteration of the lanes that move; those whose increment was small stop."""
     zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
-    condense_increment(tables, samples, factors, work, EULER, token)
+    condense_increment(tables, samples, factors, work, EULER, True, token)
     if runs is not None and slips > 0:
         slide(tables, runs, friction, slips, work, token)
     hold(
         tables, runs, None, samples, factors, work, friction, None, rows, p, slips, 0, 1.0, schedule, token
     )  # fmt: skip
+    store(work.solves, 0, load(work.solves, 0, token) + moving)
+    moving, waiting = _found(tables, factors, work, moving, token)
     store(work.unsolved, 0, where_greater(moving, zero, load(work.unsolved, 0, token), unsolved))
     _take_tensions(tables, work, moving, token)
     small = fill(bound * tables.total, work.frame, token)
-    left = _choose_way(tables, work, number > 0, small, moving, token)
+    left = _choose_way(tables, work, moving, token)
     if runs is not None and slips > 0:
         sum_losses(tables, runs, samples, friction, p, token)
         keep_row(tables, factors, friction, p, work, slips, moving, token)
     move_stations(tables, moving, work, token)
-    store(work.solves, 0, load(work.solves, 0, token) + moving)
-    store(work.moving, 0, where_greater(left, small, moving, zero))
+    store(work.moving, 0, where_greater(left, small, moving, zero) + waiting)
 
 
 @kernel
@@ -164,22 +134,16 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
     store(work.moving, 0, one)
+    store(work.largest, 0, fill(UNBOUNDED, work.frame, token))
     if runs is not None and slips > 0:
         gather_cables(tables, work, one, False, token)
         start_row(tables, runs, samples, friction, work, token)
-    for number in range(most):
-        _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, number, bound, schedule, token)
+    for _ in range(most):
+        _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bound, schedule, token)
         if not any_greater(load(work.moving, 0, token), zero):
             break
     if runs is not None:
         end_row(friction, slips, token)
-
-
-@kernel
-def forget_iterations(tables, work, token):
-    """Begin without iterations to mix."""
-    for rows in (work.change, work.went, work.older, work.earlier):
-        clear(rows, 0, SIZE * tables.stations, token)
 
 
 @kernel
@@ -188,6 +152,7 @@ def _start_settling(tables, samples, factors, work, token):
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
     store(factors.elasticity, 0, load(work.firmness, 0, token))
     store(factors.held, 0, one)
+    store(factors.turning, 0, one)
     store(factors.inertia, 0, zero)
     store(factors.force, 0, one)
     store(factors.strain, 0, load(work.firmness, 0, token))

@@ -219,7 +219,7 @@ def take_tensions(tables, factors, work, rate, token):
 
 
 @kernel
-def condense_increment(tables, samples, factors, work, stage, token):
+def condense_increment(tables, samples, factors, work, stage, still, token):
     """Assemble and eliminate the matrix station by station."""
     rate, predicted = 1.0 / stage.length, stage.predicted
     stations, panels, held, going = tables.stations, tables.panels, tables.held, load(factors.going, 0, token)
@@ -230,7 +230,7 @@ def condense_increment(tables, samples, factors, work, stage, token):
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
-            assemble_element(tables, samples, factors, station - 1, work, not last, predicted, token)
+            assemble_element(tables, samples, factors, station - 1, work, not last, predicted, still, token)
         add_station_mass(tables, samples, factors, station, work, token)
         add_station_loads(tables, samples, factors, station, work, token)
         if stage.carried > 0.0:

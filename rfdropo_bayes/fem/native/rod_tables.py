@@ -48,6 +48,7 @@ class RodTables(NamedTuple):
     beside_start: Int[np.ndarray, " pieces"]  # guide that the way begins at; of the first way of a cable its end
     beside_share: Float[np.ndarray, " pieces"]  # see `cables.CableLayout`
     beside_along: Float[np.ndarray, " pieces"]
+    beside_part: Float[np.ndarray, " pieces"]  # of the element that the piece runs beside
     row: Int[np.ndarray, " cables"]  # of the border that a cable has: those that reach farthest first
     active: Int[np.ndarray, " stations"]  # panels of the border that are not zero at a station
     section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
@@ -128,25 +129,27 @@ def _cables(layout: Any, body: Rod) -> dict[str, np.ndarray]:
         "anchor": anchor,
         "rest_length": length,
         "near": ROUND * layout.way[used],
-        **_beside(layout, body.elements),
+        **_beside(layout, np.diff(body.station)),
         "row": row,
         "active": np.array(active, dtype=np.int64),
     }
 
 
-def _beside(layout: Any, elements: int) -> dict[str, np.ndarray]:
+def _beside(layout: Any, length: Float[np.ndarray, " elements"]) -> dict[str, np.ndarray]:
     """Pieces of the ways to guides, sorted by the elements that they run beside."""
     number = np.cumsum(layout.used.ravel()).reshape(layout.used.shape) - 1
     cable, guide, piece = np.nonzero(layout.share)
     order = np.argsort(layout.element[cable, guide, piece], kind="stable")
     cable, guide, piece = cable[order], guide[order], piece[order]
+    share = layout.share[cable, guide, piece]
     return {
-        "beside_first": np.searchsorted(layout.element[cable, guide, piece], np.arange(elements + 1)),
+        "beside_first": np.searchsorted(layout.element[cable, guide, piece], np.arange(len(length) + 1)),
         "beside_cable": cable,
         "beside_guide": number[cable, guide],
         "beside_start": number[cable, np.maximum(guide - 1, 0)],
-        "beside_share": layout.share[cable, guide, piece],
+        "beside_share": share,
         "beside_along": layout.along[cable, guide, piece],
+        "beside_part": share * length[layout.element[cable, guide, piece]] / layout.way[cable, guide],
     }
 
 

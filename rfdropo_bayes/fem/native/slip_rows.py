@@ -21,7 +21,7 @@ def _bounded(share):
 
 @kernel
 def kinds_present(samples):
-    """How many kinds of friction a batch has, and the first of them."""
+    """Number of kinds of friction in a batch, and the first kind."""
     coulomb, capstan = samples.present[FRICTION], samples.present[FRICTION + 1]
     return coulomb + capstan, 0 if coulomb else 1
 
@@ -68,7 +68,7 @@ def _inverse(friction, row, token):
 
 @kernel
 def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
-    """Border row of a run; returns how fast the guides move along it."""
+    """Border row of a run; returns the speed of the guides along it."""
     zero, row = fill(0.0, border, token), kind * runs.count + r
     inverse = _inverse(friction, row, token)
     before, moving, tied = zero, zero, tables.cable_first[runs.cable[r] + 1] - 1

@@ -53,7 +53,7 @@ class Cables(NamedTuple):
 
 
 class TetrahedralSchedule(NamedTuple):
-    """How a rollout runs."""
+    """Settings of a rollout."""
 
     time_step: float
     stride: int  # steps between recorded rows
@@ -198,7 +198,7 @@ def unbalance(pattern, mesh, samples, work, count, stage, token):
 
 @mesh_part
 def _moved(work, i, stage, token):
-    """How far a stage moves a coordinate."""
+    """Displacement of a coordinate in a stage."""
     length = stage.length * load(work.wide, 0, token)
     if stage.predicted:
         return length * (load(work.velocity, i, token) - load(work.begun, i, token))

@@ -1,4 +1,4 @@
-"""How well a distribution explains a trajectory.
+"""Score of a trajectory under a distribution.
 
 Eq. 2 and 3 of RF-DROPO: at every time step a Gaussian with the mean and covariance of rollouts drawn from it.
 """

@@ -122,7 +122,7 @@ class ReplicatePlan(NamedTuple):
 
 
 class SmcState(NamedTuple):
-    """Everything a replicate needs to go on.
+    """State of a replicate between two stages.
 
     Attributes:
         population: particles; their rows reach to the end of the present block.

@@ -58,7 +58,7 @@ class Population(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """How a stage moves its particles.
+    """Settings of a stage's moves.
 
     Attributes:
         target_ess: effective sample size kept from one target to the next, as a share of the live particles.

@@ -68,7 +68,7 @@ def adapted(name: str, folder: Path, options: Mapping[str, Any]) -> BlackBox:
 
 
 def _imported(name: str, folder: Path) -> Any:
-    """The attribute that ``module:attribute`` or ``file.py:attribute`` stands for."""
+    """The attribute named by ``module:attribute`` or ``file.py:attribute``."""
     source, _, attribute = name.rpartition(":")
     try:
         if not source.endswith(".py"):

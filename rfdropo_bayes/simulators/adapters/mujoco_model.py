@@ -426,7 +426,7 @@ class MuJoCoRollouts:
         return MuJoCoLanes(self, count)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:
-        """Which rollouts went on to the end: MuJoCo stops the clock of one with a warning."""
+        """Mask of complete rollouts: MuJoCo stops the clock of one with a warning."""
         late = state[:, 0] - self.first[0][0] - steps * self.model.opt.timestep
         return (np.abs(late) < 0.5 * self.model.opt.timestep) & np.isfinite(state).all(axis=1)
 
