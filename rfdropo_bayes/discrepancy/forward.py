@@ -264,7 +264,13 @@ class Forward:
     def identity(self) -> str:
         """Digest of the simulator, its parameters with their priors, and the commands."""
         own, simulator = self.coordinates, self.lanes.simulator
-        named = (simulator.description, own.names, own.base, sorted(own.space.fixed.items()), sorted(own.nominal.items()))
+        named = (
+            simulator.description,
+            own.names,
+            own.base,
+            sorted(own.space.fixed.items()),
+            sorted(own.nominal.items()),
+        )
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
         prior = (own.prior_mean, own.prior_sd, *own.bounds)
         return digest(
