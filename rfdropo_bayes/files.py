@@ -20,13 +20,12 @@ _GLOB = "*?["
 def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]:
     """Files of a name or pattern in the first folder that has any: RFDROPO_DATA, or else ``base``.
 
-    A name that exists is taken as it stands, whatever signs of a pattern are in it, and so are the folders that a
-    pattern begins with.
+    Existing names, and existing folders at the start of a pattern, are literal, even with a pattern's signs in them.
 
     Args:
         pattern: the name or glob.
         base: folder that it is relative to.
-        folders: whether a folder may stand for the files in it.
+        folders: whether a folder may replace the files in it.
 
     Raises:
         InputError: no such file.
@@ -56,7 +55,7 @@ def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]
 
 
 def matching_files(root: Path, wanted: Path) -> list[Path]:
-    """Files and folders of a pattern below ``root``, in order; parts of it that exist are taken as they stand."""
+    """Files and folders of a pattern below ``root``, in order; existing parts are literal."""
     parts = list(wanted.parts)
     while parts and (root / parts[0]).exists():
         root /= parts.pop(0)

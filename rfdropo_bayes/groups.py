@@ -64,7 +64,7 @@ def unmatched(recordings: Sequence[str], patterns: Patterns) -> list[tuple[str, 
 
 
 def in_group(recording: str, group: str, patterns: Patterns) -> dict[str, list[str]]:
-    """Patterns under which a recording belongs to a group, whatever group named it before."""
+    """Patterns with a recording moved to a group."""
     name = whole(recording)
     found = {each: [entry for entry in entries if whole(entry) != name] for each, entries in _listed(patterns).items()}
     found[group] = [*found.get(group, []), name]

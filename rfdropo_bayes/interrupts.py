@@ -50,6 +50,12 @@ def check_interrupt() -> None:
         raise KeyboardInterrupt
 
 
+def answer_interrupt() -> None:
+    """Take Ctrl-C for answered: the run ends with what it has, and the next press stops that, too."""
+    global _pressed
+    _pressed = 0
+
+
 def stop_if_asked_twice() -> None:
     """Raise KeyboardInterrupt if Ctrl-C was pressed more than once: for long steps, since compiled code that calls back
     may have lost the exception of the second press.

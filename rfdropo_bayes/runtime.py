@@ -85,6 +85,11 @@ def configure_jax() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
+def cache_folder() -> Path:
+    """The user's folder for what the package has compiled."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rfdropo_bayes"
+
+
 def keep_compilations() -> None:
     """Let JAX keep compiled programs in the user's cache folder, unless the user chose otherwise.
 
@@ -95,7 +100,6 @@ def keep_compilations() -> None:
 
     # Homes are shared between machines; machine code is not.
     machine = f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rfdropo_bayes"
-    folder = cache / f"jax-{hashlib.sha256(machine.encode()).hexdigest()[:12]}"
+    folder = cache_folder() / f"jax-{hashlib.sha256(machine.encode()).hexdigest()[:12]}"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -68,7 +68,7 @@ def with_keys_of(schema: type[BaseModel], *, without: Container[str] = ()) -> Ca
 
 
 def as_options(kind: type[Table]) -> type[Table]:
-    """A table of an experiment file as options of a call, whose keys and values are checked where they are written."""
+    """Options of a call as a table of an experiment file; keys and values are checked at creation."""
 
     def init(self: Table, **given: Any) -> None:
         found = parse_table(kind, given, where=kind.__name__)

@@ -28,8 +28,8 @@ class CalibrationProblem:
 
     Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is cut
     into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
-    compilations serve every batch size. The number of simulated steps is a run-time argument, so that they also serve
-    every horizon. Problems of one model share its compiled programs.
+    compilations suffice for every batch size. The number of simulated steps is a run-time argument, so that they
+    suffice for every horizon. Problems of one model share its compiled programs.
 
     Attributes:
         model: priors, simulator and data.

@@ -273,7 +273,7 @@ class RolloutDefaults(ProblemDefaults):
     def noisy_rollouts(
         self: Any, key: PRNGKeyArray, values: Values
     ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
-        """The rollouts as they are."""
+        """The rollouts unchanged."""
         return self.rollouts(values, self.n_rows)
 
     def noise_deviation(self: Any, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:

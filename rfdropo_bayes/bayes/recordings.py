@@ -61,7 +61,7 @@ class RecordingSet:
 
 
 def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) -> RecordingSet:
-    """Bring trajectories onto the simulator's clock and markers: the robot's markers that every recording has.
+    """Convert trajectories to the simulator's clock and markers: the robot's markers that every recording has.
 
     Raises:
         InputError: no trajectory, two trajectories of the same name, commands that no drive executed, no common marker,

@@ -66,7 +66,7 @@ def train(
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
-    """The overrides of an experiment file that the options --task and --goal stand for."""
+    """Overrides of an experiment file by the options --task and --goal."""
     found = []
     if task is not None:
         if task not in TASKS:

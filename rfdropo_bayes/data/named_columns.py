@@ -402,7 +402,7 @@ def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
 
 
 def untimed(columns: CsvColumns) -> bool:
-    """Whether the number of a row stands in for its time."""
+    """Whether row numbers replace times."""
     return columns.time == ROWS
 
 

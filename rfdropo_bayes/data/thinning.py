@@ -1,4 +1,4 @@
-"""Recordings with more rows than their motion needs: the rate that it needs, and copies of that rate to look at."""
+"""Recordings with more rows than their motion needs: the rate that it needs, and copies with that rate."""
 
 from __future__ import annotations
 

@@ -261,7 +261,7 @@ class Trajectory:
 
     @property
     def missing(self) -> str:
-        """How many tensions, motor angles and poses of an object are missing, in words; empty if none is."""
+        """Numbers of missing tensions, motor angles and poses of an object, in words; empty if none is."""
         return ", ".join(f"{count} missing {kind}" for kind, count in self.settings.get(MISSING, {}).items())
 
     @property

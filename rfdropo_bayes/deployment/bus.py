@@ -66,7 +66,7 @@ class FrameLog(can.Listener):
         self._waiting: deque[can.Message] = deque()
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Keep a frame for the next `flush`: whoever has sent or received it must not wait for a disk."""
+        """Keep a frame for the next `flush`: sender and receiver must not wait for a disk."""
         self._waiting.append(msg)
 
     def flush(self) -> None:
@@ -87,7 +87,7 @@ class FrameLog(can.Listener):
 class Reception(can.Listener):
     """Keeps the first exception of the receiving thread, of any type: adapters pass on the exceptions of their drivers.
 
-    python-can goes on receiving after it, so that the drives' status is seen while they brake.
+    python-can continues to receive after it, so that the drives' status is seen while they brake.
     """
 
     def __init__(self) -> None:

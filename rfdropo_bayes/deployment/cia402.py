@@ -1,6 +1,6 @@
 """The power-drive state machine of CiA 402 (IEC 61800-7-201, section 5): states, commands and transitions.
 
-Master and simulated drive share this table, so that neither can know a state that the other does not. Nothing here
+Master and simulated drive share this table, so that both have the same states. Nothing here
 sends or receives: a master asks `controlword_towards`, a drive asks `obey`.
 """
 
@@ -122,7 +122,7 @@ _PATTERNS = (
 
 
 def state_of(statusword: int) -> DriveState | None:
-    """State that a statusword shows; None for a pattern that the standard does not know."""
+    """State that a statusword shows; None for a pattern outside the standard."""
     for state in DriveState:
         mask, pattern = state.value
         if statusword & mask == pattern:
@@ -171,7 +171,7 @@ _KEEP = {
 def controlword_towards(state: DriveState, target: DriveState, previous: int) -> int:
     """Controlword that brings a drive one step nearer to a state, or keeps it there.
 
-    A drive in quick stop is brought to another state through SWITCH ON DISABLED: to go on moving from a stop is a
+    A drive in quick stop is brought to another state through SWITCH ON DISABLED: to continue from a stop needs a
     decision of its own (transition 16). A fault is reset only on the way to another state than FAULT.
 
     Args:

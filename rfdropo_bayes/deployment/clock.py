@@ -23,7 +23,7 @@ _SWITCH = 5e-4  # [s]: other threads of this process give the interpreter back a
 
 
 class Tick(NamedTuple):
-    """One beat: its number, its time [s, monotonic], how late the loop woke [s], and how many beats passed unused."""
+    """One beat: its number, its time [s, monotonic], the delay of the loop [s], and the number of skipped beats."""
 
     number: int
     time: float

@@ -116,7 +116,7 @@ class SessionLog:
             thread.start()
 
     def write(self) -> None:
-        """Add ``record`` as it stands."""
+        """Append ``record`` unchanged."""
         self._records.append(self.record.tobytes())
 
     def event(self, kind: str, text: str, **more: Any) -> None:

@@ -176,7 +176,7 @@ class ControlLoop:
     # Phases
 
     def run(self, phases: Callable[[ControlLoop], None]) -> Stop:
-        """Go through the phases, and come to rest whatever happens.
+        """Go through the phases, and come to rest after any error.
 
         Returns:
             Why it ended.
@@ -390,7 +390,7 @@ class ControlLoop:
 
 
 def _as_stop(error: Exception) -> Stop:
-    """The stop that an exception of any part of a session stands for."""
+    """The stop for an exception in any part of a session."""
     if isinstance(error, Stop):
         return error
     return Stop(

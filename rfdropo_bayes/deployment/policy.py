@@ -165,7 +165,7 @@ class OnnxPolicy:
         self._last = PolicyScene(nowhere, nowhere, still, still, still, np.zeros(POSE))
 
     def rehearse(self) -> None:
-        """Look at the last scene again; see `CommandSource.rehearse`."""
+        """Use the last scene again; see `CommandSource.rehearse`."""
         self._answer(self._last)
 
     def act(self, scene: PolicyScene) -> Act:

@@ -286,7 +286,7 @@ def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
 
 
 class MarkerView:
-    """A sensor as the control loop sees it: each marker's last good position, its age, how far it moved; and the
+    """A sensor as the control loop sees it: each marker's last good position, its age, its displacement; and the
     object.
 
     Args:

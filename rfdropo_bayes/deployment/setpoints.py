@@ -1,4 +1,4 @@
-"""Set-points: lengths that keep every motor's limits on length, rate and acceleration, whatever is asked for."""
+"""Set-points: lengths within every motor's limits on length, rate and acceleration, for any commands."""
 
 from __future__ import annotations
 

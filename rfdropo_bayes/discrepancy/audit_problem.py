@@ -55,7 +55,7 @@ class AuditProblem:
 
     @property
     def compared(self) -> Groups | None:
-        """The two groups whose differences are asked for; None for an audit of all recordings."""
+        """The two compared groups; None for an audit of all recordings."""
         return self.groups if self.groups is not None and self.groups.compared else None
 
     def candidate(self, name: str) -> Candidate | None:

@@ -182,7 +182,9 @@ def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) 
         began = time.monotonic()
         forward.observe(np.clip(points, *own.bounds))
         took.append(time.monotonic() - began)
-    rollouts = climb_rollouts(target, own.base) + poll_rollouts(target)
+    climbs = 3 if target.noise.source == RESIDUALS else 1  # noise and fit in turn
+    rollouts = climbs * climb_rollouts(target, own.base) + poll_rollouts(target)
     rollouts += optimum_rollouts(target) if searches else 0
-    words = about(rollouts * forward.pace + max(took[0] - took[1], 0.0))
+    forward.compiling = max(took[0] - took[1], 0.0)
+    words = about(rollouts * forward.pace + forward.compiling)
     report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")

@@ -245,7 +245,7 @@ def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way 
 def _best_of(
     target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]
 ) -> tuple[float, Float[np.ndarray, " d"], int]:
-    """How much the point that takes most takes from the sum of squares, base parameters moved with it; this point; its
+    """Largest decrease of the sum of squares over the points, with refitted base parameters; this point; its
     number, the last one of several that take as much."""
     base = span(fit.jacobian)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]

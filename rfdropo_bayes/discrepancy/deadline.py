@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import NoReturn
 
 from rfdropo_bayes.discrepancy.processor_wait import delay, thread_times
-from rfdropo_bayes.interrupts import interrupted
+from rfdropo_bayes.interrupts import answer_interrupt, interrupted
 from rfdropo_bayes.runtime import available_processors
 
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
@@ -100,6 +100,7 @@ class Deadline:
             yield
         except (OutOfTime, KeyboardInterrupt):
             self.reached, self.why = True, self.why or INTERRUPT
+            answer_interrupt()
             report("the time is up" if self.why == TIME else "stopping: the answer has the present results")
 
     @contextmanager

@@ -176,7 +176,8 @@ class ExtensionSearch:
         finer = None
         clock, forward = self.target.forward.deadline, self.target.forward
         count = screening_rollouts(self.target, free)
-        self.report(f"screening {len(free)} candidates: {count} rollouts, {about(count * forward.pace)}")
+        apart = 2.0 * forward.compiling if forward.lanes.costly and not without else 0.0  # of slow rollouts, and slopes
+        self.report(f"screening {len(free)} candidates: {count} rollouts, {about(count * forward.pace + apart)}")
         with clock.stage("screening"):
             probes = probe_all(self.target, fit, free)
         if self.finer is not None and DISCRETISATION not in without:
@@ -381,8 +382,8 @@ class ExtensionSearch:
         return best
 
     def surpasses(self, new: Fit, old: Fit, worth: float) -> bool:
-        """Whether a model may replace an earlier choice: it must bring ``worth`` nats, also under priors of its further
-        parameters that are twice as wide.
+        """Whether a model may replace an earlier choice: its gain must be ``worth`` nats, also with doubled widths of
+        its further priors.
         """
         further = max(len(new.free) - len(old.free), 0)
         return new.log_evidence > old.log_evidence + worth + WIDER * further

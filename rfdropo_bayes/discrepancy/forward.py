@@ -1,4 +1,4 @@
-"""Rollouts and their derivatives in batches of one size, so that two compilations serve a whole audit."""
+"""Rollouts and their derivatives in batches of one size, so that two compilations suffice for an audit."""
 
 from __future__ import annotations
 
@@ -259,12 +259,14 @@ class Forward:
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
+        self.compiling = 0.0  # seconds that rollouts took to compile
 
     @cached_property
     def identity(self) -> str:
         """Digest of the simulator, its parameters with their priors, and the commands."""
         own, simulator = self.coordinates, self.lanes.simulator
-        named = (simulator.description, own.names, own.base, sorted(own.space.fixed.items()), sorted(own.nominal.items()))
+        held = sorted(own.space.fixed.items()), sorted(own.nominal.items())
+        named = (simulator.description, own.names, own.base, *held)
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
         prior = (own.prior_mean, own.prior_sd, *own.bounds)
         return digest(

@@ -119,7 +119,7 @@ def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[Judge
 def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedModel]) -> HeldOut:
     """Predictions of models; ``target`` has the measurement's noise.
 
-    A model whose rollout of an unseen recording does not end well predicts nothing, and none after it is asked.
+    A model with a failed rollout of an unseen recording gives no prediction, and later models are not evaluated.
 
     Raises:
         NoLikelihoodError: the first model's rollout does not end well.

@@ -1,6 +1,6 @@
 """Noise model of a misspecified model: as in `calibrate`, white noise of the size of its residuals.
 
-Under the measurement noise, any effect on the markers brings thousands of nats to a misspecified model: priors have no
+Under the measurement noise, any effect on the markers gains thousands of nats in a misspecified model: priors have no
 influence, and correlated noise weights wrong increments above wrong poses. While the residuals exceed `POOR` times the
 noise's variance, the model is fitted and extended under white noise of the size of its residuals. Rows are
 down-weighted by the residual correlation time. Repeats do not reduce a model's error: a mean of five counts once.

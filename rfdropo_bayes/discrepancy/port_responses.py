@@ -195,7 +195,7 @@ def with_exact_columns(
 
 
 def under(found: Responses, judge: FitTarget, other: FitTarget) -> Responses:
-    """The same responses in deviations of the noise of another target; residual and slopes stay as they are."""
+    """The same responses in deviations of the noise of another target; residual and slopes are unchanged."""
     if judge.known is None:  # it has the measurement noise, which is kept
         return found
 

@@ -1,4 +1,4 @@
-"""Parameters of the base model that their prior decides: whatever joins the model makes up for a prior that is wrong.
+"""Parameters of the base model that their prior decides: any added effect compensates for the wrong prior.
 
 An arm whose sections do not swell was audited under a prior of Poisson's ratio from 0.4 to 0.499. The parameter went to
 0.4, and a payload became 1.6 times as heavy, seven of its deviations away.

@@ -1,8 +1,8 @@
 """Score tests of a model: a joint test of its residuals, and a test of each candidate.
 
 All p-values are taken from residuals as they would be if the model were right (a parametric bootstrap): noise is drawn
-for every recording, its model is estimated from it as it was from the data, and the base model is refitted linearly. No
-rollouts are needed.
+for every recording, its model is estimated as for the data, and the base model is refitted linearly. No rollouts are
+needed.
 """
 
 from __future__ import annotations

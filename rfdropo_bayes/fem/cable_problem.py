@@ -2,7 +2,7 @@
 
 With cables only, Newton's step of ``constraints`` is the solution of R g + W g = -b over the cables that pull. It is
 the answer if these cables are the same after it. Most steps need no more than the set of the step before; else Newton's
-method goes on from the impulses of that step, with the line search of that module.
+method continues from the impulses of that step, with the line search of that module.
 """
 
 from __future__ import annotations

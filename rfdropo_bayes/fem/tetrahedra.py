@@ -9,8 +9,8 @@ functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law. Two
   TetrahedronFEMForceField does with ``method="large"`` (Nesme, Payan and Faure 2005, Eurographics short papers). It
   depends on the order of the element's nodes.
 
-Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they serve fidelity to meshes of other
-simulators, not accuracy with few unknowns.
+Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they reproduce meshes of other
+simulators, and are not accurate with few unknowns.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 - `Progress`: a bar with the time left for people, one JSON line per stage for programs.
 - `say_step`: a report on the work after a bar.
-- `Checkpoint`: a killed run goes on from its last whole stage and ends with the same draws.
+- `Checkpoint`: a killed run continues from its last whole stage and ends with the same draws.
 - `Logbook`: both of them, for a run or a part of one.
 """
 

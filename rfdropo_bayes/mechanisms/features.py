@@ -83,8 +83,7 @@ class Feature(NamedTuple):
 
     Attributes:
         kind: a key of `KINDS`.
-        channels: indices of its commands, or of its `GAUGES`; `OWN` is to be replaced before values are asked for, see
-            `of`.
+        channels: indices of its commands, or of its `GAUGES`; `OWN` must be replaced before use, see `of`.
         shape: its time constant [s] or width [m or rad]; None without.
         of_motion: whether it is made of `GAUGES`, which take the place of commands then.
     """

@@ -1,7 +1,7 @@
 """All mechanisms by name. To add one: write its class in the module of its stage, and one line here.
 
-A mechanism may also live in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
-experiment file, stands wherever a registry name does; see docs/mechanisms.md.
+A mechanism may also be defined in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
+experiment file, replaces a registry name; see docs/mechanisms.md.
 """
 
 from __future__ import annotations

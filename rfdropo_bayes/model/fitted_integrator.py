@@ -7,12 +7,20 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.assembly import integrator_of
 from rfdropo_bayes.model.experiment_file import read_tables
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 
 INTEGRATOR = "integrator"
 """Attribute of a posterior: how time steps were taken in its fit."""
+
+
+def stated_integrator(spec: ModelSpec) -> dict[str, str]:
+    """The integrator of a model as an attribute of a posterior; empty for a black box."""
+    integrator = integrator_of(spec)
+    return {} if integrator is None else {INTEGRATOR: integrator}
 
 
 def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None) -> str:
@@ -26,7 +34,8 @@ def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None)
         return str(attributes[INTEGRATOR])
     if folder is None or not (folder / CONFIG).is_file():
         return "euler"
-    return str(read_tables(folder / CONFIG).get("simulator", {}).get(INTEGRATOR, "euler"))
+    simulator = read_tables(folder / CONFIG).get("simulator", {})
+    return QUASI_STATIC if simulator.get("motion") == QUASI_STATIC else str(simulator.get(INTEGRATOR, "euler"))
 
 
 def check_fitted_integrator(fitted: str, integrator: str | None, *, where: str) -> None:

@@ -1,7 +1,6 @@
 """Policies: the paper's tasks as environments of many trunks, training, paired evaluation, export to ONNX.
 
-Gymnasium imports this room when it is asked for ``"rfdropo_bayes.policies:TrunkReach-v0"``, and finds the tasks by
-name.
+Gymnasium imports this package for ``"rfdropo_bayes.policies:TrunkReach-v0"``, and finds the tasks by name.
 """
 
 from importlib.util import find_spec

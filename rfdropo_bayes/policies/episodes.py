@@ -65,8 +65,7 @@ class Settings:
         actions, observed, period, step, history: see `layout_of`.
         noise: standard deviation of white noise on the observed positions of markers and cube [m]. A marker's
             displacement is the difference of two observations, as on a robot.
-        near: an episode ends within this distance of the goal [m]; None lets it go on, which keeps the reward of
-            staying there.
+        near: an episode ends within this distance of the goal [m]; None never, with the reward of staying there.
         tension_limit: an episode ends once a cable pulls more [N], as drives stop then; None lets it pull.
     """
 

@@ -69,7 +69,7 @@ def difference(policy: ExportedPolicy, act: Act, seen: Float[np.ndarray, "row si
 
 
 def check_exportable(model: Any, normalisation: Any, act: Act, layout: PolicyLayout) -> None:
-    """Refuse a model whose export would act otherwise; model, normalisation and random generators stay as they are.
+    """Refuse a model whose export would act otherwise; model, normalisation and random generators are unchanged.
 
     Args:
         model: model of Stable-Baselines3, trained or untrained.

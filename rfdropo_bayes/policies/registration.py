@@ -6,7 +6,7 @@ NAMES = ("TrunkReach-v0", "TrunkPush-v0")
 
 
 def register() -> None:
-    """Make ``gymnasium.make`` and ``gymnasium.make_vec`` know the tasks."""
+    """Register the tasks for ``gymnasium.make`` and ``gymnasium.make_vec``."""
     import gymnasium
 
     for name in NAMES:

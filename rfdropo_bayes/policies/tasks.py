@@ -165,8 +165,8 @@ def layout_of(
     Args:
         actions: "discrete", one channel pulled or released by ``step``, as in the paper; or "continuous", every channel
             moved by up to ``step``.
-        observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
-            marker has moved since the last action; "markers", the same with the markers that motion capture sees.
+        observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and each
+            marker's displacement since the last action; "markers", the same with the markers that motion capture sees.
         period: time from one action to the next [s].
         step: largest change of a channel per action, in the unit of its commands, or a value per channel; by default
             the command that pulls a cable by 5 mm, see `Commanded.command_of`.

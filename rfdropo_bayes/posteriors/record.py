@@ -259,7 +259,7 @@ def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | Non
 
 
 def _masks(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Masks of the observations; ArviZ looks for a prediction of everything that is observed data."""
+    """Masks of the observations; ArviZ expects a prediction of all observed data."""
     data = {
         f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8)) for i, r in enumerate(recordings)
     }

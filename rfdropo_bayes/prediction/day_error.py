@@ -189,7 +189,7 @@ def _tip_error(predictions: Sequence[RecordingPrediction]) -> float:
 
 
 def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]) -> float:
-    """Share of the coordinates of days left out in 90 % bands that know of the other days alone."""
+    """Share of the coordinates of left-out sessions in 90 % bands from the other sessions."""
     inside = []
     for number, (group, found) in enumerate(days.items()):
         other = _with_times(prior, [square for name, square in squares.items() if name != group])

@@ -184,7 +184,7 @@ def predict_new(
 
 
 def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKeyArray) -> RecordingPrediction:
-    """A prediction whose draws have the slow error of an unseen day; markers that no fit has seen stay as they are."""
+    """A prediction whose draws have the slow error of an unseen day; markers outside the fit are unchanged."""
     known = [i for i, name in enumerate(prediction.marker_names) if name in slow.markers]
     if not known:
         return prediction

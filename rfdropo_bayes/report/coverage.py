@@ -65,7 +65,7 @@ def probability_transform(recording: RecordingPrediction) -> Float[np.ndarray, "
 
 
 class TransformCurve(NamedTuple):
-    """Empirical distribution of the transform and how far from the diagonal chance would take it.
+    """Empirical distribution of the transform, and its band around the diagonal under chance.
 
     Attributes:
         grid: probabilities.

@@ -109,7 +109,7 @@ def _our_style() -> Iterator[None]:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Run a drawing function under the common style, whatever the user's matplotlibrc says."""
+    """Run a drawing function under the common style, independently of the user's matplotlibrc."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -201,7 +201,7 @@ def label_with_unit(name: str, unit: str) -> str:
 
 
 class PlainLogFormatter(LogFormatter):
-    """Numbers of a logarithmic axis as they are read: 0.6, and not 6e-01."""
+    """Plain numbers on a logarithmic axis: 0.6, and not 6e-01."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return f"{x:g}" if super().__call__(x, pos) else ""

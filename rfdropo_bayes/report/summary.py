@@ -157,7 +157,7 @@ class Errors(_Open):
 
 
 class Summary(_Open):
-    """The part of summary.json that is promised; more keys may follow."""
+    """The stable part of summary.json; more keys may follow."""
 
     schema_version: int
     status: str
@@ -284,7 +284,7 @@ def _reason(path: str, value: float) -> str:
 
 
 def check_summary(summary: Mapping[str, Any], *, where: str) -> None:
-    """Raise InputError if a promised key is missing or of the wrong type."""
+    """Raise InputError if a stable key is missing or of the wrong type."""
     parse_table(Summary, summary, where=where)
     if summary["schema_version"] != SCHEMA_VERSION:
         raise InputError(
@@ -307,7 +307,7 @@ def read_summary(path: Path) -> dict[str, Any]:
     """Read summary.json.
 
     Raises:
-        InputError: if it is missing, no JSON, or lacks a promised key.
+        InputError: if it is missing, no JSON, or lacks a stable key.
     """
     try:
         summary = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Tetrahedral meshes from files (VTK, Gmsh and whatever else meshio reads), checked and in metres."""
+"""Tetrahedral meshes from files (VTK, Gmsh and other formats of meshio), checked and in metres."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ class ReferenceLanes:
         self._lanes: _Lane | None = None
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`. All lanes are computed, so that the same program serves any number of rows."""
+        """See `BodyLanes`. All lanes are computed, so that the same compiled program works for any number of rows."""
         spread = np.zeros(self._count, int)
         spread[rows] = np.arange(len(rows))
         fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[spread], given))

@@ -103,7 +103,7 @@ class Simulator(Protocol):
         initial: Float[np.ndarray, " channel"],
         observation_time: Float[np.ndarray, " time"],
     ) -> Commands:
-        """Bring a recorded command sequence onto the simulator's own clock (see `commands_on_grid`)."""
+        """Convert a recorded command sequence to the simulator's own clock (see `commands_on_grid`)."""
 
     def rollout(
         self, parameters: Mapping[str, Float[Array, ""]], commands: Commands, steps: Int[Array, ""] | None = None

@@ -23,7 +23,7 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 @dataclass(frozen=True)
 class Discretisation:
-    """Discretisation of body and time: time step [s], and by how many times the elements of the robot's body."""
+    """Discretisation of body and time: time step [s], and factor on the elements of the robot's body."""
 
     time_step: float
     refine: int = 1

@@ -29,6 +29,7 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.assembly import pooling
 from rfdropo_bayes.model.experiment import NoiseTable
 from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
@@ -487,6 +488,7 @@ def _record(
         {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
     )
     known |= {DAY_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
+    known |= stated_integrator(asked.model.spec)
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
     predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
     record = PosteriorRecord(infos, draws, {**prior, **drawn}, tuple(predictions), attrs=attributes)

@@ -176,3 +176,29 @@ class RestingRobot:
             return jax.vmap(lambda row: own.measured(whole, row[None], at)[0])(position)
 
         return jax.jit(jax.vmap(measured))
+
+
+BLOCKS, BLOCK = 5, 24
+"""Stretches of rows that stand for a recording at rest, and rows of each: neighbours are found from each other."""
+
+
+def blocks_of(run: Trajectory) -> Trajectory:
+    """Some rows of a recording at rest, in stretches; each row under the command that its pose is simulated under."""
+    count = len(run.time)
+    if count <= BLOCKS * BLOCK:
+        return run
+    first = np.linspace(0, count - BLOCK, BLOCKS).astype(int)
+    rows = (first[:, None] + np.arange(BLOCK)).ravel()
+    time = run.time[rows]
+    command = run.command_at(time - _JUST_BEFORE)
+    dataset = run.dataset.isel(time=rows, command_time=np.arange(len(rows) - 1))
+    gaps = np.diff(time)
+    clock = np.append(0.0, np.cumsum(np.minimum(gaps, 2.0 * np.median(gaps))))  # no clock runs from stretch to stretch
+    dataset = dataset.assign_coords(time=clock, command_time=0.5 * (clock[1:] + clock[:-1]))
+    dataset["command"] = dataset["command"].copy(data=command[1:])
+    dataset["initial_command"] = dataset["initial_command"].copy(data=command[0])
+    return Trajectory(dataset)
+
+
+_JUST_BEFORE = 1e-6
+"""[s] before a row: a command that is sent in it does not act yet."""

@@ -429,8 +429,10 @@ def _model(
     trajectories: Sequence[Trajectory],
     fitted: int,
 ) -> tuple[TrajectoryModel, int]:
-    """The model with all candidates, and how many of its parameters are of the base model, which come
-    first. The noise of its channels is known, so that its parameters are not among them."""
+    """The model with all candidates, and the number of its first parameters, those of the base model.
+
+    The noise of its channels is known, so that its parameters are not included.
+    """
     added = simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
     model = build_model(

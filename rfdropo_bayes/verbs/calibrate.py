@@ -21,10 +21,9 @@ from rfdropo_bayes.inference.method_options import options_table
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
-from rfdropo_bayes.model.assembly import integrator_of
 from rfdropo_bayes.model.experiment import ROLLOUTS, InferenceTable
 from rfdropo_bayes.model.experiment_file import describe
-from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
+from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
@@ -401,11 +400,10 @@ def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
 
 
 def _attributes(model: Model, seed: int, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
-    integrator = integrator_of(model.spec)
     return {
         "seed": seed,
         "robot": model.name,
         "data_sha256": [trajectory.sha256 for trajectory in trajectories],
         "versions": software_versions(),
-        **({} if integrator is None else {INTEGRATOR: integrator}),
+        **stated_integrator(model.spec),
     }

@@ -41,6 +41,7 @@ from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
+from rfdropo_bayes.verbs.at_rest import blocks_of
 from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.command_lag import lag_words
@@ -94,7 +95,13 @@ def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflig
         InputError: bad input, or a model that cannot be simulated.
     """
     model = given_model(model, "check")
-    return preflight(model, model.runs(runs)[0], seed=seed)
+    fitted = model.runs(runs)[0]
+    if model.spec.simulator.motion != QUASI_STATIC:
+        return preflight(model, fitted, seed=seed)
+    # Poses at rest do not know of each other: some rows stand for all.
+    fewer = [blocks_of(run) for run in fitted]
+    share = sum(len(run.time) for run in fewer) / sum(len(run.time) for run in fitted)
+    return preflight(model, fewer, seed=seed, share=share)
 
 
 def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bool = False) -> Check:
@@ -144,7 +151,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     notes = [thinning_note(trajectory) for trajectory in (*recordings["fit"], *recordings["test"])]
     found.notes += [note for note in notes if note is not None]
     if ahead and recordings["fit"] and not found.problems:
-        fewer = [looked_at(trajectory) for trajectory in recordings["fit"]]
+        rests = experiment.simulator.motion == QUASI_STATIC
+        fewer = recordings["fit"] if rests else [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
             _say_motion(found, experiment, folder, recordings, fewer, output_folder(out))
         _say_ahead(found, experiment, folder, fewer)
@@ -201,7 +209,8 @@ def _say_motion(
 def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
     """Report on combinations that a fit can determine; a failed simulation is not counted as a problem."""
     seconds = sum(float(run.time[-1]) for run in runs)
-    patience = "; this takes minutes, and --quick leaves it out" if seconds > LONG else ""
+    moves = experiment.simulator.motion != QUASI_STATIC
+    patience = "; this takes minutes, and --quick leaves it out" if moves and seconds > LONG else ""
     say_step(f"simulating {seconds:.3g} s under draws of the prior, to estimate the result of a fit{patience}")
     try:
         found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)

@@ -254,7 +254,7 @@ def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers
 
 
 def lost_positions(recordings: list[Path], guess: Guess) -> dict[str, int]:
-    """Recordings, by name, in which cells of positions are empty, and how many; of plain CSV alone."""
+    """Recordings with empty cells of positions, and their number, by name; of plain CSV alone."""
     if guess.format != named_columns.FORMAT:
         return {}
     counts = {}

@@ -128,7 +128,7 @@ def length_unit(values: pd.DataFrame) -> Unit:
 def unit_of_places(start: Float[np.ndarray, "marker 3"], heights: Mapping[str, float]) -> Unit | None:
     """The unit in which distances between markers, or of a single marker from the base, match the robot.
 
-    None if no unit brings them near.
+    None if no unit agrees.
 
     Args:
         start: first seen position of each marker, in the unknown unit.

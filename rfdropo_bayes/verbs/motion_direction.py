@@ -38,7 +38,7 @@ class Direction(NamedTuple):
 
     @property
     def straight(self) -> float:
-        """Correlation of both motions as they are, -1 to 1."""
+        """Correlation of both motions without rotation, -1 to 1."""
         return self.agreement * float(np.cos(self.turn))
 
 

@@ -60,7 +60,7 @@ def limit_of(command_unit: str) -> float:
 
 
 class Unit(NamedTuple):
-    """Another unit of the commands, and the size of a command in it over the same command as it was read."""
+    """Another unit of the commands, and its ratio to the unit that was read."""
 
     name: str
     factor: float

@@ -78,8 +78,10 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
         elements = _distance(here, moved(refine=MORE_ELEMENTS * table.refine))
     if simulator.engine.carries_loads and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms):
         other = {"motion": "dynamic"} if simulator.at_rest else {"motion": QUASI_STATIC, **dict.fromkeys(MOVING)}
-        rows, steps = len(here), min(longest, float(recording.time[-1])) / simulator.time_step
-        cheaper = steps * len(STAGES[simulator.engine.integrator]) / (SOLVES * rows)
+        dynamic = replace(spec, simulator=table.model_copy(update={"motion": "dynamic"}))
+        moving = build_robot_simulator(dynamic) if simulator.at_rest else simulator
+        rows, steps = len(here), min(longest, float(recording.time[-1])) / moving.time_step
+        cheaper = steps * len(STAGES[moving.engine.integrator]) / (SOLVES * rows)
         rest = RestError(_distance(here, moved(**other)), _way(here), cheaper)
     return NumericalError(min(longest, float(recording.time[-1])), finer, elements, _way(here), rest)
 

@@ -84,7 +84,7 @@ def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
     """Find the arrangement of a robot's commands.
 
     Args:
-        resting: the robot as it is written, showing the markers of the rows.
+        resting: the robot of the file, with the markers of the rows.
         rows: rows of recordings.
     """
     robot = resting.simulator.robot
@@ -119,7 +119,7 @@ class _Finder:
         return self._seen[arrangement]
 
     def straight(self, arrangement: Arrangement) -> float:
-        """Correlation as it is."""
+        """Correlation without rotation."""
         return self.agreement(arrangement).straight
 
     def levelled(self, arrangement: Arrangement) -> Arrangement:

@@ -176,7 +176,7 @@ class _Noise(NamedTuple):
 
 
 def preflight(
-    model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0
+    model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0, share: float = 1.0
 ) -> Preflight:
     """Estimate within seconds the combinations that a fit of these recordings can determine.
 
@@ -185,6 +185,7 @@ def preflight(
         runs: recordings to fit.
         method: and ``rollouts``: its budget; by default from the model's experiment.
         seed: seed of the prior draws.
+        share: rows of ``runs`` over those of the fit, if they are some of its rows only.
 
     Raises:
         InputError: no parameter to infer, or no prior draw whose rollouts end well.
@@ -201,9 +202,11 @@ def preflight(
     count = int(np.clip(SETS // (2 * len(coordinates.names)), FEWEST, MOST))
     start = np.asarray(jax.random.permutation(second, PRIOR_DRAWS))[:count]
     noise = _noise(model, problem, drawn, runs)
+    noise = noise._replace(white=float(np.sqrt(share)) * noise.white)  # fewer rows know as much
     rough = isinstance(model.robot, BlackBox) and model.robot.difference
     difference = rough or 0.0
     slopes, good, per_set, observed = _slopes(problem, coordinates, drawn, start, difference)
+    per_set /= share
     if not good.any():
         raise InputError("no draw of the prior can be simulated", where="check", remedy=observed.remedy)
     whiten = _Whitening(problem, noise)
@@ -216,7 +219,7 @@ def preflight(
     more = _further(model, coordinates, tension)
     settings = model.settings.inference
     budget = rollouts or settings.rollouts or ROLLOUTS
-    if rollouts is None and settings.minutes is not None:
+    if not rollouts and settings.minutes is not None:
         budget = budget_within(settings.minutes, per_set, 1.0).rollouts
     return Preflight(
         _directions(coordinates, known, more),

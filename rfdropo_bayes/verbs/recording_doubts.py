@@ -131,7 +131,7 @@ def _misnamed(recording: Trajectory, markers: Sequence[str]) -> list[Caution]:
 
 
 def _unasked(recording: Trajectory, robot: Robot) -> list[Caution]:
-    """Markers that go on moving while no command changes: a step into the recording has come to rest by its middle."""
+    """Markers that move while no command changes: a step into the recording has come to rest by its middle."""
     if np.ptp(recording.command, axis=0).any():
         return []
     middle = len(recording.time) // 2

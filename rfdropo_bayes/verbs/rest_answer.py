@@ -16,6 +16,8 @@ from rfdropo_bayes.verbs.command_lag import best_delay
 from rfdropo_bayes.verbs.order_finder import arranged
 from rfdropo_bayes.verbs.rest_fit import KEPT, OWN, Estimate, RestFit, fit_at_rest
 
+MISREAD = 2.0
+"""Error over that of the best predictor without physics from which on the description itself is doubted."""
 DRIFTS, WAYS = 0.25, 0.1
 """Shares of what a fit leaves that a drift, and the way in which a command last changed, must explain to be said."""
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg")}
@@ -61,9 +63,14 @@ def rest_notes(fit: RestFit) -> list[str]:
     notes = []
     best = min((name for name in fit.unseen if name != OWN), key=lambda name: fit.unseen[name])
     if fit.unseen[OWN] > fit.unseen[best]:
+        cause = (
+            "a unit, an order, a length or a frame is likely wrong"
+            if fit.unseen[OWN] > MISREAD * fit.unseen[best]
+            else "friction, stretch of cables or another effect is missing, or some cables end or run elsewhere"
+        )
         notes.append(
             f"a fitted robot at rest is off by {_millimetres(fit.unseen[OWN])} mm, the {best} without any physics by "
-            f"{_millimetres(fit.unseen[best])} mm: a unit, an order, a length or a frame is likely wrong"
+            f"{_millimetres(fit.unseen[best])} mm: {cause}"
         )
     return [*notes, *_drifts(fit), *_ways(fit)]
 

@@ -7,7 +7,8 @@ import numba
 import numpy as np
 import pytest
 
-from rfdropo_bayes.fem.native import rod_rollout, tetrahedral_rollout
+from rfdropo_bayes.fem.native import kept_kernels, rod_rollout, tetrahedral_rollout
+from rfdropo_bayes.fem.native.kept_kernels import KernelCache, kept_for_user, kernel_folder
 from rfdropo_bayes.fem.native.rod_engine import NativeRod
 
 from .native_cases import STEPS, TIME_STEP, materials, uneven_rod
@@ -31,3 +32,37 @@ def test_one_rollout_and_many_from_numpy_and_from_jax_take_one_kernel() -> None:
         kinds.add(numba.typeof(run.batch))
     assert len(kinds) == 1
     assert "readonly" not in str(kinds.pop())
+
+
+def test_a_kernel_is_kept_in_the_users_folder_and_compiled_once(tmp_path, monkeypatch) -> None:
+    """The second function of the same name stands for another process: it finds what the first one has compiled."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+
+    def doubled(x):
+        return 2 * x
+
+    first, second = (kept_for_user(numba.njit(cache=True)(doubled)) for _ in range(2))
+    assert [first(3), second(3)] == [6, 6]
+    assert [sum(kernel.stats.cache_misses.values()) for kernel in (first, second)] == [1, 0]
+    assert sorted(file.suffix for file in (tmp_path / "rfdropo_bayes" / "kernels").iterdir()) == [
+        ".lock",
+        ".nbc",
+        ".nbi",
+    ]
+    assert kernel_folder() == tmp_path / "rfdropo_bayes" / "kernels"
+
+
+def test_a_process_waits_for_the_one_that_compiles_and_no_longer(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    kernel_folder().mkdir(parents=True)
+    one, other = (KernelCache(lambda x: x) for _ in range(2))
+    waited = []
+    monkeypatch.setattr(kept_kernels.time, "sleep", lambda seconds: (waited.append(seconds), one._let_others()))
+    one._wait()
+    one._wait()  # again after a compilation that failed: it does not wait for itself
+    assert not waited
+    other._wait()
+    assert len(waited) == (kept_kernels.fcntl is not None)
+    other._let_others()

@@ -10,9 +10,37 @@ from scipy.stats import multivariate_normal, norm
 from rfdropo_bayes.bayes.problem import ProblemDefaults, RolloutDefaults
 
 
-def first_rows(rows, horizon):
-    """Of a density that was compiled for all rows: compiling it for each horizon takes longer than all of a test."""
-    return (rows if isinstance(rows, jax.core.Tracer) else np.asarray(rows))[:, :horizon]
+def plain(value):
+    """A NumPy array unless JAX traces: each of JAX's operations on an array of another shape would be compiled."""
+    return value if isinstance(value, jax.core.Tracer) else np.asarray(value)
+
+
+def kind(*values):
+    """JAX where it traces, NumPy elsewhere."""
+    return jnp if any(isinstance(value, jax.core.Tracer) for value in values) else np
+
+
+def normal_density(value, mean, sd):
+    """Log density of a normal."""
+    return -0.5 * ((value - mean) / sd) ** 2 - np.log(np.sqrt(2.0 * np.pi) * sd)
+
+
+def sigmoid(u):
+    """Between 0 and 1."""
+    u = plain(u)
+    return 0.5 + 0.5 * kind(u).tanh(0.5 * u)
+
+
+def log_sigmoids(u):
+    """Log density of logits whose sigmoids are uniform, summed over the last axis."""
+    u = abs(plain(u))
+    return -(u + 2.0 * kind(u).log1p(kind(u).exp(-u))).sum(axis=1)
+
+
+def together(values, names):
+    """The values of some names along a last axis."""
+    parts = [plain(values[name]) for name in names]
+    return kind(*parts).stack(parts, axis=-1)
 
 
 class LinearGaussian(ProblemDefaults):
@@ -34,29 +62,27 @@ class LinearGaussian(ProblemDefaults):
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
         self.n_rows = n_rows
         self.calls: list[tuple[int, int]] = []
-        self._rows = jax.jit(self._row_density, static_argnums=1)
 
     def sample_prior(self, key, n):
-        z = jax.random.normal(key, (n, len(self.names)))
+        z = plain(jax.random.normal(key, (n, len(self.names))))
         return self.from_unconstrained(self.mean + self.sd * z)
 
     def to_unconstrained(self, values):
-        return jnp.stack([jnp.asarray(values[name]) for name in self.names], axis=-1)
+        return together(values, self.names)
 
     def from_unconstrained(self, u):
-        return {name: u[:, j] for j, name in enumerate(self.names)}
+        return {name: plain(u)[:, j] for j, name in enumerate(self.names)}
 
     def log_prior(self, u):
-        return jnp.sum(jax.scipy.stats.norm.logpdf(u, self.mean, self.sd), axis=1)
+        return normal_density(plain(u), self.mean, self.sd).sum(axis=1)
 
     def _row_density(self, u, horizon):
-        fit = u @ self.design[:horizon].T
-        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
+        return normal_density(self.data[:horizon], u @ self.design[:horizon].T, self.noise[:horizon])
 
     def row_log_likelihood(self, values, horizon):
         u = self.to_unconstrained(values)
         self.calls.append((len(u), horizon))
-        return first_rows(self._rows(u, self.n_rows), horizon), np.zeros(len(u), dtype=int)
+        return self._row_density(u, horizon), np.zeros(len(u), dtype=int)
 
     def residuals(self, values, horizon):
         u = jnp.stack([values[name] for name in self.names])
@@ -100,29 +126,24 @@ class Decay(ProblemDefaults):
         rng = np.random.default_rng(seed)
         clean = self.truth["amplitude"] * np.exp(-self.truth["rate"] * self.time)
         self.data = clean + self.truth["noise"] * rng.normal(size=n_rows)
-        self._rows = jax.jit(self._row_density, static_argnums=1)
-        self.log_prior = jax.jit(self.log_prior)
-        self.from_unconstrained = jax.jit(self.from_unconstrained)
 
     def sample_prior(self, key, n):
-        return self.from_unconstrained(self.centre + self.spread * jax.random.normal(key, (n, 3)))
+        return self.from_unconstrained(self.centre + self.spread * plain(jax.random.normal(key, (n, 3))))
 
     def to_unconstrained(self, values):
-        return jnp.stack([jnp.log(jnp.asarray(values[name])) for name in self.names], axis=-1)
+        positive = together(values, self.names)
+        return kind(positive).log(positive)
 
     def from_unconstrained(self, u):
-        return {name: jnp.exp(u[:, j]) for j, name in enumerate(self.names)}
+        values = kind(u).exp(plain(u))
+        return {name: values[:, j] for j, name in enumerate(self.names)}
 
     def log_prior(self, u):
-        return jnp.sum(jax.scipy.stats.norm.logpdf(u, self.centre, self.spread), axis=1)
-
-    def _row_density(self, values, horizon):
-        fit = values["amplitude"][:, None] * jnp.exp(-values["rate"][:, None] * self.time[:horizon])
-        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, values["noise"][:, None])
+        return normal_density(plain(u), self.centre, self.spread).sum(axis=1)
 
     def row_log_likelihood(self, values, horizon):
-        values = {name: jnp.asarray(values[name]) for name in self.names}
-        rows = np.array(self._rows(values, self.n_rows))[:, :horizon]  # a copy, to write to
+        amplitude, rate, noise = (np.asarray(values[name])[:, None] for name in self.names)
+        rows = normal_density(self.data[:horizon], amplitude * np.exp(-rate * self.time[:horizon]), noise)
         failed = np.asarray(values["rate"]) > self.fails_above
         rows[failed] = np.nan
         return rows, failed.astype(int)
@@ -146,13 +167,13 @@ class Touched(LinearGaussian):
         super().__init__(n_rows=n_rows, d=2)
         self.mean, self.sd, self.noise = np.zeros(2), np.full(2, 1.5), np.full(n_rows, 0.1)
         self.later = (np.arange(n_rows) >= n_rows // 2).astype(float)
-        self.data = np.asarray(self.fit(jnp.array([0.7, 2.2]), n_rows))
+        self.data = np.asarray(self.fit(np.array([0.7, 2.2]), n_rows))
 
     def fit(self, u, horizon):
         return u[..., :1] + (u[..., 1:] ** 3 - 3.0 * u[..., 1:]) * self.later[:horizon]
 
     def _row_density(self, u, horizon):
-        return jax.scipy.stats.norm.logpdf(self.data[:horizon], self.fit(u, horizon), self.noise[:horizon])
+        return normal_density(self.data[:horizon], self.fit(u, horizon), self.noise[:horizon])
 
     def residuals(self, values, horizon):
         u = jnp.stack([values[name] for name in self.names])
@@ -169,8 +190,8 @@ class TwoModes(LinearGaussian):
         self.data = np.concatenate([[1.0], np.linspace(-0.5, 0.5, d - 1)])
 
     def _row_density(self, u, horizon):
-        fit = jnp.concatenate([jnp.abs(u[:, :1]), u[:, 1:]], axis=1)[:, :horizon]
-        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
+        fit = kind(u).concatenate([abs(u[:, :1]), u[:, 1:]], axis=1)[:, :horizon]
+        return normal_density(self.data[:horizon], fit, self.noise[:horizon])
 
     def residuals(self, values, horizon):
         u = jnp.stack([jnp.abs(values["x0"]), *(values[name] for name in self.names[1:])])
@@ -199,25 +220,24 @@ class Ratio(LinearGaussian):
         self.data = self.gain * np.log(truth[0] / truth[1]) + self.noise * rng.normal(size=40)
 
     def sample_prior(self, key, n):
-        return dict(
-            zip(self.names, (self.low + (self.high - self.low) * jax.random.uniform(key, (n, 2))).T, strict=True)
-        )
+        share = plain(jax.random.uniform(key, (n, 2)))
+        return dict(zip(self.names, (self.low + (self.high - self.low) * share).T, strict=True))
 
     def to_unconstrained(self, values):
-        x = jnp.stack([jnp.asarray(values[name]) for name in self.names], axis=-1)
-        return jnp.log(x - self.low) - jnp.log(self.high - x)
+        x = together(values, self.names)
+        return kind(x).log((x - self.low) / (self.high - x))
 
     def from_unconstrained(self, u):
-        x = self.low + (self.high - self.low) * jax.nn.sigmoid(u)
+        x = self.low + (self.high - self.low) * sigmoid(u)
         return {name: x[:, j] for j, name in enumerate(self.names)}
 
     def log_prior(self, u):
-        return jnp.sum(jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u), axis=1)
+        return log_sigmoids(u)
 
     def _row_density(self, u, horizon):
         values = self.from_unconstrained(u)
-        fit = jnp.log(values["stiffness"] / values["mass"])[:, None] * self.gain[:horizon]
-        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
+        fit = kind(u).log(values["stiffness"] / values["mass"])[:, None] * self.gain[:horizon]
+        return normal_density(self.data[:horizon], fit, self.noise[:horizon])
 
     def residuals(self, values, horizon):
         fit = jnp.log(values["stiffness"] / values["mass"]) * self.gain[:horizon]
@@ -250,11 +270,11 @@ class Washboard(LinearGaussian):
         self.mean, self.sd, self.centre = np.full(d, 2.0), np.full(d, 3.0), np.linspace(-1.3, 3.4, d)
 
     def _shape(self, away):
-        return -0.5 * (away / self.width) ** 2 - self.ripple * (1.0 - jnp.cos(2.0 * jnp.pi * away))
+        return -0.5 * (away / self.width) ** 2 - self.ripple * (1.0 - kind(away).cos(2.0 * np.pi * away))
 
     def _row_density(self, u, horizon):
         whole = self._shape(u - self.centre).sum(axis=1)
-        return jnp.tile(whole[:, None] / self.n_rows, (1, horizon))
+        return kind(whole).tile(whole[:, None] / self.n_rows, (1, horizon))
 
     def residuals(self, values, horizon):
         away = jnp.stack([values[name] for name in self.names]) - self.centre
@@ -294,28 +314,24 @@ class Spring(RolloutDefaults):
 
     def sample_prior(self, key, n):
         keys = jax.random.split(key, 3)
-        return {
-            name: jax.random.uniform(k, (n,), minval=self.bounds[name][0], maxval=self.bounds[name][1])
-            for k, name in zip(keys, self.names, strict=True)
-        }
+        shares = [plain(jax.random.uniform(k, (n,))) for k in keys]
+        return self._within(dict(zip(self.names, shares, strict=True)))
+
+    def _within(self, shares):
+        """Values at shares of the way between their bounds."""
+        return {name: self.bounds[name][0] + np.ptp(self.bounds[name]) * share for name, share in shares.items()}
 
     def to_unconstrained(self, values):
-        return jnp.stack([_logit(jnp.asarray(values[n]), *self.bounds[n]) for n in self.names], axis=-1)
+        x, (low, high) = together(values, self.names), np.array([self.bounds[name] for name in self.names]).T
+        return kind(x).log((x - low) / (high - x))
 
     def from_unconstrained(self, u):
-        return {
-            name: self.bounds[name][0] + (self.bounds[name][1] - self.bounds[name][0]) * jax.nn.sigmoid(u[:, j])
-            for j, name in enumerate(self.names)
-        }
+        return self._within({name: sigmoid(u)[:, j] for j, name in enumerate(self.names)})
 
     def log_prior(self, u):
-        return jnp.sum(jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u), axis=1)
+        return log_sigmoids(u)
 
     def row_log_likelihood(self, values, horizon):
         features, status = self.rollouts(values, horizon)
         noise = np.asarray(values["noise"])[:, None, None]
         return norm.logpdf(self.observed[:horizon], features, noise).sum(axis=2), status
-
-
-def _logit(value, low, high):
-    return jnp.log(value - low) - jnp.log(high - value)

@@ -99,6 +99,7 @@ def test_gymnasium_and_sb3_accept_the_environment(actions, observed) -> None:
     assert frame.std() > 10.0  # something is drawn
 
 
+@pytest.mark.slow
 def test_gymnasium_finds_the_tasks_in_a_fresh_process() -> None:
     """By the module that the name begins with, and by the bare name once that is imported."""
     code = f"""if True:

@@ -130,8 +130,9 @@ def known():
     left = {"markers": ["tip"], "scale": [SIGMA] * 3, "correlation_time": STEP}
     attributes = {MODEL_ERROR: left, FITTED: ["day_0_a"], NOISE: "white"}
     scopes = {"zero_spread": Scope(spread=True), "zero_deviation": Scope("day_0", True, "zero", "zero_spread")}
+    ends = {"zero_spread": (0.0, np.inf), "zero_deviation": (-np.inf, np.inf)}
     parameters = tuple(
-        ParameterInfo(name, unit, -1.0, 3.0, prior, scope=scopes.get(name, SHARED))
+        ParameterInfo(name, unit, *ends.get(name, (-1.0, 3.0)), prior, scope=scopes.get(name, SHARED))
         for name, (unit, prior) in infos.items()
     )
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups={**DAYS, "before": "morning"}, per_group={"zero": 0.02})
@@ -314,7 +315,7 @@ def test_a_run_without_days_left_out_has_the_prior_of_their_error(known, zeros):
     """Of a new day, and says so; a fitted day has none."""
     new, old = (recorded([name], zeros[1:2], 51)[0] for name in ("b", "day_0_b"))
     found = rb.predict(known, new)
-    assert found.unseen.startswith("No recording of this day was seen. This run has no days that were left out")
+    assert found.unseen.startswith("No recording of this day was seen. This run left no session out of its fit")
     assert rb.predict(known, old).unseen == ""
 
 

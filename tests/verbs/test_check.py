@@ -178,7 +178,7 @@ def test_a_first_row_with_one_marker_says_so():
     mask[0, 1:] = False
     dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
     (hint,) = placement_hints(Robot.load("smooth_arm"), Trajectory(dataset))
-    assert "m1 alone is seen in it" in hint
+    assert "only m1 is seen in it" in hint
 
 
 @cache

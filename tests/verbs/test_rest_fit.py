@@ -11,7 +11,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.model.model_spec import ModelSpec, SimulatorTable
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import as_written
-from rfdropo_bayes.verbs.at_rest import resting
+from rfdropo_bayes.verbs.at_rest import blocks_of, resting
 from rfdropo_bayes.verbs.rest_answer import estimate_words, first_answer, rest_lines, rest_notes
 from rfdropo_bayes.verbs.rest_fit import OWN, Estimate, RestFit, least_squares
 
@@ -81,3 +81,18 @@ def test_parameters_are_shown_in_units_of_the_bench():
     assert estimate_words(Estimate("offset_x", "m", 0.002, 0.0, 1e-4, False, 0.1)) == "offset x 2 +- 0.1 mm"
     assert estimate_words(Estimate("turn", "rad", np.pi / 2, 0.0, 0.1, False, 0.1)) == "turn 90 +- 5.7 deg"
     assert estimate_words(Estimate("mass", "kg", 0.5, 1.0, 0.1, True, 0.1)) == "mass 0.5 kg (to 10 %)"
+
+
+def test_stretches_of_rows_keep_their_poses_and_commands():
+    random = np.random.default_rng(3)
+    command, position = random.normal(size=(600, 2)) * 0.01, random.normal(size=(600, 1, 3)) * 0.01
+    run = Trajectory.from_arrays(
+        time=0.5 * np.arange(600.0), position=position, command=command, markers=["tip"], channels=["a", "b"]
+    )
+    fewer = blocks_of(run)
+    assert len(fewer.time) == 120
+    assert np.diff(fewer.time).max() <= 1.0
+    at = [int(np.flatnonzero((run.position == row).all(axis=(1, 2)))[0]) for row in fewer.position]
+    assert at[-1] == 599
+    assert fewer.command_at(fewer.time) == pytest.approx(run.command_at(run.time[at] - 1e-3))
+    assert blocks_of(fewer) is fewer

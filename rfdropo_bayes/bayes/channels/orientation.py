@@ -1,4 +1,4 @@
-"""Measured orientations of sections: how the body bends and twists, which positions of few markers hardly tell."""
+"""Measured orientations of sections: bending and twist of the body, which positions of few markers hardly determine."""
 
 from __future__ import annotations
 

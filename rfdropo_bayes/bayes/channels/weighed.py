@@ -46,7 +46,7 @@ class WeighedParts(Channel):
     def named(self, inferred: Sequence[ParameterInfo]) -> WeighedParts:
         """The same, each parameter by the name under which it is inferred.
 
-        The whole recording's name stands for its only piece: ``payload_mass@a`` for ``payload_mass@a[0:99]``.
+        The whole recording's name denotes its only piece: ``payload_mass@a`` for ``payload_mass@a[0:99]``.
 
         Raises:
             InputError: a part that is no inferred parameter, or one of several.

@@ -36,7 +36,7 @@ def encode(message: can.Message) -> bytes:
 
 
 def decode(frame: bytes | memoryview, timestamp: float) -> can.Message:
-    """The frame that 16 bytes stand for."""
+    """The frame encoded in 16 bytes."""
     identifier, length, data = FRAME.unpack(frame)
     return can.Message(
         timestamp=timestamp,

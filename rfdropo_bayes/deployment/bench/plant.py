@@ -123,7 +123,7 @@ class PlantHere:
 class PlantProcess:
     """A plant in a process of its own, which drives never wait for: they get the newest state that it has sent.
 
-    A plant slower than real time lags behind; ``late`` says by how much.
+    A plant slower than real time lags behind; ``late`` is the delay.
 
     Args:
         name, robot, settings: see `build_plant`; called in the new process.

@@ -25,7 +25,7 @@ INVALID_COMMAND = 0x05040001
 
 
 class StrictNode(canopen.LocalNode):
-    """A node that knows subindex 0 alone of a plain variable, and answers by `StrictServer`."""
+    """A node with subindex 0 only for a plain variable; it answers by `StrictServer`."""
 
     def __init__(self, node_id: int, object_dictionary: canopen.ObjectDictionary) -> None:
         super().__init__(node_id, object_dictionary)

@@ -109,7 +109,7 @@ class SimulatedDrives:
         self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until told to stop, or the bus goes.
+        """Run until told to stop, or until the bus closes.
 
         Ticks that a slow plant has cost are left out, so that the next one lies ahead: the thread sleeps until then,
         and the hub, of the same priority, has its turn on the same processor.

@@ -293,7 +293,7 @@ def impact(change, token):
 
 @kernel
 def _longer(touch, slot, u, stage, token):
-    """By how much a stage is longer for a candidate that closes with this relative velocity; see
+    """Extra length of a stage for a candidate that closes with this relative velocity; see
     ``fem.integrators``."""
     zero, one, gap = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), load(touch.gap, slot, token)
     closes = where_greater(zero, gap, where_greater(zero, u, one, zero), zero)
@@ -305,7 +305,7 @@ def _longer(touch, slot, u, stage, token):
 
 @kernel
 def find_candidates(scene, position, velocity, touch, stage, token):
-    """The candidates of a stage; returns how much longer it is for their impacts, as a factor."""
+    """The candidates of a stage; returns the factor on its length for their impacts."""
     turn_cube(touch, token)
     _place_spheres(scene, touch, position, velocity, stage.length, token)
     reach = _cube_reach(touch, stage.length, token)
@@ -351,7 +351,7 @@ def choose_all(touch, token):
 
 @kernel
 def list_contacts(touch, token):
-    """List the candidates that any lane has chosen; returns how many, and how many of these the trunk takes part in."""
+    """List the candidates that any lane has chosen; returns their number, and the number of contacts with the trunk."""
     zero, contacts, corners = fill(0.0, touch.cube, token), 0, 0
     for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
         if any_greater(load(touch.chosen, slot, token), zero):

@@ -79,7 +79,7 @@ def stop_cube(touch, p, lines, contacts, token):
 
 @kernel
 def remember_impulses(scene, touch, p, lines, contacts, narrow, accepted, token):
-    """Keep the impulses of a step that was taken, in space: the next one starts from them, and friction goes on."""
+    """Keep the impulses of a step that was taken, in space: the next step starts from them, and friction continues."""
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     for i in range(3 * (CORNERS + 2 * scene.spheres)):
         store(touch.memory, i, zero)

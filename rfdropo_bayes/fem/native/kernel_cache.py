@@ -10,8 +10,9 @@ import hashlib
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from rfdropo_bayes.fem.native.compilers import COMPILERS
+from rfdropo_bayes.fem.native.compilers import COMPILERS, PLAIN
 
 PACKAGE = Path(__file__).resolve().parents[2]
 OWN = __package__.rpartition(".")[0]
@@ -47,3 +48,12 @@ def named_by(sources: str) -> Callable[[Callable], Callable]:
         return function
 
     return rename
+
+
+def kept(kernel: Any) -> Any:
+    """Decorator that keeps a kernel in the user's folder; Numba's own compilers keep it Numba's own way."""
+    if COMPILERS is PLAIN:
+        return kernel
+    from rfdropo_bayes.fem.native.kept_kernels import kept_for_user
+
+    return kept_for_user(kernel)

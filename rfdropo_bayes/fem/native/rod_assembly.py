@@ -1,7 +1,7 @@
 """Elements of a rod in SIMD lanes: strains, forces and tangent; and the inertia of its stations.
 
-The physics is that of ``fem.dynamics``. An element lies between the stations a and b. R is the rotation halfway from
-one section to the other, q the vector part of the quaternion from a to b and q0 its scalar part. With the chord d, the
+The physics follows ``fem.dynamics``. An element lies between the stations a and b. R is the rotation halfway from one
+section to the other, q the vector part of the quaternion from a to b and q0 its scalar part. With the chord d, the
 length h, u = R q, g = u / (1 + q0) and W = 1 - u g', the strains h Gamma = R' d - h e3 and h K = 2 q change as
 
     h R dGamma = dr_b - dr_a + S_a da_a + S_b da_b,    S = [d]x (1 +- [g]x) / 2 -+ e b',    h R dK = W (da_b - da_a)
@@ -10,8 +10,8 @@ An arc is longer than its chord: to h Gamma_3, along the axis e = R e3, belongs 
 part of S is b = h^2 W R (K_1, K_2, 0) / 12.
 
 A time step and an iteration for equilibrium differ in a few factors only, held in ``factors``. ``tables``, ``samples``,
-``factors`` and ``work`` are records of addresses; see `rod_records`. Stiffnesses are those over h, strains those times
-h.
+``factors`` and ``work`` are records of addresses; see `rod_records`. Stiffnesses are divided by h, strains multiplied
+by h.
 """
 
 from __future__ import annotations
@@ -326,7 +326,7 @@ def _mixed(rows, token):
 
 @kernel
 def _hold_rates(rows, token):
-    """Add to the stresses what the cables that hold an element do against the rates of its strains."""
+    """Add to the stresses the resistance of cables to the strain rates of an element."""
     stretching = combined(rows, DIRECTOR, load3(rows, RATE, token), token)
     bending = combined(rows, DIRECTOR, load3(rows, RATE + 3, token), token)
     mixed = _mixed(rows, token)
@@ -489,7 +489,7 @@ def add_station_loads(tables, samples, factors, station, work, token):
 
 @kernel
 def add_going(tables, samples, share, station, work, token):
-    """Add to ``field`` a share of what the stage before did at a station, without the impacts in it."""
+    """Add to ``field`` a share of the previous stage's change at a station, without impacts."""
     row, mass = SIZE * station, station_mass(tables, samples, station, token)
     moment = _moment_of(tables, samples, station, load3(work.before, row + 3, token), work, token)
     push = minus(scaled(load3(work.before, row, token), mass), load3(work.sudden, row, token))

@@ -1,5 +1,6 @@
-"""What one lane block of rods works on: its parameters, the factors of a solve, its state, scratch, and the
-friction of its cables."""
+"""Data of a lane block of rods: its parameters, the factors of a solve, its state, scratch, and the friction of its
+cables.
+"""
 
 from __future__ import annotations
 
@@ -52,10 +53,10 @@ class RodSamples(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """What makes a solve a time step or a static iteration; (1, lanes) each."""
+    """Factors that make a solve a time step or a static iteration; (1, lanes) each."""
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
-    held: Float[np.ndarray, "1 lanes"]  # of what taut cables hold there
+    held: Float[np.ndarray, "1 lanes"]  # of the stiffness of taut cables
     turning: Float[np.ndarray, "1 lanes"]  # of how forces turn with the sections there, for equilibria
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
@@ -72,7 +73,8 @@ class Factors(NamedTuple):
 
 class RodWork(NamedTuple):
     """State and scratch of one lane block; the last axis is the lane. Values are the six velocities of every station,
-    or what goes with them."""
+    or quantities of the same layout.
+    """
 
     turn: Float[np.ndarray, "stations4 lanes"]  # unit quaternion (w, x, y, z) of every section
     frame: Float[np.ndarray, "stations12 lanes"]  # position and directors
@@ -138,7 +140,7 @@ class Friction(NamedTuple):
 
 
 def runs_of(layout: CableLayout) -> Runs:
-    """Runs of cables; those without a guide are left out."""
+    """Runs of cables; runs without a guide are left out."""
     first_guide = np.concatenate([[0], np.cumsum(layout.used.sum(axis=1))])
     runs = [
         (cable, first_guide[cable] + guides[0], first_guide[cable] + guides[-1] + 1)

@@ -12,7 +12,7 @@ from rfdropo_bayes.fem.integrators import EULER, Stage
 from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL
 from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
-from rfdropo_bayes.fem.native.kernel_cache import named_by
+from rfdropo_bayes.fem.native.kernel_cache import kept, named_by
 from rfdropo_bayes.fem.native.rod_assembly import measure_element
 from rfdropo_bayes.fem.native.rod_constraints import constrained_stage
 from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED, follow_branch
@@ -296,6 +296,7 @@ def compile_rollout(sources: str) -> Callable:
     cables and without a cube: the compiled kernel then lacks these parts.
     """
 
+    @kept
     @whole
     @named_by(sources)
     def rollout(

@@ -105,7 +105,7 @@ def _found(tables, factors, work, moving, token):
 
 @kernel
 def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bound, schedule, token):
-    """One iteration of the lanes that move; those whose increment was small stop."""
+    """One iteration of the moving lanes; lanes with a small increment stop."""
     zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
     condense_increment(tables, samples, factors, work, EULER, True, token)
@@ -129,8 +129,9 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
 
 @kernel
 def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
-    """Find the equilibrium from where the body is, in at most so many iterations, to a largest increment relative to
-    the body's length."""
+    """Find the equilibrium from the present state in at most ``most`` iterations, to the increment ``bound`` relative
+    to the body's length.
+    """
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
     store(work.moving, 0, one)
@@ -148,7 +149,7 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
 
 @kernel
 def _start_settling(tables, samples, factors, work, token):
-    """Make the solves those of a static iteration."""
+    """Set the factors of a static iteration."""
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
     store(factors.elasticity, 0, load(work.firmness, 0, token))
     store(factors.held, 0, one)
@@ -214,7 +215,7 @@ def measure_imbalance(tables, samples, factors, work, token):
 
 @kernel
 def put_at_rest(tables, accepted, work, token):
-    """Put the body where it is undeformed, in the lanes that are not accepted."""
+    """Reset the body to its undeformed state in rejected lanes."""
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     for station in range(tables.stations):
         t, frame = 4 * station, FRAME * station

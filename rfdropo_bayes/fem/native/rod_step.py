@@ -1,6 +1,6 @@
 """One linear solve for a rod in SIMD lanes, and the step it makes: a stage or a static iteration.
 
-``stage`` is that of ``fem.integrators``, in seconds.
+``stage`` is a stage of ``fem.integrators``, in seconds.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _guide_point(tables, g, work, token):
 
 @kernel
 def pull_guide(tables, g, border, row, panels, pull, work, token):
-    """Add a pull on a guide to a row of a border of so many panels; returns it times the guide's velocity."""
+    """Add a pull on a guide to a row of a border of ``panels`` panels; returns it times the guide's velocity."""
     moving, first = fill(0.0, border, token), row // 3 * PANEL + row % 3
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
         station, push = tables.guide_station[k], scaled(pull, tables.guide_weight[k])
@@ -165,8 +165,9 @@ def _gather_cable(tables, c, work, token):
 
 @kernel
 def gather_cables(tables, work, rate, predicted, token):
-    """Border rows dl/dx of all cables; ``slack`` = rate * (commanded length - length) - dl/dt, the last one where it
-    is not ``predicted`` already."""
+    """Border rows dl/dx of all cables; ``slack`` = rate * (commanded length - length) - dl/dt, the last term only if it
+    is not ``predicted`` already.
+    """
     clear(work.border, 0, tables.stations * tables.panels * PANEL, token)
     for c in range(tables.cables):
         shorter, growth = _gather_cable(tables, c, work, token)
@@ -247,7 +248,7 @@ def condense_increment(tables, samples, factors, work, stage, still, token):
 
 @kernel
 def weigh_rows(tables, work, token):
-    """``solution`` = the weighted sum of the border rows, where the back substitution starts."""
+    """``solution`` = the weighted sum of the border rows, the start of the back substitution."""
     combine_border(
         work.border, work.weight, work.solution, tables.held, tables.stations, tables.panels, tables.active, token
     )
@@ -255,13 +256,13 @@ def weigh_rows(tables, work, token):
 
 @kernel
 def substitute_increment(tables, work, token):
-    """``solution`` = A^-1 times what it is."""
+    """``solution`` = A^-1 ``solution``."""
     substitute_back(work.pivot, work.coupling, work.solution, tables.held, tables.stations, token)
 
 
 @kernel
 def _step_of(work, row, length, predicted, token):
-    """By how much a stage changes the three values of a row further, from the place where its forces are taken."""
+    """Further change of the three values of a row by a stage, from the point at which its forces are taken."""
     change = load3(work.solution, row, token)
     if not predicted:
         change = plus(change, load3(work.velocity, row, token))
@@ -331,8 +332,9 @@ def predict_stations(tables, time, work, token):
 
 @kernel
 def take_stage(tables, factors, work, stage, token):
-    """Take the stage: velocity + solution, and where that leads; where it is lost, stay in place at rest without
-    tension. ``before`` is the change of velocity."""
+    """Take the stage: velocity + solution, and the resulting position; a failed lane stays in place, at rest without
+    tension. ``before`` is the change of velocity.
+    """
     zero = fill(0.0, work.frame, token)
     nothing = zero, zero, zero
     length = fill(stage.length, work.frame, token) * load(factors.wide, 0, token)

@@ -1,4 +1,4 @@
-"""What the kernels know of a rod, its cables and its recorded points: arrays in the precision of the kernels.
+"""Constants of a rod, its cables and its recorded points for the kernels: arrays in the precision of the kernels.
 
 A station has six velocities: its section's velocity and its spin, both in space. It has twelve rows of `frame`: the
 position of the centre line and the three directors, the columns of the section's rotation. A material point is a sum of
@@ -49,7 +49,7 @@ class RodTables(NamedTuple):
     beside_share: Float[np.ndarray, " pieces"]  # see `cables.CableLayout`
     beside_along: Float[np.ndarray, " pieces"]
     beside_part: Float[np.ndarray, " pieces"]  # of the element that the piece runs beside
-    row: Int[np.ndarray, " cables"]  # of the border that a cable has: those that reach farthest first
+    row: Int[np.ndarray, " cables"]  # of a cable's border: cables with the longest reach first
     active: Int[np.ndarray, " stations"]  # panels of the border that are not zero at a station
     section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
     section_area: Float[np.ndarray, " stations"]  # that times the body's width [m2]
@@ -78,7 +78,7 @@ def section_areas(body: Rod) -> Float[np.ndarray, "elements 5"]:
 
 
 def entries_of(points: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Entries of points bound to two sections each, without those that are zero: first, station, weight and arm."""
+    """Entries of points bound to two sections each, without zero entries: first, station, weight and arm."""
     station, weight, arm = (np.asarray(getattr(points, name)) for name in ("station", "weight", "arm"))
     used = (weight != 0.0) | np.any(arm != 0.0, axis=-1)
     first = np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int64)

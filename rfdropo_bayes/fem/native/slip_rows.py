@@ -86,7 +86,7 @@ def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
 
 @kernel
 def gather_slip(tables, runs, samples, factors, friction, border, panels, p, work, time_step, token):
-    """Border rows of all runs, and their part of a step's problem: friction goes on from ``trial``."""
+    """Border rows of all runs, and their part of a step's problem: friction continues from ``trial``."""
     kinds, kind = kinds_present(samples)
     for k in range(kinds):
         coefficient = time_step * load(samples.effects, COULOMB if kind + k == 0 else CAPSTAN, token)
@@ -136,7 +136,7 @@ def sum_losses(tables, runs, samples, friction, p, token):
 def remember_slip(tables, factors, friction, p, work, rows, time_step, going, token):
     """Friction mobilised and tensions along the cables after a stage that was taken.
 
-    ``going`` is the share of its change with which mobilised friction goes on into the next stage.
+    ``going`` is the share of its change with which mobilised friction continues in the next stage.
     """
     zero, accepted = fill(0.0, work.tension, token), load(work.accepted, 0, token)
     for i in range(rows):

@@ -268,7 +268,7 @@ def elastic_forces(mesh, samples, work, stage, token):
 
 @mesh_part
 def gone_on(samples, work, node, i, token):
-    """Component i of the impulse with which a node goes on from the stage before."""
+    """Component i of the impulse with which a node continues from the earlier stage."""
     going = load(samples.mass, node, token) * load(work.before, 3 * node + i, token)
     return (going - load(work.sudden, 3 * node + i, token)) * load(work.going, 0, token)
 

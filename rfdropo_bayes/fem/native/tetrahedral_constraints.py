@@ -120,7 +120,7 @@ def _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free
 
 @kernel
 def meet(scene, samples, touch, work, stage, token):
-    """The candidates of a stage, how much longer it is for their impacts, and the cube without contacts."""
+    """Candidates of a stage, the factor on its length for their impacts, and the cube without contacts."""
     one = fill(1.0, work.wide, token)
     wide = find_candidates(scene, work.position, work.velocity, touch, stage, token)
     if stage.carried > 0.0:
@@ -133,7 +133,7 @@ def meet(scene, samples, touch, work, stage, token):
 
 @kernel
 def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, stage, schedule, token):
-    """Impulses of all constraints of a stage, and the weights of its substitution; returns how many contacts it has.
+    """Impulses of all constraints of a stage, and the weights of its substitution; returns the number of contacts.
 
     ``work.slack`` holds the velocities of the cables' rows without impulses, ``work.condensed`` their products.
     """

@@ -21,7 +21,7 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     forward_substitute,
 )
 from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, start_cubes
-from rfdropo_bayes.fem.native.kernel_cache import named_by
+from rfdropo_bayes.fem.native.kernel_cache import kept, named_by
 from rfdropo_bayes.fem.native.simd import (
     addresses,
     fill,
@@ -276,6 +276,7 @@ def compile_rollout(sources: str) -> Callable:
     the nodes' coordinates at rest. ``scene``, ``cubes``, ``touch`` and ``poses`` are None without a cube.
     """
 
+    @kept
     @whole
     @named_by(sources)
     def rollout(

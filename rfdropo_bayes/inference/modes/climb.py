@@ -21,7 +21,7 @@ class Climbable(Protocol):
 
     @property
     def noise(self) -> Bool[np.ndarray, " d"]:
-        """Coordinates that are noise parameters, which are looked for on a grid first."""
+        """Coordinates of noise parameters, which are searched on a grid first."""
         ...
 
     @property
@@ -39,7 +39,7 @@ class Climbable(Protocol):
         ...
 
     def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-        """Minus the Hessian of the log likelihood at a mode, as well as it is known."""
+        """Approximation of minus the Hessian of the log likelihood at a mode."""
         ...
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Climbable | None:
@@ -78,7 +78,7 @@ class LevenbergState(NamedTuple):
 
 
 class ClimbStep(NamedTuple):
-    """One step: the gain in log posterior, and the gain the quadratic model promised."""
+    """One step: the gain in log posterior, and the predicted gain of the quadratic model."""
 
     gain: float
     promised: float

@@ -7,8 +7,8 @@ All together have the density ``q``. A candidate's weight for optimum k is ``p(u
 ``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight are
 then resampled, and the effective number ``(sum w)^2 / sum w^2`` measures the number of effective candidates.
 
-If the first candidates have nearly equal weights, the normals describe the posterior: the draws then come from them
-without weights, and no more rollouts are spent.
+If the first candidates have nearly equal weights, the normals describe the posterior: the draws are then unweighted,
+and no further rollouts are needed.
 """
 
 from __future__ import annotations

@@ -285,10 +285,10 @@ def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray
 def joint_covariance(information: Float[np.ndarray, "d d"], prior: Float[np.ndarray, "d d"]) -> np.ndarray:
     """Covariance of a normal posterior, by the likelihood's information and the prior's covariance.
 
-    Differences across a cliff of the likelihood may promise 1e20 times the prior's precision. The sum of the two,
-    rounded, would know nothing of the prior, and its inverse have directions without a variance. Information within the
-    rounding error of the largest, or negative, is therefore set to zero. In units of the prior's deviations, no
-    deviation is less than `NARROWEST` of the largest.
+    Differences across a discontinuity of the likelihood may reach 1e20 times the prior's precision. Their rounded sum
+    would lose the prior, and its inverse would have directions without variance. Information within the rounding error
+    of the largest, or negative, is therefore set to zero. In units of the prior's deviations, no deviation is less than
+    `NARROWEST` of the largest.
     """
     root = _root(prior)
     values, vectors = np.linalg.eigh(root.T @ information @ root)

@@ -1,4 +1,4 @@
-"""How SMC moves its particles: self-tuning proposals, and suitable coordinates.
+"""Moves of SMC's particles: self-tuning proposals, and suitable coordinates.
 
 - `propose`: preconditioned Crank-Nicolson steps, shaped by the covariance of the particles.
 - `StraightProblem`: logarithms of positive parameters, in which ridges are straight.
@@ -209,7 +209,7 @@ class StraightProblem:
 
 
 class BlockProblem(ProblemDefaults):
-    """Blocks of a problem's rows as its rows, which a sampler brings in by shares: it tempers a whole block at once."""
+    """Blocks of a problem's rows as its rows, added by a sampler in shares: it tempers a whole block at once."""
 
     def __init__(self, problem: StraightProblem, horizons: tuple[int, ...]) -> None:
         self.problem, self.horizons = problem, horizons

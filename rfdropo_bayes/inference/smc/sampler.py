@@ -160,7 +160,7 @@ def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
     """Fix particles and blocks so that the budget can be kept.
 
     Raises:
-        InputError: the budget does not even allow every particle one look at every block and one last move.
+        InputError: the budget is too small for one evaluation of every block and one last move per particle.
     """
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
     budget = np.inf if config.rollouts is None else config.rollouts / config.chains
@@ -255,7 +255,7 @@ def step(
 
 
 def _extend(state: SmcState, problem: Problem, horizon: int) -> SmcState:
-    """Roll every particle out to the next horizon; the rows it has already are kept as they are."""
+    """Roll every particle out to the next horizon; its earlier rows are kept."""
     known = state.population.rows
     rows = evaluate_rows(problem, state.population.position, horizon, state.ledger)
     rows = np.concatenate([known, rows[:, known.shape[1] :]], axis=1)

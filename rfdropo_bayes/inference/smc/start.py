@@ -70,7 +70,7 @@ def run(
     """Sample a posterior, from the start that ``config.start`` names or that the budget allows.
 
     Raises:
-        InputError: as `sampler.run`; or a start at the optima is asked for and the problem has no residuals.
+        InputError: as `sampler.run`; or a start at the optima of a problem without residuals.
     """
     if config.start == "prior" or (config.start == "auto" and not _worth_judging(problem, config)):
         return sampler.run(problem, config, key, logbook)
@@ -257,7 +257,7 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
 def way_from_prior(
     problem: Problem, mode: Laplace, horizons: tuple[int, ...], target_ess: float, key: PRNGKeyArray, n: int = 1000
 ) -> Way:
-    """Expected stages and rollouts of a sampler that starts at the prior and brings the data in at ``horizons``."""
+    """Expected stages and rollouts of a sampler that starts at the prior and adds the data at ``horizons``."""
     prior = np.asarray(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
     information, offset = _whitened(prior.mean(axis=0), np.atleast_2d(np.cov(prior.T)), mode)
     share = np.geomspace(1e-3 / max(float(information.max()), 1.0), 1.0, 2000)

@@ -154,7 +154,7 @@ def _write_joint(root: ET.Element, element: ET.Element, model: Any, number: int,
 
 
 def _write_inertial(root: ET.Element, body: ET.Element, model: Any, number: int) -> None:
-    """State mass and inertia of a body, which may have come from its geoms."""
+    """Write mass and inertia of a body, possibly derived from its geoms."""
     compiler = root.find("compiler")
     if compiler is not None and compiler.get("inertiafromgeom") == "true":
         compiler.set("inertiafromgeom", "auto")

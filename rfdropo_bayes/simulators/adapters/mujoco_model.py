@@ -72,7 +72,7 @@ def MuJoCo(
         channels: the actuator of each command: ``{command: actuator}``, by name or number; all of them by default.
             Actuators without a command keep the value of the keyframe, or zero.
         parameters: parameters that may be inferred: ``{parameter: address}``, see `mujoco_elements`; an address may
-            stand in a table with ``low``, ``high``, ``prior``, ``unit`` or ``nominal`` of your own. Other attributes
+            be a table with ``low``, ``high``, ``prior``, ``unit`` or ``nominal`` of your own. Other attributes
             are candidates of an audit, by kind.
         cables: actuators whose pull is measured as a tension [N]: ``{cable: actuator}``.
         start: "rest", the model's reference pose without speed; "settled", the equilibrium under the first command,
