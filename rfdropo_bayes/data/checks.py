@@ -102,7 +102,8 @@ def _check_lengths(dataset: xr.Dataset, name: str) -> None:
     if position.size == 0:
         if json.loads(str(dataset.attrs["settings"])).get("unseen"):
             return
-        raise InputError("every position is masked", where=name, remedy="use another recording")
+        remedy = "look at time_unit and position_unit: in wrong units all positions seem to jump"
+        raise InputError("every position is masked", where=name, remedy=remedy)
     extent = float(np.ptp(position, axis=0).max())
     if extent > _LARGEST_EXTENT:
         raise InputError(

@@ -28,6 +28,8 @@ ONE_RATE = 1.1  # times between rows that differ by less are of the same rate: c
 GRAIN = 0.02  # of the usual interval: stamps of single precision that are coarser are said
 ON_GRID = 0.2  # of the grain: largest distance of rounded stamps from single precision
 SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: range of recordings of a moving robot
+ANEW = 10.0
+"""Gaps by which a clock that is set back has begun anew; by less, rows changed places."""
 SET_BACK = 0.01  # share of rows out of order up to which the clock was set back; else rows are not sorted
 
 
@@ -154,9 +156,11 @@ def check_times(time: Float[np.ndarray, " rows"], where: str, key: str = "time")
         remedy = f"the stamps are coarser than the rows: give sample_time{given} (seconds from row to row); or {remedy}"
     elif 0 < back.sum() <= max(1.0, SET_BACK * len(gaps)):
         row = int(np.argmax(back)) + 1
+        mixed = -gaps[row - 1] > ANEW * float(np.median(np.abs(gaps)))
         remedy = (
             f"the clock was set back by {-gaps[row - 1]:.4g} s before row {row}: split the file there, or "
-            f"give sample_time if rows are evenly spaced; else {remedy}"
+            "give sample_time if rows are evenly spaced; "
+            + ("sorting the rows would mix the recordings before and after" if mixed else f"else {remedy}")
         )
     raise InputError(
         f"{key} does not increase ({stuck.size} times)", where=f"{where}, row {int(stuck[0]) + 1}", remedy=remedy
