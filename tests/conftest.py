@@ -75,6 +75,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
+# Rooms whose tests run programs of JAX once, for milliseconds. To optimise these takes a fifth of what such tests cost.
+UNOPTIMISED_ROOMS = ("bayes", "inference")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_that_run_once_are_not_optimised(request: pytest.FixtureRequest):
+    """Let JAX compile in haste in `UNOPTIMISED_ROOMS`."""
+    room = request.path.relative_to(Path(__file__).parent).parts[0]
+    jax.config.update("jax_disable_most_optimizations", room in UNOPTIMISED_ROOMS)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 MOST_MEMORY = 2.5e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
 
 

@@ -271,7 +271,8 @@ def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ...
     lanes = [1] * (offset.ndim - 3)
     parts = []
     for piece in range(layout.share.shape[2]):
-        share, along = (part[:, :, piece].reshape(*part.shape[:2], *lanes) for part in (layout.share, layout.along))
+        pieces = (part[:, :, piece].reshape(*part.shape[:2], *lanes) for part in (layout.share, layout.along))
+        share, along = map(jnp.asarray, pieces)
         taut, arm = tension[:, None] * share, along * offset + (1.0 - along) * before
         a, way, turn = taut * course.inverse, course.direction, cross(course.direction, arm)
         b = taut * course.sharp
@@ -286,9 +287,10 @@ def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ...
         return Held(*jnp.zeros((3, 3, 3, elements, *whole.shape[4:])))
     longest = np.argmax(bound.sum(axis=(1, 2)))
     if np.all((index == index[longest]) | ~bound):
-        sums = _at_stations(jnp.sum(whole, axis=1), index[longest], bound.any(axis=0), elements)
+        sums = _at_stations(jnp.sum(whole, axis=1), index[longest], np.asarray(bound.any(axis=0)), elements)
     else:
-        sums = sum(_at_stations(whole[:, c], index[c], bound[c], elements) for c in range(len(index)))
+        each = [_at_stations(whole[:, c], index[c], bound[c], elements) for c in range(len(index))]
+        sums = sum(each[1:], each[0])
     return Held(*jnp.moveaxis(sums, 0, 1).reshape(3, 3, 3, elements, *whole.shape[4:]))
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import rod_elements
 from rfdropo_bayes.fem.cable_friction import PRESLIDING, Slip, slip_problem, slip_rows, slipped, start_slip
-from rfdropo_bayes.fem.cables import CableLayout, courses, lengths, rest_lengths, threads
+from rfdropo_bayes.fem.cables import CableLayout, rest_lengths, threads
 from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
@@ -159,12 +159,6 @@ def state_at_rest(system: System) -> State:
     none = jnp.zeros((len(station), 3))
     upright = jnp.zeros((len(station), 4)).at[:, 0].set(1.0)
     return State(none.at[:, 2].set(station), upright, none, none, jnp.zeros(len(system.cables.anchor)))
-
-
-def cable_lengths(system: System, state: State) -> Float[Array, " cables"]:
-    """Lengths of the cables [m]."""
-    frame = rotation(state.orientation.T)
-    return lengths(courses(system.cables, threads(system.cables), state.position.T, frame))
 
 
 def strains(system: System, state: State) -> Float[Array, "elements 6"]:

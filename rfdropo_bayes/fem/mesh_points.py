@@ -35,11 +35,6 @@ def joined(maps: Sequence[NodePoints]) -> NodePoints:
     return NodePoints(*(np.concatenate(parts) for parts in zip(*padded, strict=True)))
 
 
-def node_positions(points: NodePoints, position: Float[Array, "nodes 3"]) -> Float[Array, "points 3"]:
-    """Positions of the points from positions of the nodes [m]; also valid for velocities."""
-    return jnp.einsum("pk,pki->pi", points.weight, position[points.node])
-
-
 def node_cables(
     bind: Callable[[Float[np.ndarray, "guides 3"]], NodePoints],
     anchors: Float[np.ndarray, "cables 3"],

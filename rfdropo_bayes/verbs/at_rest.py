@@ -192,7 +192,9 @@ def blocks_of(run: Trajectory) -> Trajectory:
     time = run.time[rows]
     command = run.command_at(time - _JUST_BEFORE)
     dataset = run.dataset.isel(time=rows, command_time=np.arange(len(rows) - 1))
-    dataset = dataset.assign_coords(command_time=0.5 * (time[1:] + time[:-1]))
+    gaps = np.diff(time)
+    clock = np.append(0.0, np.cumsum(np.minimum(gaps, 2.0 * np.median(gaps))))  # no clock runs from stretch to stretch
+    dataset = dataset.assign_coords(time=clock, command_time=0.5 * (clock[1:] + clock[:-1]))
     dataset["command"] = dataset["command"].copy(data=command[1:])
     dataset["initial_command"] = dataset["initial_command"].copy(data=command[0])
     return Trajectory(dataset)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rfdropo_bayes import fem  # noqa: F401  (double precision)
 from rfdropo_bayes.fem import rod_elements, sections
+from rfdropo_bayes.fem.cables import Held
 from rfdropo_bayes.fem.components import cross, rotation, turned
 
 STATIONS = 4
@@ -36,8 +37,16 @@ def lawful(fibre: float) -> sections.Sections:
     return sections.Sections(jnp.asarray(stretch), jnp.asarray(bending), jnp.asarray(fibre))
 
 
+def taut() -> Held:
+    """Cables that hold elements, at random."""
+    rng = np.random.default_rng(4)
+    force, mixed, moment = rng.normal(size=(3, 3, 3, STATIONS - 1))
+    force, moment = force + np.swapaxes(force, 0, 1), moment + np.swapaxes(moment, 0, 1)
+    return Held(*(jnp.asarray(part) for part in (force, mixed, moment)))
+
+
 @jax.jit
-def compared(position, quaternion, motion, section):
+def compared(position, quaternion, motion, section, held):
     """What should agree, in pairs: forces, rates, tangent by blocks."""
 
     def strain(change):
@@ -48,8 +57,9 @@ def compared(position, quaternion, motion, section):
     slope = jax.grad(lambda change: jnp.sum(LENGTH * sections.energy(section, strain(change))))(none)
     rates = rod_elements.strain_rates(elements, motion)
     moved = jax.jvp(strain, (none,), (motion,))[1]
-    stiff = -rod_elements.station_forces(elements, sections.linear(section, rates))
-    k = rod_elements.tangent(elements, section.stretch, section.bending)
+    resultant = sections.linear(section, rates) + rod_elements.held_resultant(elements, held, rates)
+    stiff = -rod_elements.station_forces(elements, resultant)
+    k = rod_elements.tangent(elements, section.stretch, section.bending, held)
 
     def apply(block, vector):
         return jnp.einsum("ijn,jn->in", block, vector)
@@ -74,7 +84,7 @@ def compared(position, quaternion, motion, section):
 @pytest.mark.parametrize("fibre", [0.0, 0.4])
 def test_forces_rates_and_tangent_follow_from_the_energy(fibre):
     motion = jnp.asarray(np.random.default_rng(2).normal(size=(6, STATIONS)))
-    for found, expected in compared(*bent(0), motion, lawful(fibre)):
+    for found, expected in compared(*bent(0), motion, lawful(fibre), taut()):
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11 * float(jnp.abs(expected).max()))
 
 

@@ -36,7 +36,7 @@ def alone(problem, *further):
 @pytest.mark.parametrize(
     ("problem", "said"),
     [
-        (alone(LinearGaussian()), r"Bare lacks fingerprint, prior_ends, status_names; .*define what Problem asks for"),
+        (alone(LinearGaussian()), r"Bare lacks fingerprint, prior_ends, status_names; .*define the members of Problem"),
         (
             alone(LinearGaussian(), "fingerprint", "prior_ends", "status_names", "residuals"),
             r"Bare has 'residuals' but lacks jacobian, physical_names, prior_derivatives; .*ResidualProblem",

@@ -91,7 +91,8 @@ def test_stretches_of_rows_keep_their_poses_and_commands():
     )
     fewer = blocks_of(run)
     assert len(fewer.time) == 120
-    at = np.searchsorted(run.time, fewer.time)
-    assert fewer.position == pytest.approx(run.position[at])
+    assert np.diff(fewer.time).max() <= 1.0
+    at = [int(np.flatnonzero((run.position == row).all(axis=(1, 2)))[0]) for row in fewer.position]
+    assert at[-1] == 599
     assert fewer.command_at(fewer.time) == pytest.approx(run.command_at(run.time[at] - 1e-3))
     assert blocks_of(fewer) is fewer
