@@ -19,6 +19,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.inference.method_options import options_table
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.experiment import ROLLOUTS, InferenceTable
@@ -71,6 +72,8 @@ from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_da
 from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
 PRIOR_DRAWS = 2000
+LEAST_POSTERIOR = 200
+"""Draws of a posterior, if its budget is small."""
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves
@@ -119,6 +122,9 @@ def calibrate(
         fitted, tested = (sum(len(run.time) for run in part) for part in (runs, test))
         budget = budget_within(table.minutes, per_set, (fitted + tested) / fitted)
         config, draws = dataclasses.replace(config, rollouts=budget.rollouts), budget.draws
+        if isinstance(config, LaplaceConfig):  # their rows are simulated once more
+            few = max(LEAST_POSTERIOR, budget.rollouts)
+            config = dataclasses.replace(config, draws=min(config.draws, few))
     said = {"method": name, **options_table(config)}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
@@ -219,7 +225,8 @@ def record_posterior(
     rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
     values = thin(result.draws, asked.draws)
-    before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
+    drawn = min(PRIOR_PREDICTIVE_DRAWS, asked.draws)
+    before = {name: column[:drawn] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
     fitted, scopes = list(problem.model.recordings.names), problem.model.scopes
     lasting = result.details.get("lasting", {}).get(problem.model.markers.name)

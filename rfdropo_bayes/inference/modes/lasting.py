@@ -47,6 +47,11 @@ class CountedProblem(ResidualProblem, Protocol):
         """Time between rows of each recording [s]."""
         ...
 
+    @property
+    def shares(self) -> Mapping[str, float]:
+        """Factor of the log likelihood of each channel."""
+        ...
+
     def counting(self, shares: Mapping[str, float]) -> CountedProblem:
         """The same problem with the log likelihood of some channels times a share."""
         ...

@@ -571,7 +571,7 @@ def run(
         exact = reweighted(problem, modes, weights, left, draw_key, ledger, config.draws, by_evidence)
         position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
         draws = chains(problem, [position])
-        rows = exact.rows[None] if exact is not None and exact.rows is not None and problem is whole else None
+        rows = None if exact is None or exact.rows is None else _whole_rows(exact.rows, problem, problem is whole)
     best, seconds = modes[0], found.climbs.seconds + time.monotonic() - began
     return InferenceResult(
         method="laplace",
@@ -594,6 +594,16 @@ def run(
         optimum={**mode_values(problem, best), **held},
         details=_details(problem, found._replace(modes=modes), lasting, weights, exact),
     )
+
+
+def _whole_rows(
+    rows: Float[np.ndarray, "draw row"], problem: Problem, whole: bool
+) -> Float[np.ndarray, "1 draw row"] | None:
+    """Log density of each row at each draw, without shares; None if channels have different shares."""
+    if whole:
+        return rows[None]
+    shares = set(problem.shares.values()) if isinstance(problem, CountedProblem) else set()
+    return rows[None] / shares.pop() if len(shares) == 1 else None
 
 
 def _details(
