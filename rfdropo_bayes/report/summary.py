@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -169,17 +169,20 @@ class Summary(_Open):
     rmse: Errors
 
 
-def effective_draws(record: PosteriorRecord, details: Mapping[str, Any]) -> float | None:
+def effective_draws(record: PosteriorRecord, rows: Sequence[ParameterRow], details: Mapping[str, Any]) -> float | None:
     """Number of independent draws that a posterior is worth; None for draws that are no posterior.
 
-    At most the number of distinct draws: a sampler without budget repeats a few.
+    At most the number of distinct draws: a sampler without budget repeats a few. Weighted draws have their own number,
+    other draws the least of ArviZ's for a parameter.
     """
     if record.log_likelihood is None:
         return None
-    drawn = np.stack([record.flat(info.name) for info in record.free], axis=1)
-    distinct = len(np.unique(drawn, axis=0))
+    names = [info.name for info in record.free]
+    distinct = len(np.unique(np.stack([record.flat(name) for name in names], axis=1), axis=0))
     weighed = details.get("effective_draws")
-    return float(distinct if weighed is None else min(distinct, weighed))
+    if weighed is None:
+        weighed = min((row.ess_bulk for row in rows if row.name in names and row.ess_bulk > 0.0), default=np.inf)
+    return float(min(distinct, weighed))
 
 
 def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
@@ -187,7 +190,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
     ``not_available``.
     """
     figures = model_errors(record)
-    shares = coverage(record.recordings)
+    shares, rows = coverage(record.recordings), posterior_table(record)
     summary = {
         "schema_version": SCHEMA_VERSION,
         **{key: getattr(facts, key) for key in ("title", "status", "robot", "method", "engine", "seed")},
@@ -196,8 +199,8 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "rollouts": facts.rollouts,
         "evaluations": facts.evaluations,
         "excluded": dict(facts.excluded),
-        "effective_draws": effective_draws(record, facts.details),
-        "parameters": {row.name: row.as_dict() for row in posterior_table(record)},
+        "effective_draws": effective_draws(record, rows, facts.details),
+        "parameters": {row.name: row.as_dict() for row in rows},
         "log_evidence": dict(zip(("value", "sd"), facts.log_evidence or (None, None), strict=True)),
         "rmse": {role: dict(errors.over_time) if errors else {} for role, errors in figures.items()},
         "errors": {role: asdict(errors) if errors else None for role, errors in figures.items()},
