@@ -29,6 +29,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     Mechanism,
     PushingMechanism,
     Values,
+    bodies_of,
     check_mechanisms,
     code_of,
     motions_of,
@@ -349,7 +350,7 @@ class RobotSimulator(ExtendedSimulator):
                 raise InputError(words, where="[model] mechanisms", remedy=f"remove it, or {DYNAMIC}")
             if isinstance(mechanism, BodyMechanism):
                 material = mechanism.embody(values, material, body)
-                if material.effects.present and not self.engine.is_rod:
+                if not self.engine.is_rod and "tetrahedra" not in bodies_of(mechanism):
                     raise InputError(
                         f"the mechanism {mechanism.name!r} acts on rods only", where="[model] mechanisms",
                         remedy='remove it, or set body = "rod" under [simulator]',

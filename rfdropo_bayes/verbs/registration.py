@@ -72,9 +72,13 @@ class Registration(NamedTuple):
     evidence: str = ""
 
 
-def frame_of(made: Float[np.ndarray, "point 3"], seen: Float[np.ndarray, "point 3"], *, scaled: bool) -> Frame:
-    """The frame that brings simulated points nearest to the measured points, rows that lack one left out."""
-    both = np.isfinite(made).all(axis=1) & np.isfinite(seen).all(axis=1)
+def frame_of(
+    made: Float[np.ndarray, "row marker 3"], seen: Float[np.ndarray, "row marker 3"], *, scaled: bool
+) -> Frame:
+    """The frame that brings simulated markers nearest to the measured markers; missing positions are left out."""
+    both = np.isfinite(made).all(axis=2) & np.isfinite(seen).all(axis=2)
+    still = np.nanmean(np.where(both[..., None], seen, np.nan), axis=0)
+    motion = np.sum((seen - still)[both] ** 2)  # about each marker's own mean: distances between markers are no motion
     made, seen = made[both], seen[both]
     centre, place = made.mean(axis=0), seen.mean(axis=0)
     left, size, right = np.linalg.svd((seen - place).T @ (made - centre))
@@ -83,7 +87,6 @@ def frame_of(made: Float[np.ndarray, "point 3"], seen: Float[np.ndarray, "point 
     scale = float(np.sum(size * proper) / np.sum((made - centre) ** 2)) if scaled else 1.0
     moved = scale * made @ rotation.T
     shift = place - moved.mean(axis=0)
-    motion = np.sum((seen - place) ** 2)
     return Frame(rotation, shift, scale, float(1.0 - np.sum((moved + shift - seen) ** 2) / motion))
 
 
@@ -111,7 +114,7 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool) -> Registr
         made = robot.markers(command)[0]
         if np.isfinite(made).all(axis=(1, 2)).mean() < SOLVED:
             return None
-        return frame_of(made.reshape(-1, 3), rows.position.reshape(-1, 3), scaled=scaled)
+        return frame_of(made, rows.position, scaled=scaled)
 
     written = seen_by(robot, rows.command)
     if written is None:

@@ -145,7 +145,7 @@ def test_another_identity_is_refused(rig, key: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("ProductNumber=0x52464401", "ProductNumber=0x52464402", "that of the data sheet 0x52464402"),
+        ("ProductNumber=0x52464401", "ProductNumber=0x52464402", "0x52464402 in the data sheet"),
         ("value\nObjectType=0x7\nDataType=0x0004", "value\nObjectType=0x7\nDataType=0x0003", "32 bits by CiA 402"),
         ("[6041]", "[6F41]", "the data sheet lacks it"),
     ],

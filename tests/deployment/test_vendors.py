@@ -256,7 +256,7 @@ def test_a_counter_that_would_overflow_in_the_travel_is_refused_with_what_to_do(
     """An absolute encoder stands anywhere: the motor's limits and units may well be right."""
     drives = masters(rigs(), str(objects.SIMULATED_EDS))
     drives.all[0].offset = 2.0**31 - 100.0
-    with pytest.raises(InputError, match=r"32-bit positions end at .*; set its position to zero .* then home"):
+    with pytest.raises(InputError, match=r"32-bit positions end at .*; set its present position to zero .* then home"):
         drives.configure(0.01, lambda text: None)
 
 
@@ -295,7 +295,7 @@ def test_a_drive_without_heartbeats_of_its_own_cannot_be_used(rigs, sheet: Write
     eds = sheet(without=(0x1017,))
     with pytest.raises(InputError, match="lacks 0x1017: the computer does not notice"):
         masters(rigs(eds=eds), eds).all[0].check(Identity())
-    with pytest.raises(ValueError, match="0x1017 is no guard that a drive may be without"):
+    with pytest.raises(ValueError, match="0x1017 is not an optional guard of a drive"):
         DrivesTable(unguarded=(0x1017,))
 
 

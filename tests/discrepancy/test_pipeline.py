@@ -720,7 +720,8 @@ def test_the_recording_that_speaks_against_an_extension_is_named(groups):
 
 
 def test_of_many_sizes_the_surest_are_said_in_their_order():
-    sizes = {f"size_{k}": {"mean": float(m), "sd": 1.0, "unit": "m"} for k, m in enumerate((0, 5, -9, 1, 7, 6))}
+    means = enumerate((0, 5, -9, 1, 7, 6))
+    sizes = {f"size_{k}": {"title": f"size_{k}", "mean": float(m), "sd": 1.0, "unit": "m"} for k, m in means}
     finding = {"mechanism": "glue", "group": "", "parameters": sizes, "relative": {}, "equivalence_class": ["glue"]}
     assert re.findall(r"size (\d)", _named(finding)) == ["1", "2", "4", "5"]
 

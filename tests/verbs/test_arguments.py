@@ -67,7 +67,6 @@ def test_the_folder_of_a_run_is_no_calibration(call):
 @pytest.mark.parametrize(
     ("commands", "message"),
     [
-        ("run.csv", "predict: 'run.csv' is no recording"),
         ([RUN], "predict: a list of 1 is no recording; give one of them"),
         ((RUN, RUN), "predict: a list of 2 is no recording"),
     ],
