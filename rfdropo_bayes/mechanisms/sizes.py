@@ -72,4 +72,6 @@ def sized(spec: ParameterSpec, scales: Scales) -> ParameterSpec:
     if powers is None:
         return spec
     ratios = np.array(scales) / np.array(USUAL)
-    return scaled(spec, float(np.prod(ratios ** np.array(powers))))
+    made = scaled(spec, float(np.prod(ratios ** np.array(powers))))
+    # Bounds are limits of the physics, and never narrower than those of the usual trunk.
+    return made._replace(low=min(made.low, spec.low), high=max(made.high, spec.high))
