@@ -505,7 +505,7 @@ def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"
 def _searching(target: FitTarget) -> LaplaceConfig:
     """Search settings of `calibrate`; rows of a body at rest are independent, and have one horizon."""
     rests = getattr(target.forward.lanes.simulator, "integrator", None) == QUASI_STATIC
-    return LaplaceConfig(tolerance=CLIMBED, **({"blocks": 1} if rests else {}))
+    return LaplaceConfig(tolerance=CLIMBED, blocks=1) if rests else LaplaceConfig(tolerance=CLIMBED)
 
 
 def optimum_rollouts(target: FitTarget) -> int:
