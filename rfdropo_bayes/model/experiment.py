@@ -222,14 +222,8 @@ class InferenceTable(BaseModel):
         default=None,
         gt=0.0,
         description="budget in minutes on the machine that calibrates, predictions and report included; rollouts are "
-        "timed, and their number is limited accordingly",
+        "timed, and their number is limited accordingly; rollouts, if given, count instead",
     )
-
-    @model_validator(mode="after")
-    def _one_budget(self) -> InferenceTable:
-        if self.rollouts is not None and self.minutes is not None:
-            raise ValueError("rollouts and minutes are both given: leave out one of them")
-        return self
 
     @property
     def options(self) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def calibrate(
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
     problem, draws = model.problem(runs, earlier_draws(fit, name)), MOST_DRAWS
-    if method is None and table.minutes is not None:
+    if method is None and table.minutes is not None and table.rollouts is None:
         per_set = rollout_seconds(problem, timing_key(chosen))
         fitted, tested = (sum(len(run.time) for run in part) for part in (runs, test))
         budget = budget_within(table.minutes, per_set, (fitted + tested) / fitted)

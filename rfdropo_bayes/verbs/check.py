@@ -376,7 +376,7 @@ def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
 
 def _budget(table: InferenceTable) -> str:
     """The budget of a fit in words."""
-    if table.minutes is not None:
+    if table.minutes is not None and table.rollouts is None:
         return f"as many rollouts as {table.minutes:g} min hold"
     return f"{table.rollouts or ROLLOUTS} rollouts"
 

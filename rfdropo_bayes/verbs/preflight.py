@@ -219,7 +219,7 @@ def preflight(
     more = _further(model, coordinates, tension)
     settings = model.settings.inference
     budget = rollouts or settings.rollouts or ROLLOUTS
-    if not rollouts and settings.minutes is not None:
+    if not (rollouts or settings.rollouts) and settings.minutes is not None:
         budget = budget_within(settings.minutes, per_set, 1.0).rollouts
     return Preflight(
         _directions(coordinates, known, more),
