@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 ANGLES = ("deg", "rad", "counts")
 FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", *ANGLES, *FORCES)
+FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
+"""Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")
 """Suffixes of models of other simulators, see `simulators.adapters`."""
 MILLIMETRES = 1e-3
@@ -226,13 +228,20 @@ def init(
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
     outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
     guess = None if guess is None else of_robot(guess, outline)
-    for path in write_first_files(folder, outline, files, sent, guess):
-        typer.echo(f"wrote {path}")
+    robot, experiment = write_first_files(folder, outline, files, sent, guess)
+    typer.echo(f"wrote {robot}\nwrote {experiment}")
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
-    for line in assumed_of_columns(guess) if guess else []:
-        typer.echo(f"look over in the experiment file: {line}")
+    for line in [*assumed_of_columns(guess), *_found_lines(robot, experiment)] if guess else []:
+        typer.echo(f"look over: {line}")
     typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(folder / 'experiment.toml')])}")
+
+
+def _found_lines(robot: Path, experiment: Path) -> list[str]:
+    """Frame, order and azimuths that were found from a recording, each with its evidence."""
+    found = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
+    found += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
+    return [line for line in found if "ASSUMED" in line]
 
 
 def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:

@@ -12,12 +12,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.sensing import direction_along, read_at
+from rfdropo_bayes.mechanisms.sizes import USUAL, scales_of
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BODIES
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 
 AXES = "xyz"
 SIZES = {"m": 1e-3, "rad": 0.05}
 """Size of an effect on a command, by unit."""
+FORCE, LENGTH = 1.25e-3, 5e-3
+"""Sizes of a force over the tension that bends the robot by a usual pull, and of a shift over its length."""
 SHARE = 0.05
 """Size of an effect in other units, as a share of usual commands."""
 EVERY_CABLE, EVERY_ACTUATOR = "every cable", "every actuator"
@@ -142,6 +146,7 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     ports: list[Port] = []
     channels = tuple(simulator.channel_names)
     engine, robot = getattr(simulator, "engine", None), getattr(simulator, "robot", None)
+    scales = scales_of(robot) if isinstance(robot, Robot) else USUAL
     if robot is None:
         left_out["cables, command delay"] = "the simulator takes no signals"
     else:
@@ -151,11 +156,12 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
     if engine is not None and robot is not None and engine.carries_loads:
         places = len(engine.load_stations)
         gravity = (float(robot.gravity[0]), float(robot.gravity[1]), float(robot.gravity[2]))
-        ports += [port for port in _of_body(places, gravity) if not (engine.at_rest and port.kind == "damping")]
+        force = FORCE * scales.force
+        ports += [port for port in _of_body(places, gravity, force) if not (engine.at_rest and port.kind == "damping")]
     else:
         body = BLACK_BOX if engine is None else f"a body of {BODIES[1]}, or one before a cube,"
         left_out["forces, stiffness, damping, base tilt"] = f"{body} takes no signals"
-    ports += _of_sensing(markers)
+    ports += _of_sensing(markers, LENGTH * scales.length)
     return PortMap(tuple(ports), left_out, len(channels), places, gravity)
 
 
@@ -179,10 +185,10 @@ def _of_actuation(channels: Sequence[str], unit: str, usual: float | None, *, wo
     return [*found, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
 
 
-def _of_body(places: int, gravity: tuple[float, float, float]) -> list[Port]:
+def _of_body(places: int, gravity: tuple[float, float, float], force: float) -> list[Port]:
     look = "anything that pulls, pushes or touches the body near its {0}"
     found = [
-        Port(f"force {AXES[i]} at the {name}", "body", "force", k, i, "N", 0.05, look.format(name))
+        Port(f"force {AXES[i]} at the {name}", "body", "force", k, i, "N", force, look.format(name))
         for k, name in enumerate(PLACES[3 - places :] if places <= 3 else PLACES)
         for i in range(3)
     ]
@@ -194,14 +200,14 @@ def _of_body(places: int, gravity: tuple[float, float, float]) -> list[Port]:
     return found
 
 
-def _of_sensing(markers: Sequence[str]) -> list[Port]:
+def _of_sensing(markers: Sequence[str], length: float) -> list[Port]:
     found: list[Port] = []
     for k, name in enumerate(markers):
         look = f"whether marker {name} slides, comes loose or is confused with another marker"
         ends = [*enumerate(AXES), (3, "along the body")] if len(markers) > 1 else list(enumerate(AXES))
-        found += [Port(f"marker {name} {way}", "sensing", "marker", k, i, "m", 1e-3, look) for i, way in ends]
+        found += [Port(f"marker {name} {way}", "sensing", "marker", k, i, "m", length, look) for i, way in ends]
     look = "whether the cameras move against the base"
-    found += [Port(f"camera {a}", "sensing", "camera", 0, i, "m", 1e-3, look) for i, a in enumerate(AXES)]
+    found += [Port(f"camera {a}", "sensing", "camera", 0, i, "m", length, look) for i, a in enumerate(AXES)]
     found += [Port(f"camera turn {a}", "sensing", "turn", 0, i, "rad", 0.01, look) for i, a in enumerate(AXES)]
     look = "the cameras' calibration of lengths"
     found.append(Port("camera scale", "sensing", "scale", 0, -1, "-", 0.01, look))

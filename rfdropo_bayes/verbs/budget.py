@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -53,8 +52,3 @@ def rollout_seconds(problem: CalibrationProblem, key: PRNGKeyArray) -> float:
     begun = time.perf_counter()
     problem.row_log_likelihood(drawn, problem.n_rows)
     return (time.perf_counter() - begun) / count
-
-
-def timing_key(seed: int) -> PRNGKeyArray:
-    """Key of the draws that are timed."""
-    return jax.random.fold_in(jax.random.key(seed), 2**31 - 1)

@@ -23,7 +23,7 @@ from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.model.experiment import ROLLOUTS, InferenceTable
-from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.experiment_file import describe, read_tables
 from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
@@ -67,7 +67,7 @@ from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_model
-from rfdropo_bayes.verbs.budget import MOST_DRAWS, budget_within, rollout_seconds, timing_key
+from rfdropo_bayes.verbs.budget import MOST_DRAWS, budget_within, rollout_seconds
 from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
@@ -117,18 +117,17 @@ def calibrate(
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
     problem, draws = model.problem(runs, earlier_draws(fit, name)), MOST_DRAWS
-    if method is None and table.minutes is not None and table.rollouts is None:
-        per_set = rollout_seconds(problem, timing_key(chosen))
+    timed = method is None and table.minutes is not None and table.rollouts is None
+    if timed:
+        per_set = rollout_seconds(problem, jax.random.key(chosen))
         fitted, tested = (sum(len(run.time) for run in part) for part in (runs, test))
         budget = budget_within(table.minutes, per_set, (fitted + tested) / fitted)
-        config, draws = dataclasses.replace(config, rollouts=budget.rollouts), budget.draws
-        if isinstance(config, LaplaceConfig):  # their rows are simulated once more
-            few = max(LEAST_POSTERIOR, budget.rollouts)
-            config = dataclasses.replace(config, draws=min(config.draws, few))
+        resumed = Path(out) if resume and out is not None else None
+        config, draws = _budgeted(config, budget.rollouts, resumed), budget.draws
     said = {"method": name, **options_table(config)}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
-        {"seed": seed, "inference": None if method is None else said},
+        {"seed": seed, "inference": said if timed or method is not None else None},
     )
     work = partial(_fit, Fitting(model, problem, config, runs, test, chosen, draws))
     if out is None:
@@ -140,6 +139,17 @@ def calibrate(
         say_step("the fit is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
         found.save(folder)
     return found
+
+
+def _budgeted(config: Any, rollouts: int, resumed: Path | None) -> Any:
+    """Options of a method with a timed number of rollouts; a resumed run keeps the number that its folder states."""
+    method, options = method_of(config), options_table(config) | {"rollouts": rollouts}
+    if resumed is not None and (resumed / CONFIG).is_file():
+        kept = read_tables(resumed / CONFIG)["inference"]
+        options = {key: value for key, value in kept.items() if key != "method"}
+    elif isinstance(config, LaplaceConfig):  # its draws are simulated once more
+        options["draws"] = min(config.draws, max(LEAST_POSTERIOR, rollouts))
+    return make_config(method, options)
 
 
 class Fitting(NamedTuple):

@@ -188,7 +188,8 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
     timed = guess.time is not None or guess.sample_time is not None
-    frame, slow = _frame(plain, made, guess), slow_motion(made, first) if timed else NO_MOTION
+    frame = [f"{line}  # ASSUMED: found from the first row" for line in _frame(plain, made, guess)]
+    slow = slow_motion(made, first) if timed else NO_MOTION
     rows = rows_to_fit(first) if len(recordings) == 1 else None
     poses = _of_poses(first, timed) if slow is not None and guess.command_time is None else None
     tables = partial(tables, rows=rows, poses=poses)
@@ -198,7 +199,7 @@ def write_first_files(
     if seen is None or columns is None or not usual:
         return robot, experiment
     found = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed)
-    ordered = guess
+    ordered, order = guess, None
     if found.arrangement is not None:
         turns = np.degrees(found.arrangement.turns)
         azimuths = tuple(round(float(a + t), 1) % 360.0 for a, t in zip(outline.first_azimuths(), turns, strict=True))
@@ -206,12 +207,15 @@ def write_first_files(
         robot.write_text(robot_text(outline), encoding="utf-8")
         made = Robot.load(robot)
         ordered = guess._replace(commands=[guess.commands[column] for column in found.arrangement.columns])
+        order = found.evidence if ordered.commands != guess.commands else None
     if found.frame is not None:
         turned = found.frame.quarter.T
         if not np.allclose(turned, np.eye(3)) or np.linalg.norm(found.frame.shift) > FAR_ORIGIN * made.length:
-            frame = moved_frame(columns, turned, -turned @ found.frame.shift)
+            seen_by = f"a rod at rest explains {100 * found.frame.explained:.0f} % of the motion in this frame"
+            lines = moved_frame(columns, turned, -turned @ found.frame.shift)
+            frame = [f"{line}  # ASSUMED: {seen_by}" for line in lines]
             found = found._replace(frame=found.frame._replace(shift=np.zeros(3)))
-    write(tables(guess=ordered, frame=frame), slow, first, found.frame)
+    write(tables(guess=ordered, frame=frame, order=order), slow, first, found.frame)
     return robot, experiment
 
 
@@ -303,12 +307,14 @@ def data_tables(
     cables: Sequence[str] = (),
     rows: tuple[list[int], list[int]] | None = None,
     poses: str | None = None,
+    order: str | None = None,
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
-    ``frame`` are the lines of axes and origin, if the first row determines them; ``cables`` the robot's, one for each
-    command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single recording;
-    ``poses`` the reason to take each command for that of the pose in its row.
+    ``frame`` are the lines of axes and origin with their evidence, if a recording determines them; ``cables`` the
+    robot's, one for each command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single
+    recording; ``poses`` the reason to take each command for that of the pose in its row; ``order`` the reason for
+    another order of the commands than the file's.
     """
     entries = _entries(folder, recordings, commands, guess, rows)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
@@ -324,7 +330,6 @@ def data_tables(
     if guess.motor_angles:
         optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
-    found = [f"{line}  # ASSUMED: found from the first row" for line in frame]
     left = [f"# not used: {', '.join(guess.left)}"] if guess.left else []
     return [
         "[data]",
@@ -338,7 +343,8 @@ def data_tables(
         *([] if guess.names is None else [f"names = {quoted(guess.names)}  # of all columns: the file has none"]),
         *([] if guess.command_names is None else [f"command_names = {quoted(guess.command_names)}"]),
         *_clock(guess),
-        f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order",
+        f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order"
+        + (f"; ASSUMED: {order}" if order else ""),
         _unit_line(guess, "command_unit"),
         *counts,
         *_other_units(guess),
@@ -350,7 +356,7 @@ def data_tables(
         _unit_line(guess, "position_unit"),
         f"markers = {quoted(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
-        *(found or [f"axes = {quoted(axes)}{assumed}"]),
+        *(frame or [f"axes = {quoted(axes)}{assumed}"]),
         *optional,
         *left,
         "",

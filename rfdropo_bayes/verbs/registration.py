@@ -87,6 +87,8 @@ def frame_of(
     scale = float(np.sum(size * proper) / np.sum((made - centre) ** 2)) if scaled else 1.0
     moved = scale * made @ rotation.T
     shift = place - moved.mean(axis=0)
+    if motion == 0.0:
+        return Frame(rotation, shift, scale, 0.0)
     return Frame(rotation, shift, scale, float(1.0 - np.sum((moved + shift - seen) ** 2) / motion))
 
 

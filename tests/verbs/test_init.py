@@ -97,7 +97,7 @@ def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     status, told = init(monkeypatch, capsys, "arm", "--recording", "Prüfung *.csv")
     assert status == 0
-    assert 'look over in the experiment file: time = "rows": no column was recognised as times' in told
+    assert 'look over: time = "rows": no column was recognised as times' in told
     assert "columns that are not used: nummer" in told
     text = (tmp_path / "arm" / "experiment.toml").read_text(encoding="utf-8")
     assert '"../Prüfung 1.csv"' in text
@@ -353,7 +353,7 @@ def test_what_was_guessed_is_marked_with_its_evidence(tmp_path, monkeypatch, cap
         'cables = ["cable_1", "cable_2", "cable_3", "cable_4"]',
     ):
         assert line in text
-    assert 'look over in the experiment file: time_unit = "s": 39 s of 40 rows' in told
+    assert 'look over: time_unit = "s": 39 s of 40 rows' in told
     assert "tension = true" in text
 
 

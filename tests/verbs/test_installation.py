@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.inference.method_options import options_table
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
+from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.budget import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS, budget_within
+from rfdropo_bayes.verbs.calibrate import _budgeted
 from rfdropo_bayes.verbs.installation import (
     ORIGIN,
     ZERO,
@@ -80,3 +85,13 @@ def test_a_budget_in_minutes_follows_the_time_of_a_rollout():
     assert fast.draws == MOST_DRAWS
     starved = budget_within(0.01, 10.0, 1.0)
     assert starved == (FEWEST_ROLLOUTS, FEWEST_DRAWS)
+
+
+def test_a_timed_budget_is_written_down_and_a_resumed_run_keeps_it(tmp_path):
+    """The clock decides once: the folder states the rollouts, whatever a second timing would say."""
+    first = _budgeted(LaplaceConfig(blocks=1), 120, None)
+    assert (first.rollouts, first.draws, first.blocks) == (120, 200, 1)
+    text = describe({"inference": {"method": "laplace", **options_table(first)}})
+    (tmp_path / CONFIG).write_text(text)
+    assert _budgeted(LaplaceConfig(blocks=1), 9000, tmp_path) == first
+    assert _budgeted(LaplaceConfig(blocks=1), 9000, None).draws == 2000
