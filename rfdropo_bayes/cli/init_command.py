@@ -218,6 +218,8 @@ def init(
     answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
     if segment_lengths is None and answers["segments"] > 1:
         ask.assumed.add("segment_lengths")
+    if answers["segments"] > 1:
+        ask.assumed.add("segment_azimuths")
     answers["segment_lengths"] = _lengths(segment_lengths)
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
     if unit in (*ANGLES, "N m"):

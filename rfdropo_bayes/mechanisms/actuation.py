@@ -447,8 +447,9 @@ class GuideAzimuth(MemorylessActuation):
 
     @classmethod
     def for_robot(cls, robot: Robot) -> GuideAzimuth:
-        """One angle for every channel that drives one cable; no angles if channels share cables, or for a black box."""
-        if not isinstance(robot, Robot):
+        """One angle for every channel that drives one cable; no angles if channels share cables, for drives that hold
+        tensions, or for a black box."""
+        if not isinstance(robot, Robot) or robot.held_by_force:
             return cls()
         gain = np.array(robot.channels.gain)
         if any(np.count_nonzero(line) != 1 for line in (*gain, *gain.T)):

@@ -48,7 +48,15 @@ from rfdropo_bayes.mechanisms.body_mechanisms import (
     ViscoelasticBranch,
     WallContact,
 )
-from rfdropo_bayes.mechanisms.drift import CableGainDrift, CameraDrift, CameraTurn, CameraZoom, DriveDrift, GainDrift
+from rfdropo_bayes.mechanisms.drift import (
+    CableGainDrift,
+    CameraDrift,
+    CameraTurn,
+    CameraZoom,
+    Drift,
+    DriveDrift,
+    GainDrift,
+)
 from rfdropo_bayes.mechanisms.sensing import (
     CameraOffset,
     CameraRotation,
@@ -147,6 +155,8 @@ class MechanismChoice:
         if isinstance(robot, Robot) and made.stage != "actuation" and REGISTRY.get(kind.name) is kind:
             scales = scales_of(robot)
             made.parameters = tuple(sized(spec, scales) for spec in made.parameters)
+            if isinstance(made, Drift):
+                made.own.parameters = tuple(sized(spec, scales) for spec in made.own.parameters)
         return made
 
 

@@ -104,6 +104,8 @@ class RobotOutline:
             said = ", ".join(f"{1e3 * part:g}" for part in given)
             remedy = f"give {self.segments} lengths whose sum is {1e3 * self.length:g} mm"
             raise InputError(f"segments of {said} mm do not make up the body", where=where, remedy=remedy)
+        if self.shape == "disks" and len({self.end_of_cables(k) for k in range(self.segments)}) < self.segments:
+            raise InputError("two segments end at one disk", where=where, remedy="give more disks")
         if self.pairs and self.cables % 2:
             raise InputError(f"{self.cables} cables make no pairs", where=where, remedy="give an even number")
         if self.shape == "disks" and self.number_of_disks % self.segments:
@@ -164,6 +166,14 @@ class RobotOutline:
         """Height at which each segment ends [m]."""
         lengths = self.segment_lengths or (self.length / self.segments,) * self.segments
         return np.cumsum(lengths).tolist()
+
+    def end_of_cables(self, segment: int) -> float:
+        """Height at which the cables of a segment end [m]: its end, or the disk that is nearest to it."""
+        end = self.segment_ends()[segment]
+        if self.shape != "disks":
+            return end
+        heights = self.guide_heights()
+        return float(heights[np.argmin(np.abs(heights - end))])
 
     @property
     def bending_force(self) -> float:
@@ -291,10 +301,7 @@ def _cables(o: RobotOutline) -> list[str]:
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
         azimuth = 360.0 / o.cables * cable + o.first_azimuths()[segment]
-        end = o.segment_ends()[segment]
-        if o.shape == "disks":  # cables are tied to the disk that is nearest to the end of their segment
-            end = heights[np.argmin(np.abs(heights - end))]
-        inside = heights <= end + 1e-9
+        inside = heights <= o.end_of_cables(segment) + 1e-9
         lines += [
             "[[cables]]",
             f'name = "{names[row]}"',

@@ -21,6 +21,7 @@ from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SensingMechanism, motions_of
 from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE
 from rfdropo_bayes.simulators.trunk import TrunkSimulator, assemble
+from rfdropo_bayes.verbs.command_lag import JUST_BEFORE
 
 MOVING = ("time_step", "integrator")
 """Keys of [simulator] that a body at rest does not have."""
@@ -190,15 +191,12 @@ def blocks_of(run: Trajectory) -> Trajectory:
     first = np.linspace(0, count - BLOCK, BLOCKS).astype(int)
     rows = (first[:, None] + np.arange(BLOCK)).ravel()
     time = run.time[rows]
-    command = run.command_at(time - _JUST_BEFORE)
-    dataset = run.dataset.isel(time=rows, command_time=np.arange(len(rows) - 1))
+    command = run.command_at(time - JUST_BEFORE)
     gaps = np.diff(time)
     clock = np.append(0.0, np.cumsum(np.minimum(gaps, 2.0 * np.median(gaps))))  # no clock runs from stretch to stretch
-    dataset = dataset.assign_coords(time=clock, command_time=0.5 * (clock[1:] + clock[:-1]))
-    dataset["command"] = dataset["command"].copy(data=command[1:])
+    sent, when = run.dataset["command"], run.dataset["command_time"]
+    dataset = run.dataset.isel(time=rows).drop_dims("command_time").assign_coords(time=clock)
+    dataset = dataset.assign_coords(command_time=(when.dims, 0.5 * (clock[1:] + clock[:-1]), when.attrs))
+    dataset["command"] = (sent.dims, command[1:], sent.attrs)
     dataset["initial_command"] = dataset["initial_command"].copy(data=command[0])
     return Trajectory(dataset)
-
-
-_JUST_BEFORE = 1e-6
-"""[s] before a row: a command that is sent in it does not act yet."""

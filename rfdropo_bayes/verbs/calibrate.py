@@ -144,6 +144,9 @@ def calibrate(
 def _budgeted(config: Any, rollouts: int, resumed: Path | None) -> Any:
     """Options of a method with a timed number of rollouts; a resumed run keeps the number that its folder states."""
     method, options = method_of(config), options_table(config) | {"rollouts": rollouts}
+    if not hasattr(config, "rollouts"):
+        remedy = "leave out minutes, and give the options of the method"
+        raise InputError(f"method {method!r} has no budget", where="[inference] minutes", remedy=remedy)
     if resumed is not None and (resumed / CONFIG).is_file():
         kept = read_tables(resumed / CONFIG)["inference"]
         options = {key: value for key, value in kept.items() if key != "method"}

@@ -18,6 +18,8 @@ DELAYS = (0.0, 0.1, 0.2, 0.4)
 """[s] of a motion after its commands."""
 MOST_ROWS = 2000
 """Rows of a recording that are used."""
+JUST_BEFORE = 1e-6
+"""[s] before a row: a command that is sent in it does not act yet."""
 RIDGE = 1e-6
 """Ridge penalty of the maps, as a share of the mean square of their features."""
 CLEARLY = 0.9
@@ -114,7 +116,8 @@ def lag_words(runs: Sequence[Trajectory], columns: CsvColumns | None) -> LagWord
     """Find the row of the command that poses at rest show."""
     left = {each.rows: each.error for each in left_by_rows(runs)}
     best = min(left, key=lambda rows: left[rows])
-    taken = 0 if columns is None or columns.commands_with_poses else 1
+    own = all(np.array_equal(run.command_at(run.time - JUST_BEFORE), run.command_at(run.time)) for run in runs)
+    taken, shared = 0 if own else 1, columns is not None and columns.command_time is None
     told = ", ".join(f"{NAMES[rows]} {1e3 * error:.3g}" for rows, error in left.items())
     words = (
         f"a pose follows the command of {NAMES[best]} best; the simulation takes that of {NAMES[taken]} (a quadratic "
@@ -123,4 +126,5 @@ def lag_words(runs: Sequence[Trajectory], columns: CsvColumns | None) -> LagWord
     if left[best] >= CLEARLY * left[taken]:
         return LagWords(words, None)
     shares = f"{1e3 * left[best]:.3g} mm are left, by {NAMES[taken]} {1e3 * left[taken]:.3g} mm"
-    return LagWords(words, f"a pose follows the command of {NAMES[best]} ({shares}): {REMEDIES.get(best, CLOCKS)}")
+    remedy = REMEDIES.get(best, CLOCKS) if shared else CLOCKS
+    return LagWords(words, f"a pose follows the command of {NAMES[best]} ({shares}): {remedy}")

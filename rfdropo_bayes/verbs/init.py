@@ -203,10 +203,16 @@ def write_first_files(
     if found.arrangement is not None:
         turns = np.degrees(found.arrangement.turns)
         azimuths = tuple(round(float(a + t), 1) % 360.0 for a, t in zip(outline.first_azimuths(), turns, strict=True))
-        outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=found.evidence)
+        evidence = found.evidence if any(found.arrangement.turns) else ""
+        outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=evidence)
         robot.write_text(robot_text(outline), encoding="utf-8")
         made = Robot.load(robot)
-        ordered = guess._replace(commands=[guess.commands[column] for column in found.arrangement.columns])
+        beside = {
+            key: [names[column] for column in found.arrangement.columns]
+            for key in ("commands", "tensions", "motor_angles")
+            if (names := getattr(guess, key))
+        }
+        ordered = guess._replace(**beside)
         order = found.evidence if ordered.commands != guess.commands else None
     if found.frame is not None:
         turned = found.frame.quarter.T

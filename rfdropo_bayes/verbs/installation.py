@@ -11,6 +11,7 @@ from collections.abc import Collection
 import numpy as np
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.registration import Frame
 
@@ -60,7 +61,7 @@ def installed_priors(
         lines.append(f'{name} = {{ distribution = "Normal", loc = {loc:.3g}, scale = {scale:.2g} }}  # {words}')
 
     if robot.initial_displacement_names:
-        pull = robot.stroke if recording is None else largest_pull(robot, recording)
+        pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording)
         if pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
     turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.left_over, frame.shift)

@@ -196,6 +196,8 @@ def _proposal(found: Finding, robot: Robot, columns: CsvColumns | None, names: S
         return None
     own = names if columns is None else columns.commands
     key = "channels in the order {}" if columns is None else "commands = [{}] in [data.columns]"
+    also = [] if columns is None else [name for name in ("tensions", "motor_angles") if getattr(columns, name)]
+    key += f", and {' and '.join(also)} in the same order" if also else ""
     lines, *others = (
         tuple(order_lines(each, robot, own, key)) for each in (found.arrangement, *(each for each, _ in found.rivals))
     )

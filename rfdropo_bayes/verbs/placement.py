@@ -149,10 +149,10 @@ def _frame(start: Start, length: float) -> tuple[Float[np.ndarray, "3 3"], Float
         return np.eye(3), shift
     if _rms(first - rest[_ordered(start)]) <= NEAR * length:
         return None
-    for turn in _turns():
+    for turn in right_angles():
         if _rms(first @ turn.T - rest) <= NEAR * length:
             return turn, np.zeros(3)
-    for turn in _turns():
+    for turn in right_angles():
         shift = np.mean(rest - first @ turn.T, axis=0)
         if len(names) > 1 and _rms(first @ turn.T + shift - rest) <= NEAR * length:
             return turn, shift
@@ -200,7 +200,7 @@ def _stretched(start: Start) -> list[str]:
     ]
 
 
-def _turns() -> list[Float[np.ndarray, "3 3"]]:
+def right_angles() -> list[Float[np.ndarray, "3 3"]]:
     """The 23 ways to name x, y and z anew that keep a frame right-handed."""
     turns = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):

@@ -218,9 +218,9 @@ def preflight(
         known = known + _information(tension)
     more = _further(model, coordinates, tension)
     settings = model.settings.inference
-    budget = rollouts or settings.rollouts or ROLLOUTS
+    budget, stated = rollouts or settings.rollouts or ROLLOUTS, None
     if not (rollouts or settings.rollouts) and settings.minutes is not None:
-        budget = budget_within(settings.minutes, per_set, 1.0).rollouts
+        budget, stated = budget_within(settings.minutes, per_set, 1.0).rollouts, settings.minutes
     return Preflight(
         _directions(coordinates, known, more),
         _shares(coordinates, known),
@@ -230,7 +230,7 @@ def preflight(
         int(np.sum(~good)),
         per_set,
         budget,
-        budget * per_set / 60.0,
+        budget * per_set / 60.0 if stated is None else stated,
         method or settings.method,
         clock.perf_counter() - begun,
     )

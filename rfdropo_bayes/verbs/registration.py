@@ -7,7 +7,6 @@ the measured positions (Kabsch 1976, Umeyama 1991).
 
 from __future__ import annotations
 
-from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -23,16 +22,10 @@ from rfdropo_bayes.verbs.command_lag import best_delay
 from rfdropo_bayes.verbs.motion_check import LEFT, SOLVED
 from rfdropo_bayes.verbs.motion_direction import AGREEING
 from rfdropo_bayes.verbs.order_finder import ROWS, arranged, find_arrangement
+from rfdropo_bayes.verbs.placement import right_angles
 
 EXPLAINED = 0.5
 """Least share of the squared motion that the rod explains in a frame that is taken from it."""
-RIGHT_ANGLES = [
-    matrix
-    for order in permutations(range(3))
-    for signs in product((1.0, -1.0), repeat=3)
-    if np.linalg.det(matrix := np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0.0
-]
-"""The 24 rotations by right angles."""
 
 
 class Frame(NamedTuple):
@@ -50,7 +43,7 @@ class Frame(NamedTuple):
     @property
     def quarter(self) -> Float[np.ndarray, "3 3"]:
         """The rotation by right angles that is nearest to the frame's."""
-        return max(RIGHT_ANGLES, key=lambda matrix: float(np.sum(matrix * self.rotation)))
+        return max([np.eye(3), *right_angles()], key=lambda matrix: float(np.sum(matrix * self.rotation)))
 
     @property
     def left_over(self) -> Float[np.ndarray, "3"]:

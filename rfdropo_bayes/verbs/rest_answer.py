@@ -44,10 +44,10 @@ def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
     """Lines on errors, with predictors without physics and for every marker, and on every parameter."""
     without = {name: value for name, value in fit.unseen.items() if name != OWN}
     told = ", ".join(f"{name} {_millimetres(value)}" for name, value in without.items())
-    marker = fit.markers[-1]
+    marker, which = fit.markers[-1], "test rows" if fit.tested else "rows of the fitted recordings"
     lines = [
         f"a robot at rest, fitted to {fit.fitted} rows, is off by {_millimetres(fit.unseen[OWN])} mm at {marker} in "
-        f"{fit.other} other rows (before the fit {_millimetres(fit.before)}); without physics: {told}"
+        f"{fit.other} {which} (before the fit {_millimetres(fit.before)}); without physics: {told}"
     ]
     if len(fit.markers) > 1:
         lines.append(f"by marker: {', '.join(map(_named, zip(fit.markers, fit.each, strict=True)))}")
@@ -62,7 +62,7 @@ def rest_notes(fit: RestFit) -> list[str]:
     """Notes on residuals at rest: worse than without physics, a drift, or hysteresis."""
     notes = []
     best = min((name for name in fit.unseen if name != OWN), key=lambda name: fit.unseen[name])
-    if fit.unseen[OWN] > fit.unseen[best]:
+    if fit.tested and fit.unseen[OWN] > fit.unseen[best]:  # regressions fit their own rows better
         cause = (
             "a unit, an order, a length or a frame is likely wrong"
             if fit.unseen[OWN] > MISREAD * fit.unseen[best]

@@ -79,7 +79,8 @@ class RestFit(NamedTuple):
         before, after: errors on the fitted rows.
         unseen: errors on unfitted rows of the fit and of predictors without physics, by name.
         each: error of every marker on the unfitted rows.
-        fitted, other: numbers of fitted and unfitted rows.
+        fitted, other: numbers of fitted rows and of rows with these errors.
+        tested: whether these are rows of test recordings.
         rows: that are shown, of all recordings; residual: measured less computed [m]; ways: whether each command was
             last changed upwards (1) or downwards (-1); recording: number of each row's recording.
     """
@@ -92,6 +93,7 @@ class RestFit(NamedTuple):
     each: tuple[float, ...]
     fitted: int
     other: int
+    tested: bool
     rows: Rows
     residual: Float[np.ndarray, "row marker 3"]
     ways: Float[np.ndarray, "row channel"]
@@ -206,6 +208,7 @@ def fit_at_rest(
         tuple(_rms(residual[:, : k + 1], judged) for k in range(len(robot.shown))),
         len(rows.time),
         int(judged.sum()),
+        bool(test),
         shown,
         residual,
         ways[index],

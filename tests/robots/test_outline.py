@@ -131,3 +131,9 @@ def test_segments_have_lengths_of_their_own():
     np.testing.assert_allclose(ends, np.repeat(np.cumsum(lengths), 3), atol=1e-6)
     with pytest.raises(InputError, match="do not make up the body"):
         Robot.outline(**given, length=0.2, segment_lengths=lengths)
+
+
+def test_segments_of_disks_end_at_disks_of_their_own():
+    given = {"name": "arm", "radius": 0.01, "markers": {"tip": 0.18}, "segments": 2, "cables": 3, "shape": "disks"}
+    with pytest.raises(InputError, match="two segments end at one disk"):
+        Robot.outline(**given, length=0.2, segment_lengths=(0.199, 0.001))

@@ -18,14 +18,19 @@ TABLE = {
 }
 
 
-def recording(lag: int, rows: int = 80) -> Trajectory:
-    """Poses that follow the command of so many rows before, quadratically."""
+def recording(lag: int, rows: int = 80, *, with_poses: bool = False) -> Trajectory:
+    """Poses that follow the command of so many rows before, quadratically; commands may be in force before their row."""
     random = np.random.default_rng(0)
     command = random.uniform(-0.01, 0.01, size=(rows, 2))
     shown = np.roll(command, lag, axis=0)
     position = np.stack([shown[:, 0], shown[:, 1], 0.2 - 10.0 * np.sum(shown**2, axis=1)], axis=1)
     return Trajectory.from_arrays(
-        time=np.arange(float(rows)), position=position[:, None], command=command, markers=["tip"], channels=["a", "b"]
+        time=np.arange(float(rows)),
+        position=position[:, None],
+        command=command,
+        command_time=np.arange(float(rows)) - 0.5 * with_poses,
+        markers=["tip"],
+        channels=["a", "b"],
     )
 
 
@@ -52,6 +57,12 @@ def test_the_delay_is_that_of_the_row(lag, least, most):
     ],
 )
 def test_a_doubt_names_the_key_that_mends_it(lag, with_poses, remedy):
-    told = lag_words([recording(lag)], CsvColumns(**TABLE, commands_with_poses=with_poses))
+    told = lag_words([recording(lag, with_poses=with_poses)], CsvColumns(**TABLE, commands_with_poses=with_poses))
     assert (told.doubt is None) == (remedy is None)
     assert remedy is None or remedy in told.doubt
+
+
+def test_commands_of_a_clock_of_their_own_are_taken_as_they_act():
+    """Commands in force before their row: the simulation takes that of the pose, whatever table they came from."""
+    assert lag_words([recording(0, with_poses=True)], None).doubt is None
+    assert "look at the clocks" in (lag_words([recording(1, with_poses=True)], None).doubt or "")

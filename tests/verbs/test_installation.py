@@ -67,6 +67,11 @@ def test_cables_in_metres_have_a_gain_and_angles_their_spool():
     assert "command_gain_error" in priors_of(installed_priors(arm(unit="m"), None))
 
 
+def test_zeros_without_a_recording_are_lengths_of_cable_whatever_the_unit_of_commands():
+    in_metres, in_angles = (priors_of(installed_priors(arm(unit=unit), None)) for unit in ("m", "rad"))
+    assert in_angles["initial_displacement"] == pytest.approx(in_metres["initial_displacement"], rel=0.05)
+
+
 def test_commands_that_never_move_leave_zeros_fixed():
     assert "initial_displacement" not in priors_of(installed_priors(arm(), run("rad", 0.0)))
 

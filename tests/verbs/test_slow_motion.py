@@ -39,8 +39,9 @@ def test_a_sine_changes_by_its_size_in_its_period_over_two_pi():
         (np.arange(0.0, 12.0, 0.1), lambda t: 0.01 * np.sin(2.0 * np.pi * t / 2.0), None),
         (np.arange(0.0, 100.0, 10.0), lambda t: 0.01 * (t / 10.0 % 2.0), "rows are 10 s apart"),
         (np.arange(0.0, 10.0, 0.1), lambda t: 0.0 * t, None),
+        (np.arange(0.0, 10.0, 0.1), lambda t: 0.0 * t + 0.1 / 3.0, None),  # its mean is rounded
     ],
-    ids=["slow sine", "fast sine", "poses", "no command"],
+    ids=["slow sine", "fast sine", "poses", "no command", "held command"],
 )
 def test_slow_commands_and_rows_far_apart_are_told(time, command, slow):
     found = slow_motion(ARM, recording(time, command(time)))
