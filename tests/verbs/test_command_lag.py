@@ -19,7 +19,7 @@ TABLE = {
 
 
 def recording(lag: int, rows: int = 80, *, with_poses: bool = False) -> Trajectory:
-    """Poses that follow the command of so many rows before, quadratically; commands may be in force before their row."""
+    """Poses that follow the command of so many rows before; commands may be in force before their row."""
     random = np.random.default_rng(0)
     command = random.uniform(-0.01, 0.01, size=(rows, 2))
     shown = np.roll(command, lag, axis=0)

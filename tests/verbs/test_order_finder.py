@@ -143,3 +143,11 @@ def test_rows_that_are_looked_at_are_seen_and_far_apart():
     assert len(chosen) == 20
     assert {7, 400} <= set(chosen.tolist())
     assert 0 not in chosen
+
+
+def test_commands_that_never_move_leave_the_arrangement_as_it_is():
+    own = at_rest(1)
+    still = Rows(np.full((20, 3), 0.001), own.markers(np.full((20, 3), 0.001))[0], np.arange(20.0))
+    found = find_arrangement(own, still)
+    assert found.arrangement == as_written(3, 1)
+    assert found.rivals == ()
