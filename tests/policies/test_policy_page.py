@@ -63,7 +63,7 @@ def test_a_training_that_still_rose_is_told_to_go_on():
 
 def test_a_parameter_that_the_policy_does_not_cope_with_is_named_and_no_other():
     told = next_steps({"curve": curve(0.01, 0.01)}, played(slope=0.01))
-    assert "where young_modulus is large" in told[0]
+    assert "when young_modulus is large" in told[0]
     assert not any("trunk_mass" in sentence for sentence in told)
     assert not any("poisson_ratio" in sentence for sentence in told)  # the same in every episode
 

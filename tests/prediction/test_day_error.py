@@ -109,7 +109,7 @@ def test_the_sentences(prior):
         "No recording of this day was seen. On days left out this model was 7.1 to 16 mm off; its 90 % bands held 88 %."
     )
     assert left_out_sentence(prior) == ""
-    assert day_sentence(prior).startswith("No recording of this day was seen. This run has no days that were left out")
+    assert day_sentence(prior).startswith("No recording of this day was seen. This run left no session out of its fit")
 
 
 def test_the_lasting_part_of_an_error_is_told_from_one_that_is_forgotten():

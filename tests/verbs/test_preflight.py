@@ -140,14 +140,15 @@ def test_a_direction_of_many_parameters_names_the_largest_parts():
     names = [f"gain_{k}" for k in range(9)]
     vector = np.linspace(1.0, 0.6, 9)
     information = 1e4 * (np.eye(9) - np.outer(vector, vector) / (vector @ vector))
-    coordinates = _Coordinates(tuple(names), np.zeros(9, dtype=bool), np.zeros(9), np.ones(9))
+    coordinates = _Coordinates(tuple(names), np.zeros(9, dtype=bool), np.zeros(9), np.ones(9), np.zeros(9, dtype=bool))
     (direction,) = _directions(coordinates, information[None], {})
     assert list(direction.together) == names
     assert direction.sentence.startswith(f"{' and '.join(names[:6])} up together, and 3 smaller parts (keeps 100 %")
 
 
 def test_parameters_that_need_a_measurement_of_their_own_share_a_sentence():
-    coordinates = _Coordinates(("stiffness", "offset", "zero"), np.zeros(3, dtype=bool), np.zeros(3), np.ones(3))
+    flags = np.zeros(3, dtype=bool)
+    coordinates = _Coordinates(("stiffness", "offset", "zero"), flags, np.zeros(3), np.ones(3), flags)
     own = {f"{name} measured by itself (to 1 %)": 1e4 * np.diag(row)[None] for name, row in zip(
         coordinates.names, np.eye(3), strict=True)}  # fmt: skip
     found = _directions(coordinates, np.diag([1e4, 0.0, 0.0])[None], own)
