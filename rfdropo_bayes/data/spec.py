@@ -13,7 +13,7 @@ from rfdropo_bayes.data import lerobot
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
 from rfdropo_bayes.data.first_command import begun_from
 from rfdropo_bayes.data.mapped_formats import FOLDERS, MAPPED, read_mapped
-from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.data.named_columns import ROWS, CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -39,6 +39,9 @@ class RecordingEntry(BaseModel):
     )
     rows: tuple[int, int] | None = Field(
         default=None, description="keep observation rows first to last only, both included, counted from 0"
+    )
+    every: int = Field(
+        default=1, ge=1, description="keep every so many of these rows: rows at rest are many, and alike"
     )
     episodes: list[int] | None = Field(
         default=None, description="numbers of a LeRobotDataset's episodes; all by default"
@@ -92,11 +95,14 @@ class DataSpec(BaseModel):
             raise ValueError(f"format {self.format!r} {takes} [data.columns] table (columns= of rb.read)")
         return self
 
-    def piece(self, whole: Trajectory, rows: tuple[int, int] | None) -> Trajectory:
-        """Rows first to last of a recording, with the commands of `lead_in`; all of it without rows.
+    def piece(self, whole: Trajectory, rows: tuple[int, int] | None, every: int = 1) -> Trajectory:
+        """Every so many rows of first to last of a recording, with the commands of `lead_in`; all of it without rows.
 
         Commands with a clock of their own may begin long before the recording does.
         """
+        if every > 1:
+            timed = self.columns is None or self.columns.time != ROWS
+            return self.piece(whole, rows).thin(every, timed)
         if rows is None and whole.command_time[0] >= -self.lead_in:
             return whole
         if rows is None:
@@ -118,6 +124,7 @@ class _Source(NamedTuple):
     commands: Path | None
     zero_command: bool
     rows: tuple[int, int] | None
+    every: int
     initial_command: InitialCommand
     episode: int | None
 
@@ -151,7 +158,7 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
             loaded[key] = begun_from(_read(spec, source), rule)
             said = loaded[key].name, loaded[key].first_command
             logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
-        recording = spec.piece(loaded[key], source.rows)
+        recording = spec.piece(loaded[key], source.rows, source.every)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources, [*fit, *test])
 
@@ -186,7 +193,7 @@ def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Itera
         for match in find_files(entry.observations, base, folders=spec.format in FOLDERS):
             zero = entry.commands == NO_COMMANDS
             for episode in _episodes(spec, entry, match):
-                yield _Source(match, commands, zero, entry.rows, entry.initial_command, episode)
+                yield _Source(match, commands, zero, entry.rows, entry.every, entry.initial_command, episode)
 
 
 def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | list[None]:
