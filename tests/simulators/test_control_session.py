@@ -95,7 +95,7 @@ def run(model, parameters, commands, late=(1, 3)):
 
 
 @pytest.mark.parametrize("integrator", [pytest.param("euler", marks=pytest.mark.slow), "sdirk2"])
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("state", ["rest", pytest.param("equilibrium", marks=pytest.mark.slow)])
 def test_a_session_is_a_rollout_bit_for_bit(precision, state, integrator):
     model = simulator("numba", precision, (), state, integrator)
@@ -143,8 +143,8 @@ PUSHED = {"cube_x": 0.012, "cube_z": 0.15, "cube_mass": 0.05, "friction": 0.3}
 @pytest.mark.parametrize(
     ("engine", "precision", "tolerance"),
     [
-        pytest.param("numba", "float64", 0.0, marks=pytest.mark.slow),  # compiles for most of a minute
-        ("numba", "float32", 0.0),
+        ("numba", "float64", 0.0),
+        pytest.param("numba", "float32", 0.0, marks=pytest.mark.slow),  # compiles for most of a minute
         pytest.param("jax", "float64", 1e-9, marks=pytest.mark.slow),
     ],
 )
@@ -272,7 +272,7 @@ def test_a_mechanism_for_whole_rollouts_only_is_refused():
 
 
 def test_a_lane_that_is_lost_says_so_and_leaves_the_others_alone():
-    model = simulator("numba", "float32")
+    model = simulator("numba")
     session, alone = Session(model, 2, PERIOD), Session(model, 1, PERIOD)
     session.reset(np.arange(2), {})
     alone.reset(np.arange(1), {})
@@ -289,7 +289,7 @@ def test_a_lane_that_is_lost_says_so_and_leaves_the_others_alone():
 
 def test_a_body_that_would_overlap_the_cube_has_no_initial_state():
     """Heavy trunks sag into the cube; one lane's cube is out of the way."""
-    model = simulator("numba", "float32", state="equilibrium").pushing()
+    model = simulator("numba", state="equilibrium").pushing()
     values = {
         "trunk_mass": np.array([0.3, 0.42, 0.7, 0.7]),
         "cube_y": np.full(4, -0.082819),
