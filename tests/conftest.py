@@ -75,15 +75,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
-# Rooms whose tests run programs of JAX once, for milliseconds. To optimise these takes a fifth of what such tests cost.
-UNOPTIMISED_ROOMS = ("bayes", "inference")
+# Rooms whose tests run programs of JAX for long. The others run each for milliseconds, and to optimise these takes a third
+# of what such tests cost.
+OPTIMISED_ROOMS = ("fem", "studies")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def programs_that_run_once_are_not_optimised(request: pytest.FixtureRequest):
-    """Let JAX compile in haste in `UNOPTIMISED_ROOMS`."""
+    """Let JAX compile in haste outside of `OPTIMISED_ROOMS`."""
     room = request.path.relative_to(Path(__file__).parent).parts[0]
-    jax.config.update("jax_disable_most_optimizations", room in UNOPTIMISED_ROOMS)
+    jax.config.update("jax_disable_most_optimizations", room not in OPTIMISED_ROOMS)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
 
