@@ -142,6 +142,7 @@ def test_a_batch_gives_the_numbers_of_its_rollouts(rollout, trunk, commands, pre
     np.testing.assert_array_equal(again.object_pose[4:8], found.object_pose)
 
 
+@pytest.mark.slow
 def test_touching_surfaces_keep_their_distance(rollout):
     """The trunk lies on the cube: no point comes nearer than the contact distance, beyond the step's linearisation."""
     found = rollout(cube_mass=5.0, friction=0.9, cube_y=REST_HEIGHT)
@@ -226,6 +227,7 @@ def test_derivatives_pass_through_sliding_contacts(beside, commands):
         np.testing.assert_allclose(found, (ahead - behind) / (2.0 * step), rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_rollout_that_is_lost_says_so(rollout):
     assert int(rollout(cube_mass=float("nan")).status) == Result.DIVERGED
 
