@@ -249,9 +249,7 @@ def test_a_plant_may_live_in_a_process_of_its_own(dry_run, tmp_path: Path) -> No
     assert np.ptp(read_journal(tmp_path / "s")[1]["tension"]) > 0.5
 
 
-def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(
-    robot: Robot, tmp_path: Path, rig: Rig
-) -> None:
+def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: Robot, tmp_path: Path, rig: Rig) -> None:
     policy = linear_policy(tmp_path / "p.onnx", robot, np.zeros((16, 4)), np.zeros(4), period_s=1 / 30)
     settings = Deployment(robot="motor_arm", policy=PolicyTable(file=str(policy)))
     with pytest.raises(InputError, match="30 Hz of the policy does not divide 100 Hz"):

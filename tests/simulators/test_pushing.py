@@ -161,7 +161,7 @@ def test_contacts_act_equally_on_both_sides():
     scene, rest = pushing.engine.scene, state_at_rest(assembly.system)
     values = pushing.complete({"cube_y": jnp.asarray(-0.035), "cube_yaw": jnp.asarray(0.3)})
     cube, start = pushing.body_inputs(values)[1]
-    touch = find_contacts(scene, cube, start, rest.position, rest.orientation)
+    touch = jax.jit(lambda: find_contacts(scene, cube, start, rest.position, rest.orientation))()
     rows = np.moveaxis(np.asarray(touch.rows), 2, 0)  # (row, station, 6)
     on_trunk, on_cube = rows.reshape(-1, 3, *rows.shape[1:]), np.asarray(touch.on_cube)
     between = slice(8, 8 + (len(on_cube) - 8) // 2)

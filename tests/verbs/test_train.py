@@ -224,7 +224,7 @@ def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, word
 
 
 def test_the_model_in_memory_makes_environments() -> None:
-    model = rb.Model("trunk_sofa", simulator=SINGLE, fixed={"young_modulus": 4e6})
+    model = rb.Model("trunk_sofa", fixed={"young_modulus": 4e6})
     options = rb.TrainingOptions(observation="markers", start={"trunk_mass": [0.3, 0.4]})
     venv = rb.make_vec("TrunkReach-v0", model, options, n=3)
     venv.seed(0)
@@ -239,7 +239,7 @@ def test_the_model_in_memory_makes_environments() -> None:
 
 def test_a_posterior_beside_another_randomisation_is_refused(tmp_path) -> None:
     """It would take the place of the ranges without a word."""
-    model = rb.Model("trunk_sofa", simulator=SINGLE)
+    model = rb.Model("trunk_sofa")
     ranges = rb.TrainingOptions(randomisation="uniform", ranges={"young_modulus": [4e6, 5e6]})
     with pytest.raises(InputError, match="a calibration was given, and randomisation = 'uniform'"):
         rb.make_vec("TrunkReach-v0", model, ranges, fit=tmp_path)
