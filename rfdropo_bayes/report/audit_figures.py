@@ -257,7 +257,7 @@ def draw_remainder(axes: Axes, shown: Shown) -> None:
         axes.fill_between(time, centre - 2 * width, centre + 2 * width, color=colour, alpha=0.18, linewidth=0)
     axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("left of the last marker [mm]")
+    axes.set_ylabel("residual of the last marker [mm]")
 
 
 @style.styled
