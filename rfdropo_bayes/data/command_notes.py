@@ -8,7 +8,7 @@ from jaxtyping import Float
 REGULAR, NEAR = 0.7, 0.25
 """Commands come regularly if this share of their intervals is as near to the median, as a share of it."""
 FEWEST = 10
-"""Intervals from which a rate is told."""
+"""Least number of intervals that give a rate."""
 HOLE = 4.0
 """Multiple of the usual interval above which an interval is noted."""
 LOST = 0.04

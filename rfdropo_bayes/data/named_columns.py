@@ -43,7 +43,7 @@ CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "V", 
 
 
 ROWS = "rows"
-"""In the place of a column of times: rows have none, and their number counts."""
+"""Stands for a column of times if rows have no times: the row number counts."""
 ROW_SECONDS = 1.0
 """Nominal time from row to row [s] of rows without times."""
 UNTIMED = "rows have no times: one a second is assumed, which means nothing but for poses at rest"
@@ -85,7 +85,7 @@ class CsvColumns(BaseModel):
     )
     time_unit: TimeUnit = Field(
         default="s",
-        description='unit of the times; dates and durations need none, nor do "rosbag" and "motive-csv": seconds',
+        description='unit of the times; dates, durations, "rosbag" and "motive-csv" need no unit',
     )
     sample_time: float | None = Field(
         default=None,
@@ -260,7 +260,7 @@ class CsvColumns(BaseModel):
 
     @property
     def left_handed(self) -> bool:
-        """Whether the file's frame is left-handed, as ``axes`` say."""
+        """Whether the file's frame is left-handed, by ``axes``."""
         return bool(np.linalg.det(axes_matrix(self.axes)) < 0.0)
 
     def factors(self, names: Sequence[str]) -> Float[np.ndarray, " column"]:

@@ -165,7 +165,7 @@ class Trajectory:
 
     @property
     def robot(self) -> str:
-        """Name of the robot description it was recorded on; empty if the file did not say."""
+        """Name of the robot that was recorded; empty if the file does not name it."""
         return str(self.dataset.attrs["robot"])
 
     @property

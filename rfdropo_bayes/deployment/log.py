@@ -187,7 +187,7 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
     """Header and records of a session; a record that a crash cut short is left out.
 
     Raises:
-        InputError: if there is none, or it is no journal of ours.
+        InputError: if the journal is missing, or in another format.
     """
     path = Path(folder) / JOURNAL
     try:

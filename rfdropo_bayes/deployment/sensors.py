@@ -64,7 +64,7 @@ class SensorTable(BaseModel):
         origin_m: origin of the base frame in the sensor's frame.
         port: UDP port that a simulation sends to (simulated).
         stale_s: older frames count as lost.
-        lost_s: a policy that sees markers or the object ends if one of them is lost for this long.
+        lost_s: a policy that sees markers or the object ends if a marker or the object is lost for this long.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

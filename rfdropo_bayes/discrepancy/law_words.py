@@ -30,7 +30,7 @@ def unknown_record(answer: Answer) -> dict[str, Any]:
 
 
 def law_record(answer: Answer) -> dict[str, Any] | None:
-    """The law that was found, whether it holds or not; None without one."""
+    """The law that was found, whether it holds or not; None without a law."""
     described = answer.causes.described
     if described is None or described.last is None:
         return None

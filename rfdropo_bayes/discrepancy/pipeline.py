@@ -225,7 +225,7 @@ class Answer:
 
     @property
     def law(self) -> Described | None:
-        """The adopted law; None without one."""
+        """The adopted law; None without an adopted law."""
         found = self.causes.described
         return found if found is not None and found.holds else None
 

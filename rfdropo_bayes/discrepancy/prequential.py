@@ -2,7 +2,7 @@
 
 With the model linear around its mode, the predictive density of every block of rows, given all rows before it, is a
 normal one (Dawid 1984, "The prequential approach"); the sum of their logarithms is the log evidence. Parameters are
-taken to be known no better than the prior and the earlier rows say, so that a fit to later rows hides nothing.
+known only as well as from the prior and the earlier rows, so that a fit to later rows hides nothing.
 """
 
 from __future__ import annotations

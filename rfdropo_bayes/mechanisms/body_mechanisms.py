@@ -60,7 +60,7 @@ class StiffnessGradient:
 
 
 class AxialStiffness:
-    """The body is stiffer or softer in tension than its bending says; zero is the base simulator."""
+    """The body is stiffer or softer in tension than in bending; zero is the base simulator."""
 
     name = "axial_stiffness"
     stage = "body"

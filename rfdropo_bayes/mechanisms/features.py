@@ -183,7 +183,7 @@ class Feature(NamedTuple):
         return tuple((name, power) for name, power in ((own, length), ("s", seconds)) if power)
 
     def shape_unit(self, command_unit: str) -> str:
-        """Unit of its shape; "-" without one."""
+        """Unit of its shape; "-" without a shape."""
         own = "m" if self.of_motion else command_unit
         return "-" if self.shape is None else own if self.kind == "play" else "s"
 

@@ -74,7 +74,7 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
     if found.unmatched:
         sentence = (
             f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row, and "
-            "count as they are: the prediction may be farther off than its bands say; adapt to a recording of that day"
+            "count as they are: the prediction may miss its bands; adapt to a recording of that day"
         )
         cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
     for name, times in found.far.items():

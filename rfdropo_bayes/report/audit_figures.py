@@ -105,7 +105,7 @@ class Shown:
         names: names of the tested candidates.
         cosines: cosines between their signatures.
         unseen: time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst:
-            measured, base model, extended model; None without one.
+            measured, base model, extended model; None without the model.
         remainder: time [s], mean and deviation [m] of the final model's residual at the last marker; None if nothing
             remains.
         tracks: replays of unseen recordings.

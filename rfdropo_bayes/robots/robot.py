@@ -51,7 +51,7 @@ class CommandTiming(RobotTable):
         "drives that are sent volts or a share of their supply; channels.gain has the newtons of the last two",
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
-    dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
+    dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
     usual: Positive | None = Field(
         default=None,
         description="size of usual commands, in their unit: mechanisms have priors in this size; by default "
@@ -367,7 +367,7 @@ class Robot(RobotTable):
         return low.max(axis=0), high.min(axis=0)
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
-        """Size of each channel's command that pulls a cable by so much [m]: the pull itself, or at nominal parameters
+        """Size of each channel's command for a given pull of a cable [m]: the pull itself, or at nominal parameters
         the angle that moves the cable that moves most."""
         if self.command_unit == "m":
             return np.full(len(self.channel_names), pull)

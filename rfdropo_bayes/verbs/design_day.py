@@ -207,7 +207,7 @@ def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -
     """The group of that name, of the last recording by default, and its recordings.
 
     Raises:
-        InputError: there is none.
+        InputError: no recording has this group.
     """
     found = gather_groups([run.name for run in runs], groups)
     day = group_of(runs[-1].name, groups) if group is None else group

@@ -196,7 +196,7 @@ class _Scalar:
 
 
 def element_names(model: Any, kind: str) -> list[str]:
-    """Names of all elements of a kind, in their order; the number of one that has none."""
+    """Names of all elements of a kind, in their order; an element without a name has its number."""
     import mujoco
 
     count = model.nflex if kind == "flex" else getattr(model, COUNTS[kind])
@@ -208,7 +208,7 @@ def number_of(model: Any, kind: str, name: str | int, *, where: str) -> int:
     """Number of an element, by its name or number.
 
     Raises:
-        InputError: there is none, with the nearest names.
+        InputError: no element has this name; the nearest names are listed.
     """
     names = element_names(model, kind)
     if str(name) in names:
