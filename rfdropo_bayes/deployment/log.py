@@ -70,7 +70,7 @@ class SessionLog:
     Args:
         folder: folder to write to; it must not hold a session yet.
         robot: robot to drive.
-        facts: about the session, kept in the recording's settings.
+        facts: facts about the session, kept in the recording's settings.
         frames: name of the file of CAN frames; its ending chooses the format.
 
     Raises:

@@ -25,7 +25,7 @@ class Sighting(NamedTuple):
 
     Attributes:
         number: rises with every frame; 0 before the first.
-        time: when it came [s, monotonic].
+        time: time of arrival [s, monotonic].
         position: positions of the markers in the robot's base frame [m].
         seen: False for a lost marker, whose position is then invalid.
         object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen.

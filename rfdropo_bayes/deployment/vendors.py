@@ -230,7 +230,7 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 
 WITHOUT: dict[int, str] = {
     Object.CONSUMER_HEARTBEAT: "it does not notice that the computer has died",
-    Object.ABORT_CONNECTION: "it does not stop when it notices that the computer has died",
+    Object.ABORT_CONNECTION: "it does not stop after the computer has died",
     Object.QUICK_STOP_OPTION: "it may let the cables go after a quick stop",
     Object.QUICK_STOP_DECELERATION: "its quick stop brakes as it was set by somebody else",
     Object.POSITION_LIMIT: "it follows set-points beyond the ends of the travel",

@@ -145,7 +145,7 @@ class BaseTilt:
     """The base is mounted at an angle: gravity turns about axes of the base; zero is the base simulator.
 
     Args:
-        axes: that it turns about, one after the other.
+        axes: axes of successive turns.
     """
 
     name = "base_tilt"

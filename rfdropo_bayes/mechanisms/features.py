@@ -84,7 +84,7 @@ class Feature(NamedTuple):
     Attributes:
         kind: a key of `KINDS`.
         channels: indices of its commands, or of its `GAUGES`; `OWN` must be replaced before use, see `of`.
-        shape: its time constant [s] or width [m or rad]; None without.
+        shape: time constant [s] or width [m or rad]; None without a shape.
         of_motion: whether it is made of `GAUGES`, which take the place of commands then.
     """
 
@@ -252,7 +252,7 @@ def feature_named(
     Args:
         kind: key of `KINDS`.
         commands: names of its commands, including `OWN_NAME` if ``names`` has it; or of its gauges.
-        shape: its time constant or width; None without.
+        shape: time constant or width; None without a shape.
         names: names of the commands, in their order; `OWN_NAME`, if it may be used, comes last. Or `GAUGES`.
         where: location in the file.
         of_motion: whether it is made of gauges.

@@ -27,7 +27,7 @@ class Residuals:
 
     Attributes:
         main: the residual's dominant pattern over the channels, a coordinate per row [m].
-        share: of the mean square that this pattern holds.
+        share: part of the mean square in this pattern.
         time: [s]; command: of every channel at that time, and its rate per second; tension: of every cable [N].
         position: simulated coordinate along the same pattern [m].
         channels, cables: their names; unit: of the commands.

@@ -66,7 +66,7 @@ class Body(RobotTable):
     )
     poisson_stiffening: tuple[tuple[float, float, float], ...] = Field(
         default=(),
-        description="how the stiffness of each layer depends on Poisson's ratio: three coefficients per layer, of "
+        description="dependence of the stiffness of each layer on Poisson's ratio: three coefficients per layer, of "
         "robots.body.poisson_terms; empty if it does not",
     )
     volume_m3: Positive = Field(

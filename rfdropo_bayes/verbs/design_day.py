@@ -173,7 +173,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
-            remedy="name the parameters that do, and calibrate",
+            remedy="name the parameters that vary between sessions, and calibrate",
         )
     points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
     values = {name: np.full(len(points), value) for name, value in body.items()}

@@ -140,7 +140,7 @@ def write_first_files(
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
 
     Args:
-        folder: to write to; it is made.
+        folder: folder to write to; it is made.
         outline: the robot.
         recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
             third of the rows of a single recording.

@@ -118,7 +118,7 @@ class Compared(NamedTuple):
 
     Attributes:
         words: summary.
-        cautions: on frame, order and unit of the commands.
+        cautions: cautions on frame, order and unit of the commands.
         arrangement: best arrangement of the commands; None without equilibria under them.
     """
 

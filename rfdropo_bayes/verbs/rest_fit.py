@@ -81,7 +81,7 @@ class RestFit(NamedTuple):
         each: error of every marker on the unfitted rows.
         fitted, other: numbers of fitted rows and of rows with these errors.
         tested: whether these are rows of test recordings.
-        rows: that are shown, of all recordings; residual: measured less computed [m]; ways: whether each command was
+        rows: shown rows of all recordings; residual: measured less computed [m]; ways: whether each command was
             last changed upwards (1) or downwards (-1); recording: number of each row's recording.
     """
 

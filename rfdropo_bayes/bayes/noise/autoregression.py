@@ -40,11 +40,11 @@ class Autoregression:
 
     Attributes:
         scale: marginal standard deviation of each column, in the column's unit.
-        autocorrelation: at lags 0 ... p; its length gives the order.
+        autocorrelation: values at lags 0 ... p; its length gives the order.
         source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's
             residuals are noise of such a process).
         freedom: degrees of freedom of the variance; infinite if stated.
-        correlation: of the columns at one time; None if they are independent.
+        correlation: correlation of the columns at one time; None if they are independent.
         step: time between rows [s] that the lags count; None if unknown, and rows of any rate count equally.
         paces: time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then
             have an axis of these recordings before the time axis.

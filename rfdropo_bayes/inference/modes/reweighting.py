@@ -73,7 +73,7 @@ def reweighted(
         weights: weights of the mixture.
         candidates: number of rollouts, at most.
         key: random key.
-        ledger: is charged; candidates without a likelihood are counted there.
+        ledger: counts rollouts, and candidates without a likelihood.
         count: number of draws.
         by_evidence: let the exact posterior decide between the optima, and not the weights.
 

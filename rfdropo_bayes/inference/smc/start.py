@@ -236,7 +236,7 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
         problem: problem to sample.
         config: settings of the sampler.
         key: random key.
-        ledger: is charged.
+        ledger: counts the rollouts.
 
     Raises:
         NoLikelihoodError: none of the draws has a positive likelihood.
