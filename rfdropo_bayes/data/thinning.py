@@ -8,7 +8,7 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
 
 MANY = 20_000
-"""Rows from which on a copy with fewer rows is looked at in place of a recording."""
+"""Number of rows at or above which a thinned copy is examined in place of a recording."""
 LOOKED_AT = 50_000
 """Rows that show which rate a motion needs."""
 LIKE_NOISE, CLOSE = 1.6, 5e-3
@@ -43,7 +43,7 @@ def needed_interval(run: Trajectory) -> float:
     if error(2) > UNRESOLVED * spread:
         return step
     allowed, longest = max(LIKE_NOISE * error(2), CLOSE * spread), 2
-    for every in FACTORS[2:]:
+    forevery in FACTORS[2:]:
         if every * step > SLOWEST or every > len(time) // 4 or error(every) > allowed:
             break
         longest = every

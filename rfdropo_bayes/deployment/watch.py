@@ -109,7 +109,7 @@ class Watch:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
 
     def _check_lag(self, drive: Drive, now: float) -> None:
-        """A drive may repeat an old "operation enabled" for ever; only its lack of motion reveals it."""
+        """A drive may repeat an old "operation enabled" forever; only its lack of motion reveals it."""
         if drive.reading is None:
             return
         lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre

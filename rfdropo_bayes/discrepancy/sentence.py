@@ -204,7 +204,7 @@ def _leading(answer: Answer) -> str:
         return f"of the candidates that were refitted, none is worth it ({brings})"
     seen = [row for row in answer.causes.screens[0].rows if row.adjusted_p <= answer.problem.rules.family]
     if not answer.causes.screens[0].rows:
-        return "no candidate was screened"
+        return "no candidate was tested"
     if not seen:
         return "no candidate stands out"
     return f"{', '.join(spoken(row.name) for row in seen[:MOST_EXCLUDED])} stand out; none was refitted to the end"

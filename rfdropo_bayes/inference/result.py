@@ -79,7 +79,7 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
 
 
 def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
-    """A caution for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, and for
+    """A caution forevery parameter whose posterior is cut off at its mode by a bound or an end of its prior, and for
     every parameter that the data put in a region of little prior mass.
 
     A prior that is more uniform in the logarithm is compared with its bounds in logarithms: a scale over decades has
@@ -96,7 +96,7 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
             word, end = ("lower", low) if side == "low" else ("upper", high)
             hard = np.isclose(end, problem.bounds[name], rtol=1e-6, atol=0.0).any()
             what = f"its {word} bound {end:g}" if hard else f"the {word} end {end:g} of its prior"
-            sentence = f"{name} sits on {what}, which decides there, and not the data"
+            sentence = f"{name} sits on {what}, which decides it instead of the data"
             found.append(Caution(Code.AT_BOUND, sentence))
         elif contradicts(values, prior):
             apart.append(name)

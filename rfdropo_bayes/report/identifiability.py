@@ -18,7 +18,7 @@ from jaxtyping import Float
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.units import display_unit
 
-TOGETHER = 0.6  # correlation from which on parameters are described jointly
+TOGETHER = 0.6  # correlation at or above which parameters are described jointly
 DETERMINED, FREE = 0.5, 0.8  # contraction against the prior
 RIDGE = 5.0  # standard deviation along a ridge over the next largest one
 NEGLIGIBLE = 0.2  # exponents below this are left out of the words

@@ -244,7 +244,7 @@ def _head(o: RobotOutline) -> list[str]:
         f'description = "{o.segments} segment{"s" if o.segments > 1 else ""}, {o.segments * o.cables} cables"',
         f"gravity_m_s2 = {gravity}{_mark(o, 'gravity')}",
         "time_step_s = 0.01             # rfdropo check measures its error",
-        'integrator = "sdirk2"          # or "euler": half the work, and ten times as far off',
+        'integrator = "sdirk2"          # or "euler": half the work, and ten times the error',
         'initial_state = "equilibrium"  # or "rest": undeformed',
         "",
         "[command]",

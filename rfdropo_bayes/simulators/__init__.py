@@ -1,4 +1,4 @@
-"""Simulators: the same call for every engine."""
+"""Simulators: the same call forevery engine."""
 
 from rfdropo_bayes.runtime import configure_jax
 

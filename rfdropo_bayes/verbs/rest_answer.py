@@ -17,7 +17,7 @@ from rfdropo_bayes.verbs.order_finder import arranged
 from rfdropo_bayes.verbs.rest_fit import KEPT, OWN, Estimate, RestFit, fit_at_rest
 
 MISREAD = 2.0
-"""Error over that of the best predictor without physics from which on the description itself is doubted."""
+"""Error over that of the best predictor without physics at or above which the description itself is doubted."""
 DRIFTS, WAYS = 0.25, 0.1
 """Least shares of the residuals that a drift, and the direction of a command's last change, must explain."""
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg")}
@@ -41,7 +41,7 @@ def first_answer(
 
 
 def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
-    """Lines on errors, with predictors without physics and for every marker, and on every parameter."""
+    """Lines on errors, with predictors without physics and forevery marker, and on every parameter."""
     without = {name: value for name, value in fit.unseen.items() if name != OWN}
     told = ", ".join(f"{name} {_millimetres(value)}" for name, value in without.items())
     marker, which = fit.markers[-1], "test rows" if fit.tested else "rows of the fitted recordings"

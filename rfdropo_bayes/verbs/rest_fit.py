@@ -30,7 +30,7 @@ DRAWS = 400
 SHORTEST = 1e-2
 """Shortest trial step, relative to the full step."""
 KEPT = 0.7
-"""Share of its prior standard deviation from which on a parameter counts as undetermined."""
+"""Share of its prior standard deviation at or above which a parameter counts as undetermined."""
 SMALLEST = 1e-5
 """Smallest noise [m]."""
 

@@ -29,7 +29,7 @@ LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
 INNOVATIONS = "innovations"  # white: the size of slow residuals that the rows before do not predict
 MISFIT = "misfit"  # white, of the size of a misspecified model's residuals
-SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
+SLOW = 0.9  # share that the rows before predict, at or above which a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
 LEAST_ROWS = 3  # for each column, to estimate correlations at all
 
