@@ -6,8 +6,10 @@ python tools/reference.py --check    # say which pages are not what the code say
 
 from __future__ import annotations
 
+import ast
 import collections.abc
 import dataclasses
+import inspect
 import json
 import sys
 import typing
@@ -22,6 +24,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from rfdropo_bayes.bayes.priors import FAMILIES, OPTIONAL
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.settings import Deployment
@@ -53,6 +56,7 @@ def pages() -> dict[str, str]:
         "mechanisms.md": mechanisms_page(),
         "methods.md": methods_page(),
         "commands.md": commands_page(),
+        "cautions.md": cautions_page(),
     }
 
 
@@ -68,6 +72,7 @@ def index_page() -> str:
         ("[mechanisms.md](mechanisms.md)", "every mechanism: cause, remedy, parameters, default priors, where it runs"),
         ("[methods.md](methods.md)", "every method of inference and its options"),
         ("[commands.md](commands.md)", "every command of `rfdropo` and its options"),
+        ("[cautions.md](cautions.md)", "every caution of a result, by its code"),
     ]
     return page("Reference", ["These pages are written from the code.", table(("Page", "What is in it"), rows)])
 
@@ -116,7 +121,7 @@ def deployment_page() -> str:
     """Keys of a deployment file."""
     parts = [
         "A deployment is one TOML file, in SI units unless a key says otherwise. Paths are relative to it. "
-        "[docs/deployment.md](../deployment.md) says what the keys are for.",
+        "[docs/deployment.md](../deployment.md) shows their use.",
         *(text for title, schema in tables_of(Deployment, "") for text in key_table(title, schema)),
     ]
     return page("The deployment file", parts)
@@ -150,8 +155,8 @@ def mechanisms_page() -> str:
 def methods_page() -> str:
     """Every method with its options."""
     parts = [
-        "`[inference] method` names one; its options stand beside it. [docs/inference.md](../inference.md) says which "
-        "to take. `rollouts` is the budget, 20000 where a file does not say, for every method that lists it."
+        "`[inference] method` names one; its options stand beside it. [docs/inference.md](../inference.md) helps to "
+        "choose. `rollouts` is the budget, 20000 by default, for every method that lists it."
     ]
     for name, method in METHODS.items():
         parts += [f"## {name}", first_paragraph(method.config.__doc__), option_table(method.config)]
@@ -161,13 +166,27 @@ def methods_page() -> str:
 def commands_page() -> str:
     """Every command with its options."""
     root: Any = typer.main.get_command(app)
-    parts = ["Bad input ends with status 2 and one line that says what to do; an interrupted run ends with status 3."]
+    parts = ["Bad input ends with status 2 and one line with a remedy; an interrupted run ends with status 3."]
     for name, command in walk(root, "rfdropo"):
         shown = [p for p in command.params if NO_HELP not in p.opts]
         rows = [(code(written(p)), default_of(p), p.help or "") for p in shown]
         parts += [f"## {name}", first_paragraph(command.help)]
         parts += [table(("Argument or option", "Default", "Meaning"), rows)] if rows else []
     return page("Commands", parts)
+
+
+def cautions_page() -> str:
+    """Every code with its meaning, which follows it in the class."""
+    (codes,) = ast.parse(inspect.getsource(Code)).body
+    assert isinstance(codes, ast.ClassDef)
+    texts = [inspect.cleandoc(node.value.value) for node in codes.body[1:] if isinstance(node, ast.Expr)]
+    rows = [(code(name), " ".join(text.split())) for name, text in zip(Code, texts, strict=True)]
+    parts = [
+        "A caution is a reason to doubt a result. Its sentence has the numbers and a remedy; its code is for programs. "
+        "Do not use the draws of a fit with a grave caution.",
+        table(("Code", "Meaning"), rows),
+    ]
+    return page("Cautions", parts)
 
 
 def walk(command: Any, name: str) -> Iterator[tuple[str, Any]]:
