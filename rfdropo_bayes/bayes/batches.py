@@ -15,7 +15,7 @@ SMALLEST, GROWTH = 8, 4  # sizes that batches are padded to: 8, 32, 128, ...
 def padded(function: Callable[[Any], Any], given: Any) -> Any:
     """A function of arrays with a common first axis, evaluated on a padded batch; the padding repeats the last entry.
 
-    JAX compiles anew forevery shape, which takes longer than a thousand evaluations of a prior.
+    JAX compiles anew for every shape, which takes longer than a thousand evaluations of a prior.
     """
     count = len(jax.tree.leaves(given)[0])
     if count == 0:

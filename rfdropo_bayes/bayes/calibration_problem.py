@@ -28,8 +28,8 @@ class CalibrationProblem:
 
     Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is cut
     into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
-    compilations suffice forevery batch size. The number of simulated steps is a run-time argument, so that they
-    suffice forevery horizon. Problems of one model share its compiled programs.
+    compilations suffice for every batch size. The number of simulated steps is a run-time argument, so that they
+    suffice for every horizon. Problems of one model share its compiled programs.
 
     Attributes:
         model: priors, simulator and data.
@@ -332,7 +332,7 @@ class CalibrationProblem:
         return Observation(*self._chunked(self.model.programs.observations, values, self.n_rows))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
-        """A realisation of the observation noise [m] forevery set of values."""
+        """A realisation of the observation noise [m] for every set of values."""
         return self._realised(self.model.markers.draw_noise, key, values)
 
     def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:

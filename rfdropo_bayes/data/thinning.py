@@ -43,7 +43,7 @@ def needed_interval(run: Trajectory) -> float:
     if error(2) > UNRESOLVED * spread:
         return step
     allowed, longest = max(LIKE_NOISE * error(2), CLOSE * spread), 2
-    forevery in FACTORS[2:]:
+    for every in FACTORS[2:]:
         if every * step > SLOWEST or every > len(time) // 4 or error(every) > allowed:
             break
         longest = every

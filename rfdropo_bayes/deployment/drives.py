@@ -301,7 +301,7 @@ class Drive:
         Args:
             period: time between set-points [s].
             guards: see there.
-            say: takes a line forevery object that is left out, or set to less than was asked.
+            say: takes a line for every object that is left out, or set to less than was asked.
 
         Raises:
             InputError: if the drive does not keep a written value, lacks a guard that it must have, or would wrap its

@@ -238,7 +238,7 @@ def left_out_gains(
     inverse = np.linalg.inv(whole[0] + held)
     for p in range(len(sums.yy)):
         own = (sums.jj[p], sums.jx[p], sums.xx[p], sums.jy[p], sums.xy[p])
-        others = [every - part forevery, part in zip(whole, own, strict=True)]
+        others = [every - part for every, part in zip(whole, own, strict=True)]
         b, u, c, _ = _solved(others, held)
         left_j, left_jx = sums.jy[p] - sums.jj[p] @ b, sums.jx[p] - sums.jj[p] @ u
         along = sums.xy[p] - sums.jx[p].T @ b - u.T @ left_j - left_jx.T @ inverse @ left_j

@@ -24,7 +24,7 @@ class Remainder(NamedTuple):
         amplitude: standard deviation of the process [m]; 0 if noise alone is likelier.
         memory: its length scale [s].
         time: times of its rows [s].
-        mean, sd: mean and deviation of the process [m], forevery group, row and channel.
+        mean, sd: mean and deviation of the process [m], for every group, row and channel.
         log_likelihood_ratio: log likelihood ratio with and without the process.
     """
 

@@ -73,7 +73,7 @@ class Ledger:
 def evaluate_rows(
     problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger: Ledger
 ) -> Float[np.ndarray, "n horizon"]:
-    """Row log likelihoods at unconstrained points; minus infinity throughout forevery rollout that is left out."""
+    """Row log likelihoods at unconstrained points; minus infinity throughout for every rollout that is left out."""
     values = problem.from_unconstrained(jnp.asarray(u))
     rows, status = (np.asarray(part) for part in problem.row_log_likelihood(values, horizon))
     rows = np.asarray(rows, dtype=float)

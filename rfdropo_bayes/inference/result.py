@@ -79,7 +79,7 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
 
 
 def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
-    """A caution forevery parameter whose posterior is cut off at its mode by a bound or an end of its prior, and for
+    """A caution for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, and for
     every parameter that the data put in a region of little prior mass.
 
     A prior that is more uniform in the logarithm is compared with its bounds in logarithms: a scale over decades has

@@ -181,7 +181,7 @@ class CableGain(MemorylessActuation):
 
     @classmethod
     def for_robot(cls, robot: Robot) -> CableGain:
-        """One error forevery command channel of a robot."""
+        """One error for every command channel of a robot."""
         return cls(robot.channel_names)
 
     def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
@@ -447,7 +447,7 @@ class GuideAzimuth(MemorylessActuation):
 
     @classmethod
     def for_robot(cls, robot: Robot) -> GuideAzimuth:
-        """One angle forevery channel that drives one cable; no angles if channels share cables, for drives that hold
+        """One angle for every channel that drives one cable; no angles if channels share cables, for drives that hold
         tensions, or for a black box."""
         if not isinstance(robot, Robot) or robot.held_by_force:
             return cls()

@@ -115,7 +115,7 @@ class MarkerOffset:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> MarkerOffset:
-        """One arm forevery marker of a robot."""
+        """One arm for every marker of a robot."""
         return cls(robot.marker_names)
 
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:

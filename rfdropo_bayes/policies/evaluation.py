@@ -92,7 +92,7 @@ def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int
         longest: most actions of an episode.
 
     Returns:
-        an episode forevery case, in order.
+        an episode for every case, in order.
     """
     episodes: list[Episode] = []
     for first in range(0, len(cases), venv.num_envs):
@@ -207,7 +207,7 @@ def interquartile_mean(
 
 
 def episode_table(policies: Mapping[str, Sequence[Episode]], cases: Sequence[Case]) -> pd.DataFrame:
-    """A row forevery policy and case: final and smallest distance [m], sum of rewards, largest tension [N],
+    """A row for every policy and case: final and smallest distance [m], sum of rewards, largest tension [N],
     whether the limit on it ended the episode, goal and parameters."""
     rows = [
         {

@@ -2,7 +2,7 @@
 
 The graph has one input, ``observation`` (float32, batch by size), and two float32 outputs. ``action`` (batch by
 channel) is the change of each channel's command per control period [m or rad]. ``raw`` is the action as the environment
-takes it: a number from -1 to 1 forevery channel, or the index of a discrete action (batch by 1). The metadata hold the
+takes it: a number from -1 to 1 for every channel, or the index of a discrete action (batch by 1). The metadata hold the
 layout (`PolicyLayout.to_json`) and the origin of the policy. The graph is built node by node: PyTorch's own exporter
 needs one more package, and would leave the normalisation out.
 """

@@ -41,7 +41,7 @@ def curve_figure(curve: Sequence[Mapping[str, float]]) -> Figure:
 
 @styled
 def success_figure(policies: Mapping[str, Sequence[Episode]], thresholds: Sequence[float]) -> Figure:
-    """Share of the episodes that end within a distance, forevery policy."""
+    """Share of the episodes that end within a distance, for every policy."""
     figure = Figure(figsize=(WIDTH, 3.2))
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()

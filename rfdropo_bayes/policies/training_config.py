@@ -18,7 +18,7 @@ class TrainingTable(BaseModel):
         default="TrunkReach-v0", description="environment in which the policy is trained"
     )
     actions: Literal["continuous", "discrete"] = Field(
-        default="continuous", description="a rate forevery channel, or one channel moved up or down by a step"
+        default="continuous", description="a rate for every channel, or one channel moved up or down by a step"
     )
     observation: Literal["full", "paper", "markers"] = Field(
         default="full",

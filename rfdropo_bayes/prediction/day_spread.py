@@ -15,7 +15,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class DayDeviation(NamedTuple):
-    """Normal distribution of a day's deviation of one parameter, forevery draw, in the parameter's unit.
+    """Normal distribution of a day's deviation of one parameter, for every draw, in the parameter's unit.
 
     Attributes:
         shift: its mean: the deviation of the day that a posterior was adapted to; zero for any other day.

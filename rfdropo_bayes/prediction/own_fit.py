@@ -1,4 +1,4 @@
-"""Least squares of many draws at once, each with its own optimum: fits the parameters of a recording forevery draw.
+"""Least squares of many draws at once, each with its own optimum: fits the parameters of a recording for every draw.
 
 Every draw has k standard normal coordinates and m whitened residuals. Its cost is half the sum of squares of the
 residuals and of the distance to a prior draw. With perturbed data and the prior draw as the centre, the optimum is a

@@ -134,7 +134,7 @@ def predict_new(
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
     A parameter that was free per recording takes, for a new recording, its value in a random fitted recording, chosen
-    anew forevery draw. A parameter of a group takes, for a new group, values from the spread between groups. The
+    anew for every draw. A parameter of a group takes, for a new group, values from the spread between groups. The
     offset of the measuring frame and the deviations of a new group are then conditioned on the first row
     (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
     (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
@@ -324,7 +324,7 @@ def with_measured_starts(
 
 
 def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajectory, values: Batch) -> Batch:
-    """Centre [m] and yaw [rad] of the measured cube in the robot's frame, forevery draw; empty if there is none."""
+    """Centre [m] and yaw [rad] of the measured cube in the robot's frame, for every draw; empty if there is none."""
     pose = trajectory.object_pose
     if pose is None or not np.isfinite(pose[0]).all():
         return {}

@@ -134,7 +134,7 @@ def _ridge(
     position: Float[np.ndarray, "row marker 3"],
     penalties: Float[np.ndarray, " penalty"],
 ) -> tuple[Float[np.ndarray, "penalty marker 3"], Float[np.ndarray, "penalty feature marker 3"]]:
-    """Offset and weights forevery penalty, from one eigendecomposition of the normal equations.
+    """Offset and weights for every penalty, from one eigendecomposition of the normal equations.
 
     The offset takes up the mean of the features over these rows, and is not penalised.
     """

@@ -70,7 +70,7 @@ def punctuality_figure(session: Trajectory, period: float) -> Figure:
 
 
 def _grid(session: Trajectory, draw: Callable[[Axes, int], None], label: str) -> Figure:
-    """A cell forevery channel, with its name above."""
+    """A cell for every channel, with its name above."""
     names = session.cable_names
     columns = min(MOST_COLUMNS, len(names))
     rows = -(-len(names) // columns)

@@ -51,7 +51,7 @@ class PolicyLayout:
         observation: parts of the observation, in order.
         channels: command channels that it moves, in order.
         unit: unit of the commands: "m" of cable, "rad" of a motor, "N" of tension; of a black box also "N m" or "-".
-        kind: "discrete" actions are rows of ``moves``; a "continuous" action is a number from -1 to 1 forevery
+        kind: "discrete" actions are rows of ``moves``; a "continuous" action is a number from -1 to 1 for every
             channel.
         moves: change of the commands by an action [unit]: (action, channel) if discrete; if continuous, one row, the
             change at 1.

@@ -1,4 +1,4 @@
-"""Simulators: the same call forevery engine."""
+"""Simulators: the same call for every engine."""
 
 from rfdropo_bayes.runtime import configure_jax
 

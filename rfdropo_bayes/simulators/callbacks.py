@@ -43,7 +43,7 @@ def one_callback(roll: Callable[[Any, int], Output], shapes: Output, inputs: Any
 
 
 def distinct(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of distinct rows, and forevery row the position of its equal among them."""
+    """Indices of distinct rows, and for every row the position of its equal among them."""
     seen: dict[bytes, int] = {}
     place = [seen.setdefault(b"".join(a[row].tobytes() for a in arrays), len(seen)) for row in range(len(arrays[0]))]
     return np.unique(place, return_index=True)[1], np.array(place)

@@ -41,7 +41,7 @@ def first_answer(
 
 
 def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
-    """Lines on errors, with predictors without physics and forevery marker, and on every parameter."""
+    """Lines on errors, with predictors without physics and for every marker, and on every parameter."""
     without = {name: value for name, value in fit.unseen.items() if name != OWN}
     told = ", ".join(f"{name} {_millimetres(value)}" for name, value in without.items())
     marker, which = fit.markers[-1], "test rows" if fit.tested else "rows of the fitted recordings"

@@ -2,7 +2,7 @@
 
 The object dictionary and the SDO server are canopen's (`sdo_server`); everything that they lack (PDOs linked to the
 dictionary, NMT, SYNC, heartbeats both ways, emergencies) is here. Power and motion of its axes are `SimulatedDrive`'s.
-One thread feeds it: `receive` forevery frame, `tick` between.
+One thread feeds it: `receive` for every frame, `tick` between.
 """
 
 from __future__ import annotations

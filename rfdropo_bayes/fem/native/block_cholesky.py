@@ -2,7 +2,7 @@
 lanes.
 
 The pattern is analysed once: fill-reducing order (multiple minimum degree, from SuperLU through SciPy), elimination
-tree, fill, and forevery block of the factor the list of products it receives. The factorisation then runs over these
+tree, fill, and for every block of the factor the list of products it receives. The factorisation then runs over these
 lists, column by column ("left-looking": George and Liu 1981, Computer Solution of Large Sparse Positive Definite
 Systems, ch. 5).
 

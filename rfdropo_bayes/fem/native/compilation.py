@@ -120,7 +120,7 @@ class WholeCompiler(DeferredCompiler):
 
 
 def deferred(function: Callable, **options: bool) -> Callable:
-    """A function that only kernels call, compiled once forevery type and not forevery number in a call."""
+    """A function that only kernels call, compiled once for every type and not for every number in a call."""
     dispatcher = numba.njit(no_cfunc_wrapper=True, _nrt=False, pipeline_class=DeferredCompiler, **options)(function)
     overloads, resolve = dispatcher.overloads, dispatcher.get_call_template
     dispatcher.add_overload = lambda result: overloads.update({tuple(result.signature.args): result})

@@ -116,7 +116,7 @@ class RodWork(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """Runs of neighbouring guides that slide as one, the same forevery kind of friction; guides count over all
+    """Runs of neighbouring guides that slide as one, the same for every kind of friction; guides count over all
     cables, as in ``rod_tables.RodTables``."""
 
     cable: Int[np.ndarray, " runs"]

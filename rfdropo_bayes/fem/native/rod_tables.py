@@ -66,7 +66,7 @@ class RodTables(NamedTuple):
 
 
 def border_panels(cables: int) -> int:
-    """Panels of three rows that hold the right-hand side and one row forevery cable."""
+    """Panels of three rows that hold the right-hand side and one row for every cable."""
     return (cables + 3) // 3
 
 

@@ -77,7 +77,7 @@ class SearchSpace(NamedTuple):
         }
 
     def edge_cautions(self, vector: Float[np.ndarray, " k"], edge: float = 0.01) -> list[Caution]:
-        """A caution forevery mean or standard deviation within ``edge`` of its range from an end of it."""
+        """A caution for every mean or standard deviation within ``edge`` of its range from an end of it."""
         d, found = len(self.names), []
         for j, name in enumerate(self.names):
             for what, value in (("mean", vector[j]), ("standard deviation", vector[d + j])):

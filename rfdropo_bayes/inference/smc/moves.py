@@ -109,7 +109,7 @@ def propose(
 
 
 def accept(generator: np.random.Generator, log_ratio: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Metropolis decision forevery particle; a ratio that is not a number is a refusal."""
+    """Metropolis decision for every particle; a ratio that is not a number is a refusal."""
     return np.log(generator.uniform(size=log_ratio.shape)) < np.where(np.isnan(log_ratio), -np.inf, log_ratio)
 
 
