@@ -133,7 +133,7 @@ def _when(described: Described) -> str:
     members = described.found.map.members(term.port)
     size = np.sqrt(np.mean([row.mean**2 for row in described.found.ports if row.port in members], axis=(0, 1)))
     large = described.found.centre[size > 0.7 * size.max()]
-    return f", most from {large.min():.2g} to {large.max():.2g} s"
+    return f", most from {large.min():.4g} to {large.max():.4g} s"
 
 
 def _stand_ins(described: Described) -> str:
