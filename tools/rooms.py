@@ -50,11 +50,11 @@ def picture(imported: dict[str, set[str]]) -> str:
     rows, direct = defaultdict(list), needed(imported)
     for room, height in levels(imported).items():
         rows[height].append(room)
-    lines = []
+    lines: list[str] = []
     for height in sorted(rows, reverse=True):
         for room in sorted(rows[height]):
             arrow = f" -> {', '.join(sorted(direct[room]))}" if direct[room] else ""
-            lines.append(f"{height}  {room:12s}{arrow}")
+            lines.append(f"{height:2d}  {room:12s}{arrow}".rstrip())
     return "\n".join(lines)
 
 
