@@ -159,7 +159,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
     found = ", ".join(
         f"{tie.feature.formula(names)} at {tie.term.port.words}{in_words(tie.term.scope)}" for tie in ties
     )
-    return f" Not to be told from it by these data: {found}."
+    return f" Indistinguishable from it in these data: {found}."
 
 
 def ports_sentence(answer: Answer) -> str:
