@@ -170,8 +170,8 @@ class CsvColumns(BaseModel):
     motor_angle_unit: Literal["rad", "deg", "counts"] = Field(default="rad", description="unit of the motor angles")
     unwrap: dict[str, float] = Field(
         {},
-        description="turn of the counter of each column of commands or motor angles that begins anew after a turn, in "
-        "the unit of the column, by its name: 4096 of an encoder, 360 of an angle in degrees",
+        description="size of a turn, by column, for commands or motor angles that begin anew after each turn; in the "
+        "unit of the column: 4096 of an encoder, 360 of an angle in degrees",
     )
     object_pose: list[str] | None = Field(
         default=None,

@@ -46,7 +46,7 @@ class TetrahedraTable(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    mesh: str = Field(description="mesh file (VTK, Gmsh), looked for as the recordings are")
+    mesh: str = Field(description="mesh file (VTK, Gmsh), in the folders of recordings")
     unit: Literal["m", "cm", "mm"] = Field(description="unit of its coordinates, in the frame of the robot's base")
     clamp_height: float = Field(description="nodes at or below this height are held [m]")
     frames: Literal["polar", "edges"] = Field(

@@ -54,7 +54,7 @@ RESTING = 3e-3
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
 METRES_UP_TO = 0.2
-"""No cable of a soft arm is pulled by more metres."""
+"""Largest plausible pull of a cable of a soft arm [m]."""
 
 
 BENT, UPRIGHT = 2.0, 1.1
