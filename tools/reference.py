@@ -30,6 +30,7 @@ from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.settings import Deployment
 from rfdropo_bayes.inference.method_options import attributes_of
 from rfdropo_bayes.inference.methods import METHODS
+from rfdropo_bayes.mechanisms.features import KINDS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.assembly import measurement_specs
 from rfdropo_bayes.model.experiment import Experiment, NoiseModel
@@ -38,6 +39,7 @@ from rfdropo_bayes.model.model_spec import DataChannels
 from rfdropo_bayes.model.robot_listings import format_rows, robot_rows
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
+from rfdropo_bayes.simulators.adapters.mujoco_elements import ATTRIBUTES, Attribute
 from rfdropo_bayes.simulators.mechanisms import STAGES
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -57,6 +59,7 @@ def pages() -> dict[str, str]:
         "methods.md": methods_page(),
         "commands.md": commands_page(),
         "cautions.md": cautions_page(),
+        "mujoco.md": mujoco_page(),
     }
 
 
@@ -73,6 +76,7 @@ def index_page() -> str:
         ("[methods.md](methods.md)", "every method of inference and its options"),
         ("[commands.md](commands.md)", "every command of `rfdropo` and its options"),
         ("[cautions.md](cautions.md)", "every caution of a result, by its code"),
+        ("[mujoco.md](mujoco.md)", "every parameter of a MuJoCo model: address, unit, default prior"),
     ]
     return page("Reference", ["These pages are written from the code.", table(("Page", "What is in it"), rows)])
 
@@ -149,7 +153,22 @@ def mechanisms_page() -> str:
                     [(code(row["parameter"]), *list(row.values())[1:]) for row in rows],
                 ),
             ]
+    parts += [
+        "## Features of laws",
+        "A [law at a port](../mechanisms.md#laws-at-ports) is a sum of coefficients times features of "
+        "commands u. The shape of a low pass and of a lag is a time constant [s], the shape of a play half its width.",
+        table(("Feature", "Commands", "Formula", "Shapes that audits try"), feature_rows()),
+    ]
     return page("Mechanisms", parts)
+
+
+def feature_rows() -> list[tuple[str, str, str, str]]:
+    """Features with the formula of two commands a and b."""
+    rows = []
+    for name, kind in KINDS.items():
+        formula = kind.formula.replace("{shape:.2g}", "shape").format("a", "b")
+        rows.append((code(name), str(kind.channels), code(formula), ", ".join(map(str, kind.shapes))))
+    return rows
 
 
 def methods_page() -> str:
@@ -187,6 +206,30 @@ def cautions_page() -> str:
         table(("Code", "Meaning"), rows),
     ]
     return page("Cautions", parts)
+
+
+def mujoco_page() -> str:
+    """Every attribute of every kind of element."""
+    rows = [
+        (code(f"{kind}/{'' if kind == 'option' else 'NAME/'}{name}"), *unit_and_prior(attribute), attribute.words)
+        for kind, attributes in ATTRIBUTES.items()
+        for name, attribute in attributes.items()
+    ]
+    parts = [
+        "`[adapter.parameters]` names [parameters](../your_simulator.md) by their address. `*` in a "
+        "name makes a factor on all that match. Units and scales of joints are for linear and rotational joints. A "
+        "positive quantity that is zero in the file has a half-normal prior of the scale.",
+        table(("Address", "Unit", "Default prior about the value in the file", "Scale", "Meaning"), rows),
+    ]
+    return page("Parameters of MuJoCo models", parts)
+
+
+def unit_and_prior(attribute: Attribute) -> tuple[str, str, str]:
+    """Unit, default prior and scale of a MuJoCo attribute."""
+    unit = attribute.unit if isinstance(attribute.unit, str) else " or ".join(attribute.unit)
+    typical = attribute.typical if isinstance(attribute.typical, tuple) else (attribute.typical,)
+    prior = "Normal" if attribute.signed else f"LogNormal, sigma {attribute.sigma:g}"
+    return unit, prior, " or ".join(f"{scale:g}" for scale in typical)
 
 
 def walk(command: Any, name: str) -> Iterator[tuple[str, Any]]:

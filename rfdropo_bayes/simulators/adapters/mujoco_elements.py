@@ -2,7 +2,7 @@
 
 An address is ``kind/name/attribute``: ``joint/elbow/damping``. The number of an element, from zero, replaces its name
 if it has none, and ``*`` in a name matches any text: the parameter is then a factor on all of them. Options have no
-name: ``option/gravity_z``. docs/your_simulator.md has the table of `ATTRIBUTES`.
+name: ``option/gravity_z``. docs/reference/mujoco.md lists `ATTRIBUTES`.
 """
 
 from __future__ import annotations
