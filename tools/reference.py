@@ -28,6 +28,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.settings import Deployment
+from rfdropo_bayes.deployment.vendors import WITHOUT
 from rfdropo_bayes.inference.method_options import attributes_of
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.features import KINDS
@@ -127,6 +128,9 @@ def deployment_page() -> str:
         "A deployment is one TOML file, in SI units unless a key says otherwise. Paths are relative to it. "
         "[docs/deployment.md](../deployment.md) shows their use.",
         *(text for title, schema in tables_of(Deployment, "") for text in key_table(title, schema)),
+        "## Guards",
+        "`[drives] unguarded` may list these objects, if something else does the work of the missing guard.",
+        table(("Object", "Without it"), [(code(f"0x{index:04X}"), words) for index, words in sorted(WITHOUT.items())]),
     ]
     return page("The deployment file", parts)
 
