@@ -231,14 +231,14 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 WITHOUT: dict[int, str] = {
     Object.CONSUMER_HEARTBEAT: "it does not notice that the computer has died",
     Object.ABORT_CONNECTION: "it does not stop after the computer has died",
-    Object.QUICK_STOP_OPTION: "it may let the cables go after a quick stop",
-    Object.QUICK_STOP_DECELERATION: "its quick stop brakes as it was set by somebody else",
+    Object.QUICK_STOP_OPTION: "its quick stop may release the cables",
+    Object.QUICK_STOP_DECELERATION: "its quick stop brakes at an unknown rate",
     Object.POSITION_LIMIT: "it follows set-points beyond the ends of the travel",
     Object.FOLLOWING_WINDOW: "it does not notice that it lags behind its set-points",
-    Object.FOLLOWING_TIMEOUT: "it bears a lag behind its set-points for as long as was set by somebody else",
+    Object.FOLLOWING_TIMEOUT: "it tolerates a lag behind its set-points for an unknown time",
     Object.MAX_TORQUE: "it does not limit its torque, on which homing relies",
     Object.MAX_MOTOR_SPEED: "it does not limit its speed",
-    Object.RATED_TORQUE: "nobody notices a torque in another unit, or another motor",
+    Object.RATED_TORQUE: "a torque in another unit, or another motor, goes unnoticed",
 }
 """Guards that a drive may lack if its owner accepts the stated consequence."""
 
