@@ -37,7 +37,7 @@ STEP = 1e-4
 COARSE = 0.03
 """The same for an engine in single precision, whose rounding is 1e-5 m, or with rough motion."""
 FINE = 1e-5
-"""Relative steps of an engine's own differences, up to which it counts as smooth."""
+"""Largest relative steps of the differences of a smooth engine."""
 
 
 class Scope(NamedTuple):
