@@ -103,7 +103,7 @@ def test_the_page_tells_of_tensions_and_of_what_speaks_against_the_posterior():
     assert "Warning" not in render_policy(SUMMARY, seen, "My arm", "")
 
 
-@pytest.mark.parametrize("count", [1, 4, 7])
+@pytest.mark.parametrize("count", [1, 4, pytest.param(7, marks=pytest.mark.slow)])
 def test_every_parameter_has_its_panel_however_the_grid_fills(count: int):
     values = {f"p{k}": np.linspace(1.0, 2.0, 20) for k in range(count)}
     figure = draws_figure(values, np.full(20, 0.01))
