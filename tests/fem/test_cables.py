@@ -63,6 +63,7 @@ def test_many_nearly_dependent_cables_never_fail(seed):
     assert np.all(np.abs(left + longest)[tension > 1e-9 * tension.max()] < 1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_of_cables_is_solved_as_each():
     rng = np.random.default_rng(0)
     factor = rng.normal(size=(40, 5, 4))

@@ -141,6 +141,7 @@ def test_friction_keeps_in_its_cone_and_contacts_add_no_energy(angle, friction, 
     assert np.diff(np.concatenate([[first], energy])).max() < 1e-6 * max(first, 1e-3) + held
 
 
+@pytest.mark.slow
 def test_drag_limits_the_speed_of_a_fall():
     """Rayleigh damping by mass alone: m g = a m v at the end."""
     start = cube_at(jnp.array([0.0, 1e3, 0.0]), 0.0, UP)

@@ -73,6 +73,7 @@ def test_failed_simulations_are_counted():
     assert told[0].startswith("3 of 100 simulations failed")
 
 
+@pytest.mark.slow
 def test_stopped_episodes_are_counted_and_leave_a_median_that_is_no_number():
     seen = played(failed=1)
     pulls = [replace(each, tension=100.0, stopped=each.case > 40) for each in seen.episodes]

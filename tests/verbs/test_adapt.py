@@ -59,6 +59,7 @@ def fit(zeros):
     return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, screen=32), test=unseen, seed=0, show=False)
 
 
+@pytest.mark.slow
 def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})

@@ -170,6 +170,7 @@ def write(path: Path, *parts: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_simulated_recording_is_found_again(bar, tmp_path, monkeypatch, capsys):
     made = write(tmp_path / "made.toml", bar.read_text(), COMMANDS)
     assert simulate(made, tmp_path / "made", monkeypatch, capsys)["error_mm"] is None
@@ -181,6 +182,7 @@ def test_a_simulated_recording_is_found_again(bar, tmp_path, monkeypatch, capsys
     assert softer["error_mm"]["max"] > 1.0
 
 
+@pytest.mark.slow
 def test_the_mesh_is_looked_for_beside_the_experiment(bar, bar_mesh, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     text = bar.read_text().replace(str(bar_mesh), "mine.vtk") + COMMANDS
