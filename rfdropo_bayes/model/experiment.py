@@ -41,9 +41,9 @@ class WeighedTable(ExperimentTable):
 class LawTermTable(ExperimentTable):
     """A term of [[model.laws]]: a coefficient times a feature."""
 
-    coefficient: str = Field(description="name of its parameter, zero of which is no effect")
+    coefficient: str = Field(description="name of its parameter; zero has no effect")
     feature: str = Field(description="kind of the feature, see docs/mechanisms.md")
-    commands: list[str] = Field(default_factory=list, description="commands that the feature is made of")
+    commands: list[str] = Field(default_factory=list, description="commands of the feature")
     motion: list[str] = Field(
         default_factory=list,
         description="motion in their place, at ports of the body: tip x, tip y, tip z or tip distance, from the first "
@@ -127,8 +127,8 @@ class ModelTable(ExperimentTable):
     )
     orientation: bool = Field(
         default=False,
-        description="the recordings' orientations of sections are data, with a noise orientation_noise that is "
-        "inferred and a turn of the frame, frame_turn_x, _y and _z, that is zero unless it has a prior",
+        description="use recorded orientations of sections; their noise orientation_noise is inferred, and the turn of "
+        "the frame (frame_turn_x, _y and _z) is zero unless it has a prior",
     )
     object_pose: bool = Field(
         default=False,
