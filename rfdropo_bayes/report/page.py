@@ -38,11 +38,11 @@ SECTIONS = (
     ("data", "Data"),
     ("model", "Model and priors"),
     ("posterior", "Posterior"),
-    ("identifiability", "What the data determine"),
+    ("identifiability", "Determined parameters"),
     ("predictions", "Measured against predicted"),
     ("bands", "Are the bands honest?"),
     ("computation", "Computation"),
-    ("limits", "What this cannot see"),
+    ("limits", "Limits"),
     ("reproduce", "To reproduce"),
 )
 
