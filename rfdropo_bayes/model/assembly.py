@@ -219,7 +219,9 @@ def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *
 def parameters_elsewhere(spec: ModelSpec, simulator: AnySimulator) -> dict[str, Sequence[ParameterSpec]]:
     """Parameters that a model could have, by the change of the model that adds them."""
     chosen = asdict(spec.channels)
-    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
+    further: dict[str, Sequence[ParameterSpec]] = {
+        f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]
+    }
     if spec.simulator.motion == QUASI_STATIC:
         damping = {name: found for name, found in robot_of(spec).parameters.items() if name in DAMPING}
         further['set [simulator] motion = "dynamic"'] = specs_of(damping)
