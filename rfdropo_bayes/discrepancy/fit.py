@@ -430,7 +430,7 @@ def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:
     """Expected rollouts of an optimisation of ``parameters`` parameters."""
     forward = target.forward
-    return forward.count * USUAL * (1 + forward.lanes.slope_rollouts * parameters)
+    return forward.count * USUAL * (7 + forward.lanes.slope_rollouts * parameters)
 
 
 def best_between(

@@ -1,4 +1,4 @@
-"""Rollouts and their derivatives in batches of one size, so that two compilations suffice for an audit."""
+"""Rollouts and their derivatives in batches of one size, so that few compilations suffice for an audit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ from rfdropo_bayes.discrepancy.journal import digest
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 # Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
@@ -30,6 +29,10 @@ from rfdropo_bayes.simulators.protocol import Result, Simulator
 # least time for the Jacobians of both real robots, two thirds of the time with 16.
 WIDTH = 48
 NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
+# Step of a derivative of a compiled engine in prior deviations, one-sided; a larger step is taken to both sides. The
+# rounding of 1e-13 m then errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
+STEP = 1e-4
+COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
 
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
@@ -42,14 +45,17 @@ def _no_limit() -> None:
 
 
 class Lanes:
-    """A simulator behind two compiled functions of a fixed number of lanes.
+    """A simulator behind compiled functions of a fixed number of lanes.
 
     Args:
         simulator: simulator with the base model's mechanisms and every candidate at its null value.
         marker_index: indices of its measured markers.
         width: lanes per call, with the last call of a batch padded; None for the engine's choice.
-        slope_rollouts: rollouts per derivative, including the value.
         fields: parts of an observation that are data; if the pose of an object is included, its start is an input.
+        costly: parameters of which rollouts take longer than others.
+
+    Attributes:
+        difference: step of derivatives in prior deviations, see `STEP`; None if derivatives are exact.
     """
 
     def __init__(
@@ -57,15 +63,18 @@ class Lanes:
         simulator: Simulator,
         marker_index: np.ndarray,
         width: int | None = None,
-        slope_rollouts: int = 3,
         fields: Sequence[str] = ("position",),
+        costly: Sequence[str] = (),
     ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
         backend = getattr(getattr(simulator, "engine", None), "backend", None)
         self.width = width or (NARROW if backend is not None and backend.name == "jax" else WIDTH)
-        self.slope_rollouts = slope_rollouts
         self.fields = tuple(fields)
+        self.costly = tuple(costly)
+        self.difference: float | None = None
+        if backend is not None and backend.name == "numba":
+            self.difference = STEP if backend.precision == "float64" else COARSE
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
     def _observe(
@@ -88,25 +97,17 @@ class Lanes:
         return {name: part for name, part in found.items() if part is not None}, status
 
     @property
-    def costly(self) -> tuple[str, ...]:
-        """Parameters of which rollouts take longer than others."""
-        return ()
+    def slope_rollouts(self) -> int:
+        """Rollouts per derivative, beside those of the value."""
+        if self.difference is None:
+            return 3
+        return 1 if self.difference <= STEP else 2
 
-    @property
-    def difference(self) -> float | None:
-        """Relative step of its derivatives; None if they are exact."""
-        engine: Any = getattr(self.simulator, "engine", None)
-        backend = getattr(engine, "backend", None)
-        if backend is None or backend.name != "numba":
-            return None
-        usual = FORWARD if backend.one_sided else DIFFERENCE[backend.precision]
-        return backend.difference or usual
-
-    def with_difference(self, step: float) -> Lanes:
-        """The same with central differences over another step."""
-        simulator: Any = self.simulator
-        backend = simulator.engine.backend._replace(difference=step)
-        return Lanes(simulator.with_backend(backend), self.marker_index, self.width, fields=self.fields)
+    def with_difference(self, step: float) -> Self:
+        """The same with differences over another step."""
+        changed = copy.copy(self)
+        changed.difference = step
+        return changed
 
     @cached_property
     def _rolled(self) -> Any:
@@ -154,7 +155,8 @@ class Lanes:
 
 
 class RoutedLanes(Lanes):
-    """Two simulators of one model: a fast one for all that it can do, another for rollouts with further candidates.
+    """Two compiled simulators of one model: a fast one for all that it can do, another for rollouts with further
+    candidates.
 
     Args:
         fast: lanes of the simulator without these candidates.
@@ -163,26 +165,11 @@ class RoutedLanes(Lanes):
     """
 
     def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
-        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.slope_rollouts, slow.fields)
+        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.fields, slow.costly)
         self.fast, self.slow = fast, slow
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
-        self.null = null
         self._null = np.array([null[self.physical[i]] for i in self._further])
-
-    @property
-    def costly(self) -> tuple[str, ...]:
-        """See `Lanes.costly`."""
-        return tuple(self.physical[i] for i in self._further)
-
-    @property
-    def difference(self) -> float | None:
-        """See `Lanes.difference`."""
-        return self.fast.difference
-
-    def with_difference(self, step: float) -> Lanes:
-        """See `Lanes.with_difference`."""
-        return RoutedLanes(self.fast.with_difference(step), self.slow.with_difference(step), self.null)
 
     def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
@@ -196,33 +183,13 @@ class RoutedLanes(Lanes):
         steps: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
         """See `Lanes.roll`."""
-
-        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> tuple[Fields, np.ndarray]:
-            return lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check, steps)
-
-        return self._routed(self._needs_slow(theta), run)
-
-    def differentiate(
-        self,
-        theta: Thetas,
-        tangent: Thetas,
-        start: np.ndarray,
-        commands: Commands,
-        check: Callable[[], None] = _no_limit,
-    ) -> Fields:
-        """See `Lanes.differentiate`."""
-
-        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> Fields:
-            points, directions = theta[chosen][:, kept], tangent[chosen][:, kept]
-            return lanes.differentiate(points, directions, start[chosen], commands.of(chosen), check)
-
-        return self._routed(self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1), run)
-
-    def _routed(self, slow: np.ndarray, run: Callable[[Lanes, np.ndarray, Any], Any]) -> Any:
-        """Results of the two simulators for their lanes, merged."""
+        slow = self._needs_slow(theta)
         routes = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
-        order = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes])
-        found = [run(lanes, np.flatnonzero(mask), kept) for mask, lanes, kept in routes if mask.any()]
+        order, found = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []
+        for mask, lanes, kept in routes:
+            if mask.any():
+                chosen = np.flatnonzero(mask)
+                found.append(lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check, steps))
         return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *found)
 
 
@@ -341,9 +308,19 @@ class Forward:
         """Derivatives of `observe` for data fields along a direction at each point; one-sided for one-sided mechanisms
         at null.
         """
-        theta = self.coordinates.physical_values(points, self.slots)
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
-        flat, start, commands = self._per_lane(theta, points)
+        step = self._difference
+        found = self._exact(points, tangent) if step is None else self._differences(points, directions, step)
+        return found | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+
+    @property
+    def _difference(self) -> float | None:
+        """See `Lanes.difference`."""
+        return self.lanes.difference
+
+    def _exact(self, points: Points, tangent: np.ndarray) -> Fields:
+        """Derivatives by JAX."""
+        flat, start, commands = self._per_lane(self.coordinates.physical_values(points, self.slots), points)
         along = tangent.reshape(flat.shape)
         # Recordings that a direction does not affect, such as another group's, are unchanged.
         moved = np.flatnonzero(along.any(axis=1))
@@ -357,7 +334,26 @@ class Forward:
             every = np.zeros((len(flat), *part.shape[1:]))
             every[moved] = np.nan_to_num(part)
             shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
-        return shown | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+        return shown
+
+    def _differences(self, points: Points, directions: Points, step: float) -> Fields:
+        """Differences over a step in prior deviations: to one side if it is small, and at bounds; zero if a rollout
+        fails.
+        """
+        low, high = self.coordinates.bounds
+        size = step / np.maximum(np.abs(directions / self.coordinates.prior_sd).max(axis=1), np.finfo(float).tiny)
+        move = size[:, None] * directions
+        ahead, behind = (((x >= low) & (x <= high)).all(axis=1) for x in (points + move, points - move))
+        behind &= ~ahead | (step > STEP)
+        ends = np.concatenate([points - behind[:, None] * move, points + ahead[:, None] * move])
+        seen, fine = self.observe(ends)
+        usable = fine.reshape(2, -1).all(axis=0) & (ahead | behind)
+        share = np.where(usable, 1.0 / (np.maximum(ahead.astype(float) + behind, 1.0) * size), 0.0)
+        shown = {}
+        for name in self.lanes.fields:
+            before, after = np.split(seen[name], 2)
+            shown[name] = np.nan_to_num(after - before) * share.reshape(-1, *[1] * (before.ndim - 1))
+        return shown
 
     def _offset(self, theta: np.ndarray) -> np.ndarray:
         found = np.zeros((*theta.shape[:2], 3))
