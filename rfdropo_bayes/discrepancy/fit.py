@@ -21,6 +21,7 @@ from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.noise.autoregression import MISFIT
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.scopes import Scopes
@@ -423,8 +424,20 @@ def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: 
     slope, _ = climbed.quadratic(u)
     slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
     promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
-    evidence = found.log_evidence + float(np.sum(inside))
+    evidence = found.log_evidence + float(np.sum(inside)) + _over_sizes(target, residual)
     return Fit(posterior.place(u[None])[0], free, residual, -jacobian, found.covariance, evidence, promise)
+
+
+def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
+    """Change of a log evidence [nat] by integrating over the size of a misspecified model's residuals; 0 at the assumed
+    size.
+    """
+    series, found = target.measurements.series(residual), 0.0
+    for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
+        if part.source == MISFIT:
+            share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
+            found += 0.5 * part.freedom * (share - 1.0 - np.log(share))
+    return found
 
 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:

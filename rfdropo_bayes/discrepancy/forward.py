@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -20,15 +19,15 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.journal import digest
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
+from rfdropo_bayes.runtime import available_processors
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
-# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
-# shares common work of lanes, such as padding and the value beside its slopes: of 16, 32, 48 and 64 lanes, 48 took the
-# least time for the Jacobians of both real robots, two thirds of the time with 16.
-WIDTH = 48
-NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
+# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. Calls with few
+# different lanes are the most frequent.
+WIDTH = 8 * max(available_processors(), 2)
+KEPT = 64  # points, at most, of which the last observations are kept
 # Step of a derivative of a compiled engine in prior deviations, one-sided; a larger step is taken to both sides. The
 # rounding of 1e-13 m then errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
 STEP = 1e-4
@@ -50,7 +49,7 @@ class Lanes:
     Args:
         simulator: simulator with the base model's mechanisms and every candidate at its null value.
         marker_index: indices of its measured markers.
-        width: lanes per call, with the last call of a batch padded; None for the engine's choice.
+        width: lanes per call, with the last call of a batch padded.
         fields: parts of an observation that are data; if the pose of an object is included, its start is an input.
         costly: parameters of which rollouts take longer than others.
 
@@ -62,16 +61,17 @@ class Lanes:
         self,
         simulator: Simulator,
         marker_index: np.ndarray,
-        width: int | None = None,
+        width: int = WIDTH,
         fields: Sequence[str] = ("position",),
         costly: Sequence[str] = (),
     ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
         backend = getattr(getattr(simulator, "engine", None), "backend", None)
-        self.width = width or (NARROW if backend is not None and backend.name == "jax" else WIDTH)
+        self.width = width
         self.fields = tuple(fields)
         self.costly = tuple(costly)
+        self._size: tuple[int, int] | None = None
         self.difference: float | None = None
         if backend is not None and backend.name == "numba":
             self.difference = STEP if backend.precision == "float64" else COARSE
@@ -137,9 +137,25 @@ class Lanes:
         ``start`` (lane, 7) are initial poses of an object. ``check`` is called before every batch, and may raise. After
         ``steps`` time steps, all by default, rows are meaningless.
         """
-        limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
-        lanes = (theta, start, commands)
-        return in_chunks(lambda own: self._rolled(*own, limit), lanes, (self.width,), before=check)
+        limit, rows = jnp.asarray(commands.step.shape[1] if steps is None else steps), commands.sample_step.shape[1]
+        lanes = (theta, start, self._as_long(commands))
+        found, status = in_chunks(lambda own: self._rolled(*own, limit), lanes, (self.width,), before=check)
+        return {name: part[:, :rows] for name, part in found.items()}, status
+
+    def _as_long(self, commands: Commands) -> Commands:
+        """Commands with steps and rows that are not computed, as many as in the first call: of shorter recordings, the
+        program is not compiled again.
+        """
+        given = commands.step.shape[1], commands.sample_step.shape[1]
+        self._size = self._size or given
+        steps, rows = (most - own for most, own in zip(self._size, given, strict=True))
+        if commands.signals is not None or min(steps, rows) < 0 or steps == rows == 0:
+            return commands
+        return commands._replace(
+            step=np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
+            sample_step=np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
+            sample_fraction=np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
+        )
 
     def differentiate(
         self,
@@ -227,6 +243,7 @@ class Forward:
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
         self.compiling = 0.0  # seconds that rollouts took to compile
+        self._recent: tuple[dict[bytes, int], Fields, np.ndarray] = ({}, {}, np.zeros(0))
 
     @cached_property
     def identity(self) -> str:
@@ -259,7 +276,7 @@ class Forward:
     def _with(self, **parts: Any) -> Forward:
         changed = copy.copy(self)
         changed.__dict__.pop("identity", None)
-        changed.__dict__.update(parts)
+        changed.__dict__.update(parts, _recent=({}, {}, np.zeros(0)))
         return changed
 
     def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:
@@ -271,6 +288,10 @@ class Forward:
         channels that rollouts do not use.
         """
         points = np.atleast_2d(points)
+        places, seen, fine = self._recent
+        if all(point.tobytes() in places for point in points):  # an optimisation asks for a value after its slopes
+            index = [places[point.tobytes()] for point in points]
+            return {name: part[index] for name, part in seen.items()}, fine[index]
         theta = self.coordinates.physical_values(points, self.slots)
         flat, start, commands = self._per_lane(theta, points)
         beside = np.repeat(self._beside(points), self.count, axis=0)
@@ -290,7 +311,10 @@ class Forward:
             fine &= np.isfinite(found[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
         shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()}
         shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
-        return shown, fine.reshape(len(points), -1).all(axis=1)
+        fine = fine.reshape(len(points), -1).all(axis=1)
+        if rows is None and len(points) <= KEPT:
+            self._recent = {point.tobytes(): i for i, point in enumerate(points)}, shown, fine
+        return shown, fine
 
     def observe_one(self, point: Float[np.ndarray, " d"]) -> Fields:
         """Observations of every recording at one point.
