@@ -36,7 +36,7 @@ from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
 ALL = 40  # most steps of a full optimisation
-USUAL = 12  # steps of an optimisation, each with a Jacobian
+USUAL = 8  # steps of an optimisation, each with a Jacobian
 TOLERANCE = 0.01  # predicted gain of a step [nat] at the end of an optimisation
 CLOSE = 1e-3  # of the squared misfit: optimisations end at steps with less than a thousandth of it
 SEARCHED = 3  # steps of an optimisation in a search: a linear model needs one or two, the demonstration's arm five
@@ -127,6 +127,7 @@ class FitTarget:
     def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
         """A computation with this target, from the journal if stored; its rollouts and seconds count in both cases."""
         before, looked_up = self.forward.rollouts, True
+        self.forward.forget()
 
         def counted() -> Arrays:
             nonlocal looked_up
@@ -136,6 +137,7 @@ class FitTarget:
 
         found = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
         self.forward.rollouts = before + int(found.pop("rollouts"))
+        self.forward.forget()
         seconds = float(found.pop("seconds", 0.0))
         if looked_up:
             self.forward.deadline.recall(seconds)

@@ -243,6 +243,10 @@ class Forward:
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
         self.compiling = 0.0  # seconds that rollouts took to compile
+        self.forget()
+
+    def forget(self) -> None:
+        """Compute again what was observed last: rollouts then do not depend on what was looked up before."""
         self._recent: tuple[dict[bytes, int], Fields, np.ndarray] = ({}, {}, np.zeros(0))
 
     @cached_property
@@ -276,7 +280,8 @@ class Forward:
     def _with(self, **parts: Any) -> Forward:
         changed = copy.copy(self)
         changed.__dict__.pop("identity", None)
-        changed.__dict__.update(parts, _recent=({}, {}, np.zeros(0)))
+        changed.__dict__.update(parts)
+        changed.forget()
         return changed
 
     def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:

@@ -217,7 +217,7 @@ class PortedForward(Forward):
         self.coordinates = with_terms(forward.coordinates, terms)
         added = np.full((len(forward.slots), len(self._own)), -1)
         self.slots = np.concatenate([forward.slots, added], axis=1)
-        self._recent = {}, {}, np.zeros(0)
+        self.forget()
 
     @cached_property
     def identity(self) -> str:

@@ -224,7 +224,7 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
     resumed = audit(asked, journal=Journal(tmp_path, resume=True))
     again, calls[:] = len(calls), []
     whole = audit(asked, journal=Journal(tmp_path / "other"))
-    assert again < 0.7 * len(calls)
+    assert again < 0.9 * len(calls)
     # What the first part took counts: a resumed audit that looks nearly all up has a longer account than its own time.
     assert sum(resumed.cost.profile.values()) == resumed.cost.seconds
     assert {"base model", "screening", "joint test", "refits", "gain"} <= set(resumed.cost.profile)
