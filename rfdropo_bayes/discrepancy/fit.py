@@ -45,7 +45,7 @@ CLIMBED = 0.1
 POLLED = (0.3, 0.03, 0.003)  # trial deviations of the prior to each side of an optimum
 ALONG = (4.0, 2.0, 1.0, 0.3)  # trial deviations of the posterior along its principal axes
 WITHIN = 0.5 * max(ALONG) ** 2  # predicted gain [nat] of a step no longer than the trial steps
-FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
+FAILED = 1e6  # whitened residual of a rollout that failed: no step is ever taken there
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class FitTarget:
         """Measured less simulated readings at one point, in the unit of the noise.
 
         Raises:
-            InputError: a rollout there did not end well.
+            InputError: a rollout there failed.
         """
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 

@@ -329,7 +329,7 @@ class Forward:
         """
         found, fine = self.observe(point[None])
         if not fine[0]:
-            words = "a rollout at the optimum did not end well"
+            words = "a rollout at the optimum failed"
             raise NoLikelihoodError(words, where="audit", remedy=Result.DIVERGED.remedy)
         return {name: part[0] for name, part in found.items()}
 

@@ -88,7 +88,7 @@ def robot_of(spec: ModelSpec) -> Robot:
 
 
 def integrator_of(spec: ModelSpec) -> str | None:
-    """Integrator of time steps: as [simulator] says, or else the robot; "quasi-static" for a body at rest, None for a
+    """Integrator of time steps: from [simulator], or else from the robot; "quasi-static" for a body at rest, None for a
     black box."""
     if isinstance(spec.robot, BlackBox):
         return None
@@ -228,7 +228,7 @@ def check_spec(spec: ModelSpec, simulator: AnySimulator) -> None:
     """See that all that a model names are its parameters, and that priors can be priors of them.
 
     Raises:
-        InputError: a parameter that the model does not have, or a prior or a value that is none of its parameter.
+        InputError: a parameter that the model does not have, or a prior or a value that does not suit its parameter.
     """
     specs = model_specs(spec, simulator)
     for key in ("priors", "per_recording", "per_group", "only_in"):
@@ -281,7 +281,7 @@ def scoping(
     """The parameters of [model.only_in], with the recordings of each of their groups that has one to fit.
 
     Raises:
-        InputError: a name that is none of the simulator's parameters, one that has another scope or a fixed value as
+        InputError: a name that the simulator does not have, a name that has another scope or a fixed value as
             well, or a group that [model.groups] lacks.
     """
     check_used(spec.only_in, spec, simulator, where="[model.only_in]")

@@ -46,7 +46,7 @@ class LawTermTable(ExperimentTable):
     commands: list[str] = Field(default_factory=list, description="commands that the feature is made of")
     motion: list[str] = Field(
         default_factory=list,
-        description="in their place, at ports of the body: tip x, tip y, tip z or tip distance, from the first "
+        description="motion in their place, at ports of the body: tip x, tip y, tip z or tip distance, from the first "
         "position of the last marker",
     )
     shape: float | None = Field(
@@ -168,7 +168,7 @@ class SimulatorTable(ExperimentTable):
     )
     precision: Literal["float64", "float32"] = Field(
         default="float64",
-        description="of the compiled engine; stiff bodies lose their answer in float32",
+        description="floating-point precision of the compiled engine; stiff bodies lose their answer in float32",
     )
     time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
     integrator: Literal["euler", "sdirk2"] | None = Field(
@@ -177,7 +177,7 @@ class SimulatorTable(ExperimentTable):
         'converged motion than "euler", which takes one, as SOFA does; the robot\'s by default',
     )
     refine: int = Field(default=1, ge=1, le=16, description="cut every element of the robot's rod into this number")
-    threads: int | None = Field(default=None, ge=1, description="of the compiled engine; one per processor by default")
+    threads: int | None = Field(default=None, ge=1, description="threads of the engine; one per processor by default")
 
     @model_validator(mode="after")
     def _rests(self) -> SimulatorTable:
@@ -253,11 +253,11 @@ class CommandsTable(ExperimentTable):
 class NoiseTable(ExperimentTable):
     """[noise]: noise of marker positions whose size is known."""
 
-    standard_deviation: float = Field(ge=0.0, description="of one coordinate of one marker [m]")
+    standard_deviation: float = Field(ge=0.0, description="standard deviation of one coordinate of one marker [m]")
     correlation_time: float | None = Field(
         default=None,
         gt=0.0,
-        description="over which the noise forgets its sign [s]; white by default",
+        description="correlation time of the noise [s]; white by default",
     )
 
 
@@ -312,7 +312,7 @@ class Experiment(ExperimentTable):
         description="settings of another simulator: markers, channels, parameters and further keys of its adapter; "
         "see docs/your_simulator.md",
     )
-    seed: int = Field(default=0, description="of all that is random")
+    seed: int = Field(default=0, description="seed of all random numbers")
     title: str = Field(default="", description="heading of the report; the file's name by default")
     data: DataSpec | None = Field(default=None, description="the recordings")
     commands: CommandsTable | None = Field(

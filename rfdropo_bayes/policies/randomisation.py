@@ -207,7 +207,7 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     """The randomisation, if every value that it can give lies within the hard bounds of a parameter of the simulator.
 
     Raises:
-        InputError: an unknown parameter, or values outside its bounds; of a posterior the number of such draws is said.
+        InputError: an unknown parameter, or values outside its bounds, with the number of such draws of a posterior.
     """
     if isinstance(randomisation, Layers):
         for part in randomisation.parts:

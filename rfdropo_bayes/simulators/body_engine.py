@@ -66,7 +66,7 @@ EFFECT_SIZES = BodyEffects(
 QUASI_STATIC: Literal["quasi-static"] = "quasi-static"
 """Motion of a body that is at rest in every row."""
 FAR_WOUND = 10.0
-"""[m] No cable is wound in so far."""
+"""[m] Beyond the displacement of any cable."""
 CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
 FRICTION = 0.1
@@ -237,7 +237,7 @@ class Engine:
         return self._differentiable(inputs, limit)
 
     def section_loads(self, loads: BodySignals | None) -> SectionLoads | None:
-        """Signals on the body as the engine takes them, with the stations that forces act on; None for none."""
+        """Signals on the body as the engine takes them, with the stations that forces act on; None without signals."""
         return None if loads is None else SectionLoads(*loads, station=self.load_stations)
 
     def initial(

@@ -67,7 +67,7 @@ JITTER = 3.0
 
 
 def usable_difference(slope: Callable[[float], Float[np.ndarray, "..."]]) -> float:
-    """Smallest step of `LADDER` from which on slopes agree; the largest step if none agree.
+    """Smallest step of `LADDER` at and above which slopes agree; the largest step if none agree.
 
     A motion can be rough: smooth on the smallest scales, with slopes thousands of times the relevant slopes (a
     jittering body of tetrahedra). Rounding is also rough. A curved motion is not: slopes over the smallest step are

@@ -79,7 +79,7 @@ def test_a_step_that_is_held_is_told_from_a_motion_that_dies_away():
     assert recognised(recording(command, np.zeros(3))).rule == "zero"
     whole = recording(np.concatenate([np.zeros((10, 3)), command]), np.zeros(3))
     late = whole.slice_rows(14, 60)
-    assert recognised(late).why == "assumed: the first rows do not tell"
+    assert recognised(late).why == "assumed: the first rows do not decide"
     assert recognised(late).rule == "first"
 
 

@@ -155,7 +155,7 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     left = residual_dataset(answer)
     assert float((left.residual_last**2).mean()) < float((left.residual_base**2).mean())
     assert left.signal.sel(port="marker m3 x").shape == (2, left.sizes["signal_time"])
-    assert "What acts, and where" in render_audit(shown(answer), content, "toy", "")
+    assert "Law and port" in render_audit(shown(answer), content, "toy", "")
 
 
 @pytest.mark.parametrize(("left", "said"), [(1.0, "at marker tip x, of 0.002 m"), (30.0, "at marker tip x explains")])

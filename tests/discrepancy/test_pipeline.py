@@ -725,7 +725,7 @@ def test_of_many_sizes_the_surest_are_said_in_their_order():
 def test_a_tie_with_the_same_mechanism_in_another_group_is_said():
     alike = ["glue@april", "slip@april", "glue@june", "glue"]
     finding = {"mechanism": "glue", "group": "april", "parameters": {}, "relative": {}, "equivalence_class": alike}
-    assert "(not to be told from slip in april, glue in june, glue by these data)" in _named(finding)
+    assert "(indistinguishable from slip in april, glue in june, glue in these data)" in _named(finding)
 
 
 def test_what_a_class_would_explain_is_shown_by_marker_and_by_recording():

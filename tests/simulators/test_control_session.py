@@ -404,7 +404,7 @@ def test_laws_that_need_a_whole_rollout_are_refused():
     late = {"coefficient": "c", "feature": "command", "commands": ["left"], "scale": 1.0}
     for port, table, why in (
         ("stiffness", follows, "follows the motion"),
-        ("observation", late, "when markers are seen"),
+        ("observation", late, "times at which markers are seen"),
         ("command delay", late, "written for whole rollouts only"),
     ):
         if ports.named(port) is None:

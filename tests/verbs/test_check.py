@@ -376,7 +376,7 @@ def test_a_group_that_names_no_recording_is_doubtful(tmp_path):
     path = tmp_path / "own.toml"
     path.write_text(path.read_text() + '[model.groups]\nmonday = ["run", "runn_*"]\n')
     found = run_check(path, tmp_path / "pictures")
-    assert [doubt for doubt in found.doubts if "monday: 'runn_*' is the name of none" in doubt] == found.doubts
+    assert [doubt for doubt in found.doubts if "monday: 'runn_*' matches no recording" in doubt] == found.doubts
 
 
 @pytest.mark.parametrize(
