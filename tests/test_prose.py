@@ -109,6 +109,13 @@ def test_documents_are_plain() -> None:
     assert faults(re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", text, flags=re.DOTALL)) == []
 
 
+def test_reports_are_plain() -> None:
+    folders = ("reports", "examples", "models")
+    pages = [page for folder in folders for page in sorted((REPOSITORY / folder).rglob("README.md"))]
+    text = "\n\n".join(page.read_text(encoding="utf-8") for page in pages)
+    assert faults(re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", text, flags=re.DOTALL)) == []
+
+
 @pytest.mark.parametrize(
     ("text", "kind"),
     [

@@ -98,14 +98,11 @@ class Backend(NamedTuple):
         name: "numba" or "jax".
         precision: precision of "numba"; "jax" uses double precision.
         threads: threads of "numba"; None for all processors.
-        one_sided, difference: settings of derivatives of "numba", see `with_differences`.
     """
 
     name: Literal["numba", "jax"] = "numba"
     precision: Literal["float64", "float32"] = "float64"
     threads: int | None = None
-    one_sided: bool = False
-    difference: float | None = None
 
 
 class CubeInputs(NamedTuple):
@@ -295,8 +292,7 @@ class Engine:
 
     @cached_property
     def _differentiable(self) -> Any:
-        backend = self.backend
-        return with_differences(self._call, input_sizes, backend.precision, backend.one_sided, backend.difference)
+        return with_differences(self._call, input_sizes, self.backend.precision)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
         rows, cables = inputs.displacement.shape[0] + 1, inputs.displacement.shape[1]

@@ -185,7 +185,7 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
 
     monkeypatch.setattr(described_module, "law_search", lambda *_: Twice())
     said = []
-    found = list(describe(question, Named(search_of(question, target), base), None, said.append))
+    *_, found = describe(question, Named(search_of(question, target), base), None, said.append)
     assert found.holds
     assert [refit.term.port.name for refit in found.found.terms] == ["marker m3 x"]
     assert len(found.held_out.predictions) == 2
