@@ -4,7 +4,7 @@ Writes recordings as a laboratory has them: commands in counts of encoders, posi
 axis points up, columns of their own names. They are simulated, of an arm with four cables whose commands arrive 70 ms
 late, which no file mentions. Then every command that the README names is typed, from init to predict, and the axes that
 check offers are pasted into the experiment file. Prints words read, words typed and the time of each command, and fails
-if the audit does not name the delay, or if the prediction is off. See docs/your_robot.md.
+if the audit does not name the delay, or if the prediction is off. See docs/tutorial.md.
 
     python benchmarks/fifteen_minutes.py FOLDER [--look]        (6 minutes of one processor)
 """

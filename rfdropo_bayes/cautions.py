@@ -46,7 +46,7 @@ class Code(StrEnum):
     NO_SPREAD = "no_spread"
     """RF-DROPO's standard deviation is at its smallest value."""
     DRIVES_UNSTATED = "drives_unstated"
-    """The travel of drives is stated for other recordings, and for some that are used is not."""
+    """The travel of drives is stated for some recordings, but not for all used recordings."""
     FIRST_ROW_FAR = "first_row_far"
     """A first row is farther from the simulated one than the model was wrong in the fitted recordings."""
     FIRST_ROW_UNMATCHED = "first_row_unmatched"

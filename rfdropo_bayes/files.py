@@ -67,7 +67,7 @@ def matching_files(root: Path, wanted: Path) -> list[Path]:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A name to write to, which becomes ``path`` once the block has ended well; else nothing is left of it.
+    """A name to write to, which becomes ``path`` once the block has succeeded; else nothing is left of it.
 
     Raises:
         InputError: the file cannot be written, e.g. because the disk is full.

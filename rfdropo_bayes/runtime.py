@@ -34,7 +34,7 @@ def keep_callback_threads() -> None:
     """Give XLA's pool at least `CALLBACK_THREADS` threads, unless the user chose otherwise.
 
     A callback waits, in a thread of that pool, for a copy of its arguments by another thread of it. The pool has one
-    thread for each processor: on one processor two callbacks of one program wait for ever. The variable is read when
+    thread for each processor: on one processor two callbacks of one program wait forever. The variable is read when
     JAX first makes an array, and engines that use JAX do so when they are imported.
     """
     if available_processors() < CALLBACK_THREADS:
@@ -59,7 +59,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def refuse_lost_threads() -> None:
-    """Refuse to compute in a forked process that JAX's threads are missing in: it would wait for them for ever.
+    """Refuse to compute in a forked process that JAX's threads are missing in: it would wait for them forever.
 
     Raises:
         InputError: with the way out.
@@ -77,7 +77,7 @@ def configure_jax() -> None:
 
     Stiff finite-element solves lose their answer in float32. Operations that run ahead of a callback into the compiled
     engines can take the threads that the callback waits for: on two processors a rollout outside ``jax.jit`` then
-    hangs for ever.
+    hangs forever.
     """
     import jax
 

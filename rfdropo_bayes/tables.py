@@ -122,7 +122,7 @@ def set_entry(tables: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 def _follow(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], list[type[BaseModel]]]:
     """User's name of a location from pydantic, and the tables allowed there.
 
-    Pydantic puts the tag of a union, such as a shape's name, between the keys; the file has none there.
+    Pydantic puts the tag of a union, such as a shape's name, between the keys; the file has no such key.
     """
     path: list[str] = []
     here: list[type[BaseModel]] = [schema]

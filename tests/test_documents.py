@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import shlex
 import subprocess
 import sys
 import typing
@@ -17,11 +18,19 @@ import jax
 import nbformat
 import numpy as np
 import pytest
+import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.inference import methods
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY / "tools"))
+
+import rooms  # noqa: E402
+
 DOCUMENTS = sorted({*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md"), *REPOSITORY.glob("*/*/README.md")})
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -223,6 +232,70 @@ def test_the_problem_of_a_document_is_inferred() -> None:
     time, data = scope["Line"].time, scope["Line"].data
     precision = 1.0 + time @ time / 0.1**2  # of a standard normal prior and noise of 0.1
     assert float(draws.mean()) == pytest.approx(float(time @ data / 0.1**2 / precision), abs=5.0 * precision**-0.5)
+
+
+WRITTEN = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md")])
+SHELL = re.compile(
+    r"```sh\n(.*?)```|((?:^    (?:rfdropo|python) .*\n)+)|`((?:rfdropo|python) [^`]+)`", re.DOTALL | re.MULTILINE
+)
+COMMANDS = get_command(app)
+(UsageError,) = typer.BadParameter.__bases__
+
+
+def commands_in(text: str, program: str) -> list[list[str]]:
+    """Words of the complete commands of a program in a page: in blocks, and in sentences with an argument."""
+    code = "\n".join(match[1] or match[2] or match[3].replace("\n", " ") for match in SHELL.finditer(text))
+    lines = re.findall(rf"^ *{program} (.+)$", re.sub(r"\\\n", " ", code), re.MULTILINE)
+    found = [shlex.split(line, comments=True) for line in lines]
+    return [words for words in found if len(words) > 1 and "..." not in words]
+
+
+def usage_error(words: list[str]) -> str:
+    """What the parser of the command line finds wrong; nothing is run."""
+    assert isinstance(COMMANDS, TyperGroup)
+    try:
+        context = COMMANDS.make_context("rfdropo", words)
+        name, command, rest = COMMANDS.resolve_command(context, words)
+        assert command is not None
+        command.make_context(name, rest, parent=context)
+    except UsageError as error:
+        return error.format_message()
+    return ""
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
+def test_commands_of_a_page_are_understood(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    wrong = [(words, said) for words in commands_in(text, "rfdropo") if (said := usage_error(words))]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
+def test_scripts_of_a_page_exist_with_their_options(page: Path) -> None:
+    for words in commands_in(page.read_text(encoding="utf-8"), "python"):
+        if words[0] == "-m":
+            sources = [*(REPOSITORY / "studies").glob("*.py")] if words[1] == "studies" else []
+        else:
+            sources = [REPOSITORY / words[0]]
+        known = set(re.findall(r"[\w-]+", "".join(source.read_text(encoding="utf-8") for source in sources)))
+        options = {word.partition("=")[0] for word in words if word.startswith("--")} if sources else set()
+        assert not {option for option in options if not known & {option, option[2:].replace("-", "_")}}, words
+
+
+def test_commands_that_do_not_exist_are_found() -> None:
+    assert "No such option" in usage_error(["calibrate", "a.toml", "--ouut", "runs"])
+    assert "Missing argument" in usage_error(["check", "--quick"])
+    assert usage_error(["calibrat", "a.toml"])
+    page = "`rfdropo check`, `rfdropo check a.toml`\n```sh\nrfdropo init a \\\n    --shape cone # note\npip x\n```\n"
+    assert commands_in(page, "rfdropo") == [["check", "a.toml"], ["init", "a", "--shape", "cone"]]
+
+
+def test_the_picture_of_the_rooms_is_drawn_from_the_imports() -> None:
+    page = rooms.PAGE.read_text(encoding="utf-8")
+    assert page == rooms.drawn(page, rooms.imports()), "run python tools/rooms.py"
+    imported = {"a": set(), "b": {"a"}, "c": {"a", "b"}}
+    assert rooms.needed(imported)["c"] == {"b"}
+    assert rooms.levels(imported) == {"a": 0, "b": 1, "c": 2}
 
 
 def test_every_page_of_the_site_is_in_its_navigation():

@@ -26,7 +26,6 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 DOCUMENTS = sorted(REPOSITORY.glob("*.md")) + sorted((REPOSITORY / "docs").rglob("*.md"))
 
 README = (REPOSITORY / "README.md").read_text()
-GUIDE = (REPOSITORY / "docs" / "guide.md").read_text()
 
 OWN_PATH = re.compile(r"(?<![\w./~$}])/(?:home|Users|root|work|tmp|mnt|farm)/\w")
 INDEX_OPTION = re.compile(r"--(?:extra-)?index[-]url|--find[-]links|--trusted[-]host")
@@ -115,9 +114,10 @@ def test_documented_rfdropo_commands_exist(document: Path) -> None:
     assert named <= known, f"{document.name} names {sorted(named - known)}"
 
 
-def test_the_experiment_in_the_guide_is_one(tmp_path: Path) -> None:
+def test_the_experiment_in_the_tutorial_is_valid(tmp_path: Path) -> None:
     """The example experiment is valid, and so is its [data] replaced by the example of a plain CSV."""
-    whole, plain = (tomllib.loads(text) for text in re.findall(r"```toml\n(.*?)```", GUIDE, flags=re.DOTALL))
+    pages = ((REPOSITORY / "docs" / f"{name}.md").read_text() for name in ("tutorial", "recordings"))
+    whole, plain = (tomllib.loads(re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)[0]) for page in pages)
     for name, tables in (("whole", whole), ("plain", whole | plain)):
         path = tmp_path / f"{name}.toml"
         path.write_text(tomli_w.dumps(tables))

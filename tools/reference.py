@@ -6,8 +6,10 @@ python tools/reference.py --check    # say which pages are not what the code say
 
 from __future__ import annotations
 
+import ast
 import collections.abc
 import dataclasses
+import inspect
 import json
 import sys
 import typing
@@ -22,11 +24,14 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from rfdropo_bayes.bayes.priors import FAMILIES, OPTIONAL
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.settings import Deployment
+from rfdropo_bayes.deployment.vendors import WITHOUT
 from rfdropo_bayes.inference.method_options import attributes_of
 from rfdropo_bayes.inference.methods import METHODS
+from rfdropo_bayes.mechanisms.features import KINDS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.assembly import measurement_specs
 from rfdropo_bayes.model.experiment import Experiment, NoiseModel
@@ -35,6 +40,7 @@ from rfdropo_bayes.model.model_spec import DataChannels
 from rfdropo_bayes.model.robot_listings import format_rows, robot_rows
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
+from rfdropo_bayes.simulators.adapters.mujoco_elements import ATTRIBUTES, Attribute
 from rfdropo_bayes.simulators.mechanisms import STAGES
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -53,6 +59,8 @@ def pages() -> dict[str, str]:
         "mechanisms.md": mechanisms_page(),
         "methods.md": methods_page(),
         "commands.md": commands_page(),
+        "cautions.md": cautions_page(),
+        "mujoco.md": mujoco_page(),
     }
 
 
@@ -68,6 +76,8 @@ def index_page() -> str:
         ("[mechanisms.md](mechanisms.md)", "every mechanism: cause, remedy, parameters, default priors, where it runs"),
         ("[methods.md](methods.md)", "every method of inference and its options"),
         ("[commands.md](commands.md)", "every command of `rfdropo` and its options"),
+        ("[cautions.md](cautions.md)", "every caution of a result, by its code"),
+        ("[mujoco.md](mujoco.md)", "every parameter of a MuJoCo model: address, unit, default prior"),
     ]
     return page("Reference", ["These pages are written from the code.", table(("Page", "What is in it"), rows)])
 
@@ -116,8 +126,11 @@ def deployment_page() -> str:
     """Keys of a deployment file."""
     parts = [
         "A deployment is one TOML file, in SI units unless a key says otherwise. Paths are relative to it. "
-        "[docs/deployment.md](../deployment.md) says what the keys are for.",
+        "[docs/deployment.md](../deployment.md) shows their use.",
         *(text for title, schema in tables_of(Deployment, "") for text in key_table(title, schema)),
+        "## Guards",
+        "`[drives] unguarded` may list these objects, if something else does the work of the missing guard.",
+        table(("Object", "Without it"), [(code(f"0x{index:04X}"), words) for index, words in sorted(WITHOUT.items())]),
     ]
     return page("The deployment file", parts)
 
@@ -144,14 +157,29 @@ def mechanisms_page() -> str:
                     [(code(row["parameter"]), *list(row.values())[1:]) for row in rows],
                 ),
             ]
+    parts += [
+        "## Features of laws",
+        "A [law at a port](../mechanisms.md#laws-at-ports) is a sum of coefficients times features of "
+        "commands u. The shape of a low pass and of a lag is a time constant [s], the shape of a play half its width.",
+        table(("Feature", "Commands", "Formula", "Shapes that audits try"), feature_rows()),
+    ]
     return page("Mechanisms", parts)
+
+
+def feature_rows() -> list[tuple[str, str, str, str]]:
+    """Features with the formula of two commands a and b."""
+    rows = []
+    for name, kind in KINDS.items():
+        formula = kind.formula.replace("{shape:.2g}", "shape").format("a", "b")
+        rows.append((code(name), str(kind.channels), code(formula), ", ".join(map(str, kind.shapes))))
+    return rows
 
 
 def methods_page() -> str:
     """Every method with its options."""
     parts = [
-        "`[inference] method` names one; its options stand beside it. [docs/inference.md](../inference.md) says which "
-        "to take. `rollouts` is the budget, 20000 where a file does not say, for every method that lists it."
+        "`[inference] method` names one; its options stand beside it. [docs/inference.md](../inference.md) helps to "
+        "choose. `rollouts` is the budget, 20000 by default, for every method that lists it."
     ]
     for name, method in METHODS.items():
         parts += [f"## {name}", first_paragraph(method.config.__doc__), option_table(method.config)]
@@ -161,13 +189,51 @@ def methods_page() -> str:
 def commands_page() -> str:
     """Every command with its options."""
     root: Any = typer.main.get_command(app)
-    parts = ["Bad input ends with status 2 and one line that says what to do; an interrupted run ends with status 3."]
+    parts = ["Bad input ends with status 2 and one line with a remedy; an interrupted run ends with status 3."]
     for name, command in walk(root, "rfdropo"):
         shown = [p for p in command.params if NO_HELP not in p.opts]
         rows = [(code(written(p)), default_of(p), p.help or "") for p in shown]
         parts += [f"## {name}", first_paragraph(command.help)]
         parts += [table(("Argument or option", "Default", "Meaning"), rows)] if rows else []
     return page("Commands", parts)
+
+
+def cautions_page() -> str:
+    """Every code with its meaning, which follows it in the class."""
+    (codes,) = ast.parse(inspect.getsource(Code)).body
+    assert isinstance(codes, ast.ClassDef)
+    texts = [inspect.cleandoc(node.value.value) for node in codes.body[1:] if isinstance(node, ast.Expr)]
+    rows = [(code(name), " ".join(text.split())) for name, text in zip(Code, texts, strict=True)]
+    parts = [
+        "A caution is a reason to doubt a result. Its sentence has the numbers and a remedy; its code is for programs. "
+        "Do not use the draws of a fit with a grave caution.",
+        table(("Code", "Meaning"), rows),
+    ]
+    return page("Cautions", parts)
+
+
+def mujoco_page() -> str:
+    """Every attribute of every kind of element."""
+    rows = [
+        (code(f"{kind}/{'' if kind == 'option' else 'NAME/'}{name}"), *unit_and_prior(attribute), attribute.words)
+        for kind, attributes in ATTRIBUTES.items()
+        for name, attribute in attributes.items()
+    ]
+    parts = [
+        "`[adapter.parameters]` names [parameters](../your_simulator.md) by their address. `*` in a "
+        "name makes a factor on all that match. Units and scales of joints are for linear and rotational joints. A "
+        "positive quantity that is zero in the file has a half-normal prior of the scale.",
+        table(("Address", "Unit", "Default prior about the value in the file", "Scale", "Meaning"), rows),
+    ]
+    return page("Parameters of MuJoCo models", parts)
+
+
+def unit_and_prior(attribute: Attribute) -> tuple[str, str, str]:
+    """Unit, default prior and scale of a MuJoCo attribute."""
+    unit = attribute.unit if isinstance(attribute.unit, str) else " or ".join(attribute.unit)
+    typical = attribute.typical if isinstance(attribute.typical, tuple) else (attribute.typical,)
+    prior = "Normal" if attribute.signed else f"LogNormal, sigma {attribute.sigma:g}"
+    return unit, prior, " or ".join(f"{scale:g}" for scale in typical)
 
 
 def walk(command: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -113,7 +113,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         if not page.endswith(".md"):
             continue
         for match in LINK.finditer(CODE.sub("", text_of(page))):
-            found = target(page, match[2] or "")
+            found = target(page, match[2]) if match[2] else None
             if found and site_path(found) is None and (where := f"repository/{found}") not in known:
                 known.add(where)
                 files.append(File.generated(config, where, abs_src_path=str(ROOT / found)))

@@ -107,7 +107,7 @@ class CalibrationProblem:
 
     @cached_property
     def physical_names(self) -> tuple[str, ...]:
-        """Parameters that the simulation depends on, and standard deviations of such."""
+        """Parameters of the simulation, and their standard deviations between groups."""
         physical = {spec.name for spec in self.model.simulator.parameters}
         every = self.model.scopes.parameters
         return tuple(p.name for p in every if p.physical in physical or p.name in self.scales)

@@ -207,7 +207,7 @@ def table_of(prior: Any, *, where: str) -> dict[str, Any]:
 
 
 def _table(prior: dist.Distribution, where: str) -> dict[str, Any] | None:
-    """The table of a distribution of one element; None if there is none."""
+    """The table of a distribution of one element; None for other distributions."""
     if type(prior) in KINDS:
         family, names = KINDS[type(prior)]
         return {"distribution": family, **{name: _plain(getattr(prior, name), name, where) for name in names}}
@@ -228,7 +228,7 @@ def _table(prior: dist.Distribution, where: str) -> dict[str, Any] | None:
 
 
 def _through(table: dict[str, Any], transform: transforms.Transform, where: str) -> dict[str, Any] | None:
-    """The table of a transformed distribution; None if there is none."""
+    """The table of a transformed distribution; None for other distributions."""
     family = table["distribution"]
     if isinstance(transform, transforms.ExpTransform):
         if family == "Normal":

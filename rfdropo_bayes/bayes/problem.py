@@ -30,7 +30,7 @@ from rfdropo_bayes.posteriors import DrawsByOwner
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
-# Arrays of JAX or of NumPy: a problem takes and returns either.
+# Arrays of JAX or of NumPy: a problem takes and returns both.
 Values = Mapping[str, Float[Any, " n"]]
 
 
@@ -154,7 +154,7 @@ class WarmStart(Problem, Protocol):
     """A problem with starting points beside its prior.
 
     Attributes:
-        earlier: draws of an earlier posterior, by parameter and owner; empty without one.
+        earlier: draws of an earlier posterior, by parameter and owner; empty without an earlier posterior.
     """
 
     @property
@@ -285,7 +285,7 @@ def with_rollouts(problem: Problem) -> RolloutProblem:
     """A problem for a method that learns from rollouts.
 
     Raises:
-        InputError: it has none.
+        InputError: the problem does not have them.
     """
     if not isinstance(problem, RolloutProblem):
         raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')

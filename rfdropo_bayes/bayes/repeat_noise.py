@@ -20,7 +20,7 @@ from rfdropo_bayes.errors import InputError
 CLOCKS_AGREE = 0.1  # of a sample time: largest difference of the clocks of repeats
 SURE = 1e-4  # p-value under the noise within recordings, below which shifts are there
 LEAST = 0.5  # of the noise's standard deviation: smaller differences change no conclusion
-ROWS = 10  # fewer tell no constant from slow noise
+ROWS = 10  # fewer rows do not distinguish a constant from slow noise
 
 Groups = tuple[tuple[int, ...], ...]
 """Indices of the recordings in each group of repeats."""

@@ -46,7 +46,7 @@ class Scopes:
         fixed: Mapping[str, float],
         held: Sequence[tuple[ParameterInfo, float]] = (),
     ) -> Scopes:
-        """The parameters of a posterior; to which recordings a group belongs is said by `extended`.
+        """The parameters of a posterior; `extended` has the recordings of each group.
 
         Args:
             infos: facts about the inferred parameters.
@@ -230,7 +230,7 @@ class Scopes:
             spec = next((p.spec for p in shared if p.spec.name == name), None)
             if spec is None:
                 raise InputError(
-                    f"{name} differs between groups about a value that all share, and has none",
+                    f"{name} differs between groups about a shared value, but has no shared value",
                     where="[model.per_group]",
                     remedy="give it a prior, and calibrate again",
                 )
@@ -350,7 +350,7 @@ def build_scopes(
         alone = name in per_recording
         if name not in priors or alone:
             raise InputError(
-                f"{name} differs between groups about a value that all share, and has none",
+                f"{name} differs between groups about a shared value, but has no shared value",
                 where="[model.per_group]",
                 remedy="take it out of [model.per_recording]" if alone else "also name it under [model.priors]",
             )

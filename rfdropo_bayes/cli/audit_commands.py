@@ -89,7 +89,7 @@ def design(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Propose commands that tell causes apart. Writes next_commands.csv and design.json."""
+    """Propose commands that distinguish causes. Writes next_commands.csv and design.json."""
     see_calibration(fit, "--from")
     if adapt and fit is None:
         raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --from")

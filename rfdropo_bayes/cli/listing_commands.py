@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-ROBOT_HELP = "name of a robot, or path of a robot file: say more of it"
+ROBOT_HELP = "name of a robot, or path of a robot file, to describe"
 
 
 def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=ROBOT_HELP)] = None) -> None:
@@ -32,7 +32,7 @@ def mechanisms(
 
     if name is None:
         _show(mechanism_rows())
-        typer.echo("\nrfdropo mechanisms NAME says more: parameters, default priors, remedy.")
+        typer.echo("\nrfdropo mechanisms NAME describes a mechanism: parameters, default priors, remedy.")
     else:
         facts, parameters = mechanism_facts(name, robot)
         _say(facts)

@@ -8,13 +8,13 @@ from jaxtyping import Float
 REGULAR, NEAR = 0.7, 0.25
 """Commands come regularly if this share of their intervals is as near to the median, as a share of it."""
 FEWEST = 10
-"""Intervals from which a rate is told."""
+"""Least number of intervals that give a rate."""
 HOLE = 4.0
 """Multiple of the usual interval above which an interval is noted."""
 LOST = 0.04
-"""Share of commands that are lost one by one, from which on they are noted."""
+"""Share of commands that are lost one by one, at or above which they are noted."""
 ALTERNATING = 8
-"""Commands in a row that go to and fro between two others, from which on two programs are suspected."""
+"""Commands in a row that go to and fro between two others, at or above which two programs are suspected."""
 SAME = 0.2
 """Share of a change of command within which the command after the next one counts as equal."""
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 SHORT, LONG = 0.35, 0.6
 """Steps of a counter that wraps are shorter or longer than these shares of a turn, and none lies between."""
 FEWEST = 5
-"""Short steps without which nothing tells a turn from a command that jumps."""
+"""Short steps that are needed to distinguish a turn from a command that jumps."""
 SEVERAL = 2
 """Jumps that it takes to believe in a turn of no known counter."""
 EXCEPTIONAL = 3.0

@@ -93,7 +93,7 @@ def without_names(lines: Sequence[str], separator: str) -> bool:
 
 
 def units_above(rows: Sequence[str], separator: str) -> list[str] | None:
-    """The units that the line below the names tells, one for each column; None if it is a row of values."""
+    """The units in the line below the names, one for each column; None if it is a row of values."""
     if len(rows) < 2:
         return None
     cells = [cell.strip().strip('"').strip("[]() ") for cell in cells_of(rows[0], separator)]

@@ -131,7 +131,7 @@ class CsvTable:
         self.require(required)
 
     def _parse(self, lines: list[str], names: Sequence[str] | None = None) -> None:
-        """Read a header and rows; empty lines at the end are none."""
+        """Read a header and rows; empty lines at the end are ignored."""
         while lines and not lines[-1].strip():
             lines.pop()
         if not lines:

@@ -14,7 +14,7 @@ Five kinds, each with its pattern in the numbers:
   (a moved frame, an impact) is kept and counted among the *breaks*.
 - *renamed*: the place of a marker under the name of another (`identities`).
 
-At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: jumps cannot be told from it, none is masked.
+At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: no row is masked then.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def recognised(trajectory: Trajectory) -> Beginning:
         return Beginning("first", "the first command is zero")
     errors = beginning_errors(trajectory)
     if errors is None:
-        return Beginning("first", "assumed: the first rows do not tell")
+        return Beginning("first", "assumed: the first rows do not decide")
     first, zero = 1e3 * errors["first"], 1e3 * errors["zero"]
     said = (
         f"the first rows differ by {first:.2g} mm from a start at the first command, by {zero:.2g} mm from one at zero"

@@ -13,7 +13,7 @@ def shared_markers(trajectories: Sequence[Trajectory], markers: Sequence[str]) -
     """The robot's ``markers`` that every recording has, in the robot's order.
 
     Raises:
-        InputError: there is none.
+        InputError: no file matches.
     """
     for trajectory in trajectories:
         if not set(trajectory.marker_names) & set(markers):

@@ -43,7 +43,7 @@ def read_motive(path: Path) -> MotiveFile:
     """Read an export of Motive's.
 
     Raises:
-        InputError: it is none, has no row of axes or no positions, or is damaged (see `CsvTable`).
+        InputError: it is not an export of Motive, has no row of axes or no positions, or is damaged (see `CsvTable`).
     """
     lines = read_text(path).replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not lines[0].startswith(MOTIVE):

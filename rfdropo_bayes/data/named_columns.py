@@ -43,7 +43,7 @@ CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "V", 
 
 
 ROWS = "rows"
-"""In the place of a column of times: rows have none, and their number counts."""
+"""Stands for a column of times if rows have no times: the row number counts."""
 ROW_SECONDS = 1.0
 """Nominal time from row to row [s] of rows without times."""
 UNTIMED = "rows have no times: one a second is assumed, which means nothing but for poses at rest"
@@ -85,7 +85,7 @@ class CsvColumns(BaseModel):
     )
     time_unit: TimeUnit = Field(
         default="s",
-        description='unit of the times; dates and durations need none, nor do "rosbag" and "motive-csv": seconds',
+        description='unit of the times; dates, durations, "rosbag" and "motive-csv" need no unit',
     )
     sample_time: float | None = Field(
         default=None,
@@ -170,8 +170,8 @@ class CsvColumns(BaseModel):
     motor_angle_unit: Literal["rad", "deg", "counts"] = Field(default="rad", description="unit of the motor angles")
     unwrap: dict[str, float] = Field(
         {},
-        description="turn of the counter of each column of commands or motor angles that begins anew after a turn, in "
-        "the unit of the column, by its name: 4096 of an encoder, 360 of an angle in degrees",
+        description="size of a turn, by column, for commands or motor angles that begin anew after each turn; in the "
+        "unit of the column: 4096 of an encoder, 360 of an angle in degrees",
     )
     object_pose: list[str] | None = Field(
         default=None,
@@ -260,7 +260,7 @@ class CsvColumns(BaseModel):
 
     @property
     def left_handed(self) -> bool:
-        """Whether the file's frame is left-handed, as ``axes`` say."""
+        """Whether the file's frame is left-handed, by ``axes``."""
         return bool(np.linalg.det(axes_matrix(self.axes)) < 0.0)
 
     def factors(self, names: Sequence[str]) -> Float[np.ndarray, " column"]:

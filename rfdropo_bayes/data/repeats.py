@@ -91,7 +91,7 @@ def _variances(repeats: Sequence[Trajectory]) -> dict[str, float]:
     own = list(zip(repeats, columns, strict=True))
     position = np.stack([repeat.position[:rows, index] for repeat, index in own])
     weight = np.stack([repeat.position_mask[:rows, index] for repeat, index in own]).astype(float)
-    weight *= weight.sum(axis=0) >= 2  # a row seen once says nothing about spread
+    weight *= weight.sum(axis=0) >= 2  # a row seen once gives no spread
     count = weight.sum(axis=0)
     mean = (weight[..., None] * position).sum(axis=0) / np.maximum(count, 1.0)[..., None]
     square = (weight * ((position - mean) ** 2).sum(axis=-1)).sum(axis=(0, 1))

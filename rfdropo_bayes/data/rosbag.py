@@ -6,8 +6,8 @@ has no names: ``/joint_states.position[motor1]``, ``/tf.transforms[tip].transfor
 ``/rigid_bodies.rigidbodies[tip].pose.position.x``. Every message of numbers is read, even if only the bag defines its
 type.
 
-Times are header stamps if a topic has them, else the recorder's times of arrival; or the recorder's times for all
-topics. Elements with a header of their own, as transforms, have its stamps.
+The clock "header" takes header stamps, and times of arrival for topics without stamps. The clock "log" takes times of
+arrival for all topics. Elements with a header of their own, as transforms, have its stamps.
 """
 
 from __future__ import annotations

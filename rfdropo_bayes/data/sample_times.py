@@ -23,14 +23,14 @@ SHORT = 0.1  # share of the local interval below which a row came in one deliver
 BUNCHED = 0.1  # share of such rows above which stamps are of arrival
 LONGEST_WINDOW, SHORTEST_WINDOW = 100, 8  # rows that a local interval is a mean of: several deliveries
 JUMP = 10.0  # intervals: a longer interval is a jump of the clock, or lost rows
-COARSE = 0.1  # share of repeated stamps from which on the clock is coarser than the rows
+COARSE = 0.1  # share of repeated stamps at or above which the clock is coarser than the rows
 ONE_RATE = 1.1  # times between rows that differ by less are of the same rate: clocks jitter
-GRAIN = 0.02  # of the usual interval: stamps of single precision that are coarser are said
+GRAIN = 0.02  # of the usual interval: coarser stamps of single precision are reported
 ON_GRID = 0.2  # of the grain: largest distance of rounded stamps from single precision
 SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: range of recordings of a moving robot
 ANEW = 10.0
 """Gaps by which a clock that is set back has begun anew; by less, rows changed places."""
-SET_BACK = 0.01  # share of rows out of order up to which the clock was set back; else rows are not sorted
+SET_BACK = 0.01  # largest share of rows out of order after a clock that was set back; else rows are not sorted
 
 
 class Stamps(NamedTuple):
@@ -216,7 +216,7 @@ def _between(time: np.ndarray, short: np.ndarray) -> float:
 
 
 def rounded_notes(stamps: Stamps, time: Float[np.ndarray, " rows"]) -> list[str]:
-    """Stamps that were kept in single precision until they no longer told rows apart evenly; ``time`` in seconds."""
+    """Stamps in single precision that are too coarse to space rows evenly; ``time`` in seconds."""
     if stamps.ticks.dtype.kind != "f" or len(time) < SHORTEST_WINDOW:
         return []
     single = stamps.ticks.astype(np.float32)

@@ -46,7 +46,7 @@ class RecordingEntry(BaseModel):
     episodes: list[int] | None = Field(
         default=None, description="numbers of a LeRobotDataset's episodes; all by default"
     )
-    initial_command: InitialCommand = Field(default=None, description="as in [data], for this entry")
+    initial_command: InitialCommand = Field(default=None, description="command before the first row, as in [data]")
 
 
 class DataSpec(BaseModel):
@@ -54,7 +54,7 @@ class DataSpec(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    format: Format = Field(description="how the files are written")
+    format: Format = Field(description="format of the files")
     fit: list[RecordingEntry] = Field(min_length=1, description="recordings that a fit may see")
     test: list[RecordingEntry] = Field([], description="recordings that no fit sees")
     columns: CsvColumns | None = Field(
@@ -66,7 +66,7 @@ class DataSpec(BaseModel):
         default=None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"
     )
     missing: Literal["error", "mask"] = Field(
-        default="error", description="whether a lost marker position is an error or is left out"
+        default="error", description="treatment of lost marker positions: an error, or masked"
     )
     initial_command: InitialCommand = Field(
         default=None,

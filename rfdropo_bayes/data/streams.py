@@ -110,7 +110,7 @@ def one_frame(streams: Sequence[Stream], names: Sequence[str], where: str) -> No
     frames = {frame for name in names for stream in streams if name in stream.values for frame in stream.frames}
     if len(frames) > 1:
         raise InputError(
-            f"the positions are told in several coordinate frames: {', '.join(sorted(frames))}",
+            f"the positions are in several coordinate frames: {', '.join(sorted(frames))}",
             where=where,
             remedy="name positions of one frame; transforms are not chained",
         )

@@ -8,7 +8,7 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
 
 MANY = 20_000
-"""Rows from which on a copy with fewer rows is looked at in place of a recording."""
+"""Number of rows at or above which a thinned copy is examined in place of a recording."""
 LOOKED_AT = 50_000
 """Rows that show which rate a motion needs."""
 LIKE_NOISE, CLOSE = 1.6, 5e-3
@@ -23,7 +23,7 @@ FACTORS = tuple(digit * 10**power for power in range(4) for digit in (1, 2, 5))
 
 
 def needed_interval(run: Trajectory) -> float:
-    """The longest time between rows [s] at which a straight line from row to row tells the motion between them."""
+    """The longest time between rows [s] at which a straight line from row to row describes the motion between them."""
     time, mask = run.time[:LOOKED_AT], run.position_mask[:LOOKED_AT]
     position, step = run.position[:LOOKED_AT], sample_time(run.time)
     seen = [(time[good], position[good, marker]) for marker, good in enumerate(mask.T) if good.sum() > 2]

@@ -47,7 +47,7 @@ class Trajectory:
     - ``position(time, marker, axis)`` [m] and ``position_mask(time, marker)``: False for a recording fault; the value
       there is a finite placeholder that no likelihood may use;
     - ``command(command_time, cable)``, unit in its attribute ("m" or "rad"): cumulative command, pull > 0, unclipped,
-      piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last for ever;
+      piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last forever;
     - ``initial_command(cable)``: command before ``command_time[0]``, hence the initial state of the recording;
     - optionally ``tension(time, cable)`` [N] and its ``tension_mask``, False for a missing tension; ``motor_angle(time,
       cable)`` [rad] and its ``motor_angle_mask``, False for a missing or repeated reading; ``object_pose(time, pose)``
@@ -165,7 +165,7 @@ class Trajectory:
 
     @property
     def robot(self) -> str:
-        """Name of the robot description it was recorded on; empty if the file did not say."""
+        """Name of the robot that was recorded; empty if the file does not name it."""
         return str(self.dataset.attrs["robot"])
 
     @property

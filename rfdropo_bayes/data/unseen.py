@@ -46,8 +46,7 @@ def load_unseen(
         start: the file of observations, if it is another file; only one row is used.
         rows: keep observation rows first to last, both included; the start pose is then from row ``first``.
         begun: beginning of the fitted recordings, "zero" or "first" (`common_beginning`), if all begin by the same
-            rule;
-            it then applies to these commands unless [data] or the file has another.
+            rule; it then applies to these commands unless [data] or the file has another.
         episode: number of the episode, if the file of observations is a LeRobotDataset.
 
     Raises:
@@ -80,8 +79,9 @@ def load_unseen(
     else:
         entry = RecordingEntry(observations=commands, episodes=episodes)
     changes: dict[str, Any] = {"fit": [entry], "test": [], "resample": None, "missing": "mask"}
-    if spec.initial_command is None and spec.format in UNTOLD:
-        changes["initial_command"] = "first"  # not recognised: later rows would have a say
+    poses = spec.columns is not None and spec.columns.commands_with_poses
+    if spec.initial_command is None and spec.format in UNTOLD and not poses:
+        changes["initial_command"] = "first"  # recognition would use later rows
     recordings = load_recordings(changed(spec, where="[data]", **changes), base)
     if len(recordings) > 1:
         raise one_at_a_time(spec, commands, len(recordings), "predict")
@@ -97,6 +97,8 @@ def one_at_a_time(spec: DataSpec, name: str, number: int, verb: str) -> InputErr
 
 def _begun(whole: Trajectory, spec: DataSpec, begun: str | None) -> Trajectory:
     """With the command before the first row as [data], file, motors or fitted recordings have it; else the first."""
+    if whole.settings.get("settled_poses"):
+        return whole
     if spec.initial_command is not None or spec.format not in UNTOLD:
         return begun_from(whole, spec.initial_command)
     angle = angle_at_first(whole)

@@ -19,7 +19,7 @@ from jaxtyping import Float
 PRIORITY = 50  # SCHED_FIFO: above every ordinary process, below the kernel's own interrupt threads
 PLANT_PRIORITY = 30  # of a simulated robot: after everything that has a deadline
 _LOCK_ALL = 7  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT
-_SWITCH = 5e-4  # [s]: other threads of this process give the interpreter back after so long; 5 ms by default
+_SWITCH = 5e-4  # [s]: time after which another thread gives the interpreter back; 5 ms by default
 
 
 class Tick(NamedTuple):

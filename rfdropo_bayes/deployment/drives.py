@@ -519,7 +519,7 @@ class Drives:
         while waiting := [drive for drive in self.all if drive.node.nmt != NmtState.OPERATIONAL]:
             if time.monotonic() > end:
                 raise InputError(
-                    f"does not become OPERATIONAL (its heartbeat says {waiting[0].node.nmt})",
+                    f"does not become OPERATIONAL (its heartbeat reports {waiting[0].node.nmt})",
                     where=waiting[0].name,
                     remedy="power it off and on",
                 )

@@ -66,7 +66,7 @@ def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
     """Read the result of a homing.
 
     Raises:
-        InputError: if there is none, it is of another robot or other channels, or too old.
+        InputError: if the file is missing, too old, or of another robot or other channels.
     """
     where, again = f"homing {path}", "run `rfdropo deploy --mode home`"
     try:
@@ -107,7 +107,7 @@ class Homing:
         self.homes: tuple[Home, ...] = ()
 
     def __call__(self, loop: ControlLoop) -> None:
-        """Home every cable, one after the other, as often as the table says.
+        """Home every cable, one after the other, as often as the table asks.
 
         Raises:
             Stop: if a cable does not reach its tension within the caps on travel and time.

@@ -70,7 +70,7 @@ class SessionLog:
     Args:
         folder: folder to write to; it must not hold a session yet.
         robot: robot to drive.
-        facts: about the session, kept in the recording's settings.
+        facts: facts about the session, kept in the recording's settings.
         frames: name of the file of CAN frames; its ending chooses the format.
 
     Raises:
@@ -187,7 +187,7 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
     """Header and records of a session; a record that a crash cut short is left out.
 
     Raises:
-        InputError: if there is none, or it is no journal of ours.
+        InputError: if the journal is missing, or in another format.
     """
     path = Path(folder) / JOURNAL
     try:

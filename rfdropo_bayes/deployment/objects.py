@@ -138,7 +138,7 @@ class Nmt(IntEnum):
 
 
 class NmtState(IntEnum):
-    """States of a node, as its heartbeat tells them."""
+    """States of a node in its heartbeat."""
 
     BOOT_UP = 0
     STOPPED = 4

@@ -25,7 +25,7 @@ class Sighting(NamedTuple):
 
     Attributes:
         number: rises with every frame; 0 before the first.
-        time: when it came [s, monotonic].
+        time: time of arrival [s, monotonic].
         position: positions of the markers in the robot's base frame [m].
         seen: False for a lost marker, whose position is then invalid.
         object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen.
@@ -64,7 +64,7 @@ class SensorTable(BaseModel):
         origin_m: origin of the base frame in the sensor's frame.
         port: UDP port that a simulation sends to (simulated).
         stale_s: older frames count as lost.
-        lost_s: a policy that sees markers or the object ends if one of them is lost for this long.
+        lost_s: a policy that sees markers or the object ends if a marker or the object is lost for this long.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -68,7 +68,7 @@ class DrivesTable(_Table):
         return Units(self.torque_unit, self.speed_unit, self.acceleration_unit)
 
     def check_serial(self, channels: Sequence[str]) -> None:
-        """Raise an InputError that names the first of ``serial`` that is none of the robot's channels."""
+        """Raise an InputError that names the first of ``serial`` that is not a channel of the robot."""
         for channel in self.serial:
             if channel not in channels:
                 remedy = nearest(channel, channels)
@@ -137,7 +137,7 @@ class SafetyTable(_Table):
         )
 
     def guards(self, nodes: Collection[int]) -> Guards:
-        """For the drives of these ``nodes``: the master takes the highest number that is none of theirs."""
+        """For the drives of these ``nodes``: the master takes the highest free number."""
         return Guards(
             master_node=max(set(range(1, 128)) - set(nodes)),
             master_timeout_s=self.heartbeat_s,

@@ -50,7 +50,7 @@ _TOLD_COUNTS = {(0xB5, 0x03), (0xB5, 0x57)}
 
 
 def told_counts(word: int, counts_per_turn: float) -> float | None:
-    """Counts in one of the unit that an object 0x60A9 or 0x60AA tells; None for a unit that is not known here.
+    """Counts in one unit of an object 0x60A9 or 0x60AA; None for an unknown unit.
 
     The word is, from its highest byte: a power of ten, numerator, denominator, 0 (CiA 402-2; codes of CiA 303-2, as
     real data sheets have them: 0xB4 revolutions, 0xB5 counts, 0xC0 rpm, 0x03 s, 0x47 min, 0x57 s2).
@@ -97,7 +97,7 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
         where: location for messages.
 
     Raises:
-        InputError: if the drive tells another unit than is stated, or one that is not known here and none is stated.
+        InputError: if the drive has another unit than the stated unit, or an unknown unit without a stated unit.
     """
     told = told_counts(word, counts_per_turn) if word else None
     if stated is None and not word:
@@ -105,7 +105,7 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
     if stated is None:
         if told is None:
             raise InputError(
-                f"tells its accelerations in a unit that is not known here (0x60AA is 0x{word:08X})",
+                f"has an unknown unit of accelerations (0x60AA is 0x{word:08X})",
                 where=where,
                 remedy='look into its manual, and state [drives] acceleration_unit, "counts/s2" or "rpm/s"',
             )
@@ -113,7 +113,7 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
     found = counts_of(stated, counts_per_turn)
     if told is not None and not math.isclose(told, found):
         raise InputError(
-            f"tells another unit of accelerations (0x60AA is 0x{word:08X}) than {stated}",
+            f"has another unit of accelerations (0x60AA is 0x{word:08X}) than {stated}",
             where=where,
             remedy="leave [drives] acceleration_unit out, or correct it",
         )
@@ -138,7 +138,7 @@ def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: s
         return
     what = f"its rated torque is {found} {unit}, but {expected:.9g} {unit} in the robot file"
     if found == 0:
-        raise InputError(what, where=where, remedy="tell the drive which motor it has, with the vendor's own program")
+        raise InputError(what, where=where, remedy="set the motor of the drive with the vendor's own program")
     power = 3 * round(math.log10(found / expected) / 3.0)
     if power == 0 or not _agree(found, expected * 10.0**power):
         raise InputError(
@@ -151,7 +151,7 @@ def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: s
     remedy = (
         f'state [drives] torque_unit = "{fitting[0]}" if rated_torque_n_m = {torque_n_m:.9g} N m is right for the motor'
         if fitting
-        else f"write rated_torque_n_m in N m (it says {torque_n_m:.9g}), and the drive's unit in [drives] torque_unit"
+        else f"write rated_torque_n_m in N m (it is {torque_n_m:.9g}), and the drive's unit in [drives] torque_unit"
     )
     raise InputError(f"{what}: {times}, which is another unit, not another motor", where=where, remedy=remedy)
 
@@ -230,15 +230,15 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 
 WITHOUT: dict[int, str] = {
     Object.CONSUMER_HEARTBEAT: "it does not notice that the computer has died",
-    Object.ABORT_CONNECTION: "it does not stop when it notices that the computer has died",
-    Object.QUICK_STOP_OPTION: "it may let the cables go after a quick stop",
-    Object.QUICK_STOP_DECELERATION: "its quick stop brakes as it was set by somebody else",
+    Object.ABORT_CONNECTION: "it does not stop after the computer has died",
+    Object.QUICK_STOP_OPTION: "its quick stop may release the cables",
+    Object.QUICK_STOP_DECELERATION: "its quick stop brakes at an unknown rate",
     Object.POSITION_LIMIT: "it follows set-points beyond the ends of the travel",
     Object.FOLLOWING_WINDOW: "it does not notice that it lags behind its set-points",
-    Object.FOLLOWING_TIMEOUT: "it bears a lag behind its set-points for as long as was set by somebody else",
+    Object.FOLLOWING_TIMEOUT: "it tolerates a lag behind its set-points for an unknown time",
     Object.MAX_TORQUE: "it does not limit its torque, on which homing relies",
     Object.MAX_MOTOR_SPEED: "it does not limit its speed",
-    Object.RATED_TORQUE: "nobody notices a torque in another unit, or another motor",
+    Object.RATED_TORQUE: "a torque in another unit, or another motor, goes unnoticed",
 }
 """Guards that a drive may lack if its owner accepts the stated consequence."""
 
@@ -250,7 +250,7 @@ LEFT_OUT: dict[int, str] = WITHOUT | {
 """Consequence of each missing object that is set or read."""
 
 STRICTER_BELOW = {Object.FOLLOWING_WINDOW, Object.FOLLOWING_TIMEOUT, Object.MAX_TORQUE, Object.MAX_MOTOR_SPEED}
-"""Guards that a smaller value makes stricter: a drive that does not take so large a value gets its largest."""
+"""Guards that a smaller value makes stricter: a drive that rejects a large value gets its largest."""
 
 
 def check_guards(lacking: Collection[int], unguarded: Collection[int], where: str) -> None:

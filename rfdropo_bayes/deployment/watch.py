@@ -85,12 +85,12 @@ class Watch:
             if emergency.code == 0x8611:
                 raise Stop(Cause.FOLLOWING_ERROR, f"{drive} does not follow its set-points")
             if emergency.code:
-                raise Stop(Cause.EMERGENCY_MESSAGE, f"{drive} says 0x{emergency.code:04X}")
+                raise Stop(Cause.EMERGENCY_MESSAGE, f"{drive} reports 0x{emergency.code:04X}")
 
     def _check_life(self, drive: Drive, now: float) -> None:
         quiet = now - max(drive.node.heartbeat, self._started)
         if drive.node.nmt not in (None, NmtState.OPERATIONAL):
-            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.node.nmt})")
+            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat reports {drive.node.nmt})")
         if quiet > self._patience.heartbeat_s:
             raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
         if drive.unanswered > self._patience.stale_cycles:
@@ -109,7 +109,7 @@ class Watch:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
 
     def _check_lag(self, drive: Drive, now: float) -> None:
-        """A drive may repeat an old "operation enabled" for ever; only its lack of motion reveals it."""
+        """A drive may repeat an old "operation enabled" forever; only its lack of motion reveals it."""
         if drive.reading is None:
             return
         lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre

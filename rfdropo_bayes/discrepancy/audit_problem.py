@@ -59,7 +59,7 @@ class AuditProblem:
         return self.groups if self.groups is not None and self.groups.compared else None
 
     def candidate(self, name: str) -> Candidate | None:
-        """A candidate by its name; None for the mesh and time step, which are none of the library's."""
+        """A candidate by its name; None for the mesh and time step, which are not in the library."""
         return next((candidate for candidate in self.candidates if candidate.name == name), None)
 
     def group_of(self, name: str) -> str:

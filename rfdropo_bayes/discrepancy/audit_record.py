@@ -28,7 +28,7 @@ MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
 FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
-REFINE = "raise [simulator] refine and, of a motion, shorten its time_step"
+REFINE = "raise [simulator] refine and, if the robot moves, shorten time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
 
 

@@ -57,7 +57,7 @@ class Reached:
 
     def settled(self) -> tuple[FitTarget, Fit]:
         """Target and fit; a point that no fit has ended at takes a rollout of each recording, counts as not converged,
-        and says no more of the base parameters than their prior."""
+        and the base parameters keep their prior."""
         if self.fit is not None:
             return self.target, self.fit
         target, fit = self.target, _unfitted(self.target, self.x)

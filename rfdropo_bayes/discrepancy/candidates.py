@@ -19,7 +19,7 @@ LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
 WAY = np.geomspace(0.05, 1.5, 12)  # shares of the path from null to a trial shape
 NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
 NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
-SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
+SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in prior deviations; the slope at null shows small sizes
 UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
 
 

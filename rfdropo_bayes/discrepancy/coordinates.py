@@ -185,7 +185,7 @@ class Coordinates:
 
     @cached_property
     def _moved(self) -> Callable[[Float[Any, "n moved"]], tuple[Float[Any, "n moved"], Float[Any, "n moved"]]]:
-        """Values of the parameters that are moved unconstrained, and their derivatives."""
+        """Values and derivatives of the parameters that move in unconstrained coordinates."""
         transforms = [p.transform for p, affine in zip(self.space.parameters, self.affine, strict=True) if not affine]
 
         def values(u: Float[Array, "n moved"]) -> Float[Array, "n moved"]:

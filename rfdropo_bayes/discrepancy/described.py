@@ -135,7 +135,7 @@ def _needed(problem: AuditProblem, described: Described) -> list[str]:
     for step in reversed(described.steps):
         candidate = problem.candidate(step.name)
         own = np.intersect1d(candidate.indices, fit.free) if candidate is not None else np.zeros(0, dtype=int)
-        if not own.size:  # the finer mesh, whose parameters are none
+        if not own.size:  # the finer mesh, which has no parameters
             needed.append(step.name)
             continue
         start = fit.x.copy()

@@ -50,7 +50,7 @@ class Groups:
     @property
     def shifted(self) -> tuple[str, ...]:
         """Groups in which a value that all share may be another: of two groups without other recordings the second
-        alone, as the difference is the same, seen from either."""
+        alone, since the difference is the same for both."""
         return self.names[1:] if len(self.members) == 2 and not self.complements else self.names
 
     def recordings(self, scope: str) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ SCANNED = tuple((k + 0.5) / 32 for k in range(32))
 """Quantiles of the prior of a candidate's size that are tried as starts of an optimisation. The optimum of a delay of
 70 ms under a noise of 0.3 mm is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms.
 """
-TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
+TOLD_APART = 10.0  # nats: a refitted candidate that is worse by this difference is excluded from the class of the best
 # Nats of evidence that a parameter which the data fix costs under a prior twice as wide. Widths are chosen by hand: a
 # family of many parameters must not owe its place to that choice.
 WIDER = float(np.log(2.0))
@@ -177,7 +177,7 @@ class ExtensionSearch:
         clock, forward = self.target.forward.deadline, self.target.forward
         count = screening_rollouts(self.target, free)
         apart = 2.0 * forward.compiling if forward.lanes.costly and not without else 0.0  # of slow rollouts, and slopes
-        self.report(f"screening {len(free)} candidates: {count} rollouts, {about(count * forward.pace + apart)}")
+        self.report(f"score tests of {len(free)} candidates: {count} rollouts, {about(count * forward.pace + apart)}")
         with clock.stage("screening"):
             probes = probe_all(self.target, fit, free)
         if self.finer is not None and DISCRETISATION not in without:
@@ -188,7 +188,7 @@ class ExtensionSearch:
             names.append(DISCRETISATION)
         with clock.stage("joint test"):
             found = screen(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
-            if self.target.known is not None:  # whether anything is wrong, the noise of the measurement says
+            if self.target.known is not None:  # the joint test uses the noise of the measurement
                 return replace(found, omnibus=self._tested(fit, len(without)), finer=None)
             if found.finer is None:
                 return found

@@ -21,6 +21,7 @@ from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.noise.autoregression import MISFIT
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.scopes import Scopes
@@ -35,7 +36,7 @@ from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
 ALL = 40  # most steps of a full optimisation
-USUAL = 12  # steps of an optimisation, each with a Jacobian
+USUAL = 8  # steps of an optimisation, each with a Jacobian
 TOLERANCE = 0.01  # predicted gain of a step [nat] at the end of an optimisation
 CLOSE = 1e-3  # of the squared misfit: optimisations end at steps with less than a thousandth of it
 SEARCHED = 3  # steps of an optimisation in a search: a linear model needs one or two, the demonstration's arm five
@@ -44,7 +45,7 @@ CLIMBED = 0.1
 POLLED = (0.3, 0.03, 0.003)  # trial deviations of the prior to each side of an optimum
 ALONG = (4.0, 2.0, 1.0, 0.3)  # trial deviations of the posterior along its principal axes
 WITHIN = 0.5 * max(ALONG) ** 2  # predicted gain [nat] of a step no longer than the trial steps
-FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
+FAILED = 1e6  # whitened residual of a rollout that failed: no step is ever taken there
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,7 @@ class FitTarget:
     def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
         """A computation with this target, from the journal if stored; its rollouts and seconds count in both cases."""
         before, looked_up = self.forward.rollouts, True
+        self.forward.forget()
 
         def counted() -> Arrays:
             nonlocal looked_up
@@ -135,6 +137,7 @@ class FitTarget:
 
         found = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
         self.forward.rollouts = before + int(found.pop("rollouts"))
+        self.forward.forget()
         seconds = float(found.pop("seconds", 0.0))
         if looked_up:
             self.forward.deadline.recall(seconds)
@@ -167,7 +170,7 @@ class FitTarget:
         """Measured less simulated readings at one point, in the unit of the noise.
 
         Raises:
-            InputError: a rollout there did not end well.
+            InputError: a rollout there failed.
         """
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 
@@ -423,14 +426,26 @@ def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: 
     slope, _ = climbed.quadratic(u)
     slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
     promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
-    evidence = found.log_evidence + float(np.sum(inside))
+    evidence = found.log_evidence + float(np.sum(inside)) + _over_sizes(target, residual)
     return Fit(posterior.place(u[None])[0], free, residual, -jacobian, found.covariance, evidence, promise)
+
+
+def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
+    """Change of a log evidence [nat] by integrating over the size of a misspecified model's residuals; 0 at the assumed
+    size.
+    """
+    series, found = target.measurements.series(residual), 0.0
+    for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
+        if part.source == MISFIT:
+            share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
+            found += 0.5 * part.freedom * (share - 1.0 - np.log(share))
+    return found
 
 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:
     """Expected rollouts of an optimisation of ``parameters`` parameters."""
     forward = target.forward
-    return forward.count * USUAL * (1 + forward.lanes.slope_rollouts * parameters)
+    return forward.count * USUAL * (7 + forward.lanes.slope_rollouts * parameters)
 
 
 def best_between(

@@ -1,13 +1,12 @@
-"""Rollouts and their derivatives in batches of one size, so that two compilations suffice for an audit."""
+"""Rollouts and their derivatives in batches of one size, so that few compilations suffice for an audit."""
 
 from __future__ import annotations
 
 import copy
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,16 +19,19 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.journal import digest
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
+from rfdropo_bayes.runtime import available_processors
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
-# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
-# shares common work of lanes, such as padding and the value beside its slopes: of 16, 32, 48 and 64 lanes, 48 took the
-# least time for the Jacobians of both real robots, two thirds of the time with 16.
-WIDTH = 48
-NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
+# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. Calls with few
+# different lanes are the most frequent.
+WIDTH = 8 * max(available_processors(), 2)
+KEPT = 64  # points, at most, of which the last observations are kept
+# Step of a derivative of a compiled engine in prior deviations, one-sided; a larger step is taken to both sides. The
+# rounding of 1e-13 m then errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
+STEP = 1e-4
+COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
 
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
@@ -42,30 +44,37 @@ def _no_limit() -> None:
 
 
 class Lanes:
-    """A simulator behind two compiled functions of a fixed number of lanes.
+    """A simulator behind compiled functions of a fixed number of lanes.
 
     Args:
         simulator: simulator with the base model's mechanisms and every candidate at its null value.
         marker_index: indices of its measured markers.
-        width: lanes per call, with the last call of a batch padded; None for the engine's choice.
-        slope_rollouts: rollouts per derivative, including the value.
+        width: lanes per call, with the last call of a batch padded.
         fields: parts of an observation that are data; if the pose of an object is included, its start is an input.
+        costly: parameters of which rollouts take longer than others.
+
+    Attributes:
+        difference: step of derivatives in prior deviations, see `STEP`; None if derivatives are exact.
     """
 
     def __init__(
         self,
         simulator: Simulator,
         marker_index: np.ndarray,
-        width: int | None = None,
-        slope_rollouts: int = 3,
+        width: int = WIDTH,
         fields: Sequence[str] = ("position",),
+        costly: Sequence[str] = (),
     ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
         backend = getattr(getattr(simulator, "engine", None), "backend", None)
-        self.width = width or (NARROW if backend is not None and backend.name == "jax" else WIDTH)
-        self.slope_rollouts = slope_rollouts
+        self.width = width
         self.fields = tuple(fields)
+        self.costly = tuple(costly)
+        self._size: tuple[int, int] | None = None
+        self.difference: float | None = None
+        if backend is not None and backend.name == "numba":
+            self.difference = STEP if backend.precision == "float64" else COARSE
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
     def _observe(
@@ -88,25 +97,17 @@ class Lanes:
         return {name: part for name, part in found.items() if part is not None}, status
 
     @property
-    def costly(self) -> tuple[str, ...]:
-        """Parameters of which rollouts take longer than others."""
-        return ()
+    def slope_rollouts(self) -> int:
+        """Rollouts per derivative, beside those of the value."""
+        if self.difference is None:
+            return 3
+        return 1 if self.difference <= STEP else 2
 
-    @property
-    def difference(self) -> float | None:
-        """Relative step of its derivatives; None if they are exact."""
-        engine: Any = getattr(self.simulator, "engine", None)
-        backend = getattr(engine, "backend", None)
-        if backend is None or backend.name != "numba":
-            return None
-        usual = FORWARD if backend.one_sided else DIFFERENCE[backend.precision]
-        return backend.difference or usual
-
-    def with_difference(self, step: float) -> Lanes:
-        """The same with central differences over another step."""
-        simulator: Any = self.simulator
-        backend = simulator.engine.backend._replace(difference=step)
-        return Lanes(simulator.with_backend(backend), self.marker_index, self.width, fields=self.fields)
+    def with_difference(self, step: float) -> Self:
+        """The same with differences over another step."""
+        changed = copy.copy(self)
+        changed.difference = step
+        return changed
 
     @cached_property
     def _rolled(self) -> Any:
@@ -136,9 +137,25 @@ class Lanes:
         ``start`` (lane, 7) are initial poses of an object. ``check`` is called before every batch, and may raise. After
         ``steps`` time steps, all by default, rows are meaningless.
         """
-        limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
-        lanes = (theta, start, commands)
-        return in_chunks(lambda own: self._rolled(*own, limit), lanes, (self.width,), before=check)
+        limit, rows = jnp.asarray(commands.step.shape[1] if steps is None else steps), commands.sample_step.shape[1]
+        lanes = (theta, start, self._as_long(commands))
+        found, status = in_chunks(lambda own: self._rolled(*own, limit), lanes, (self.width,), before=check)
+        return {name: part[:, :rows] for name, part in found.items()}, status
+
+    def _as_long(self, commands: Commands) -> Commands:
+        """Commands with steps and rows that are not computed, as many as in the first call: of shorter recordings, the
+        program is not compiled again.
+        """
+        given = commands.step.shape[1], commands.sample_step.shape[1]
+        self._size = self._size or given
+        steps, rows = (most - own for most, own in zip(self._size, given, strict=True))
+        if commands.signals is not None or min(steps, rows) < 0 or steps == rows == 0:
+            return commands
+        return commands._replace(
+            step=np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
+            sample_step=np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
+            sample_fraction=np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
+        )
 
     def differentiate(
         self,
@@ -154,7 +171,8 @@ class Lanes:
 
 
 class RoutedLanes(Lanes):
-    """Two simulators of one model: a fast one for all that it can do, another for rollouts with further candidates.
+    """Two compiled simulators of one model: a fast one for all that it can do, another for rollouts with further
+    candidates.
 
     Args:
         fast: lanes of the simulator without these candidates.
@@ -163,26 +181,11 @@ class RoutedLanes(Lanes):
     """
 
     def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
-        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.slope_rollouts, slow.fields)
+        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.fields, slow.costly)
         self.fast, self.slow = fast, slow
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
-        self.null = null
         self._null = np.array([null[self.physical[i]] for i in self._further])
-
-    @property
-    def costly(self) -> tuple[str, ...]:
-        """See `Lanes.costly`."""
-        return tuple(self.physical[i] for i in self._further)
-
-    @property
-    def difference(self) -> float | None:
-        """See `Lanes.difference`."""
-        return self.fast.difference
-
-    def with_difference(self, step: float) -> Lanes:
-        """See `Lanes.with_difference`."""
-        return RoutedLanes(self.fast.with_difference(step), self.slow.with_difference(step), self.null)
 
     def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
@@ -196,33 +199,13 @@ class RoutedLanes(Lanes):
         steps: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
         """See `Lanes.roll`."""
-
-        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> tuple[Fields, np.ndarray]:
-            return lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check, steps)
-
-        return self._routed(self._needs_slow(theta), run)
-
-    def differentiate(
-        self,
-        theta: Thetas,
-        tangent: Thetas,
-        start: np.ndarray,
-        commands: Commands,
-        check: Callable[[], None] = _no_limit,
-    ) -> Fields:
-        """See `Lanes.differentiate`."""
-
-        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> Fields:
-            points, directions = theta[chosen][:, kept], tangent[chosen][:, kept]
-            return lanes.differentiate(points, directions, start[chosen], commands.of(chosen), check)
-
-        return self._routed(self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1), run)
-
-    def _routed(self, slow: np.ndarray, run: Callable[[Lanes, np.ndarray, Any], Any]) -> Any:
-        """Results of the two simulators for their lanes, merged."""
+        slow = self._needs_slow(theta)
         routes = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
-        order = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes])
-        found = [run(lanes, np.flatnonzero(mask), kept) for mask, lanes, kept in routes if mask.any()]
+        order, found = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []
+        for mask, lanes, kept in routes:
+            if mask.any():
+                chosen = np.flatnonzero(mask)
+                found.append(lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check, steps))
         return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *found)
 
 
@@ -260,6 +243,11 @@ class Forward:
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
         self.compiling = 0.0  # seconds that rollouts took to compile
+        self.forget()
+
+    def forget(self) -> None:
+        """Compute again what was observed last: rollouts then do not depend on what was looked up before."""
+        self._recent: tuple[dict[bytes, int], Fields, np.ndarray] = ({}, {}, np.zeros(0))
 
     @cached_property
     def identity(self) -> str:
@@ -293,6 +281,7 @@ class Forward:
         changed = copy.copy(self)
         changed.__dict__.pop("identity", None)
         changed.__dict__.update(parts)
+        changed.forget()
         return changed
 
     def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:
@@ -304,6 +293,10 @@ class Forward:
         channels that rollouts do not use.
         """
         points = np.atleast_2d(points)
+        places, seen, fine = self._recent
+        if all(point.tobytes() in places for point in points):  # an optimisation asks for a value after its slopes
+            index = [places[point.tobytes()] for point in points]
+            return {name: part[index] for name, part in seen.items()}, fine[index]
         theta = self.coordinates.physical_values(points, self.slots)
         flat, start, commands = self._per_lane(theta, points)
         beside = np.repeat(self._beside(points), self.count, axis=0)
@@ -323,7 +316,10 @@ class Forward:
             fine &= np.isfinite(found[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
         shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()}
         shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
-        return shown, fine.reshape(len(points), -1).all(axis=1)
+        fine = fine.reshape(len(points), -1).all(axis=1)
+        if rows is None and len(points) <= KEPT:
+            self._recent = {point.tobytes(): i for i, point in enumerate(points)}, shown, fine
+        return shown, fine
 
     def observe_one(self, point: Float[np.ndarray, " d"]) -> Fields:
         """Observations of every recording at one point.
@@ -333,7 +329,7 @@ class Forward:
         """
         found, fine = self.observe(point[None])
         if not fine[0]:
-            words = "a rollout at the optimum did not end well"
+            words = "a rollout at the optimum failed"
             raise NoLikelihoodError(words, where="audit", remedy=Result.DIVERGED.remedy)
         return {name: part[0] for name, part in found.items()}
 
@@ -341,9 +337,19 @@ class Forward:
         """Derivatives of `observe` for data fields along a direction at each point; one-sided for one-sided mechanisms
         at null.
         """
-        theta = self.coordinates.physical_values(points, self.slots)
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
-        flat, start, commands = self._per_lane(theta, points)
+        step = self._difference
+        found = self._exact(points, tangent) if step is None else self._differences(points, directions, step)
+        return found | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+
+    @property
+    def _difference(self) -> float | None:
+        """See `Lanes.difference`."""
+        return self.lanes.difference
+
+    def _exact(self, points: Points, tangent: np.ndarray) -> Fields:
+        """Derivatives by JAX."""
+        flat, start, commands = self._per_lane(self.coordinates.physical_values(points, self.slots), points)
         along = tangent.reshape(flat.shape)
         # Recordings that a direction does not affect, such as another group's, are unchanged.
         moved = np.flatnonzero(along.any(axis=1))
@@ -357,7 +363,26 @@ class Forward:
             every = np.zeros((len(flat), *part.shape[1:]))
             every[moved] = np.nan_to_num(part)
             shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
-        return shown | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+        return shown
+
+    def _differences(self, points: Points, directions: Points, step: float) -> Fields:
+        """Differences over a step in prior deviations: to one side if it is small, and at bounds; zero if a rollout
+        fails.
+        """
+        low, high = self.coordinates.bounds
+        size = step / np.maximum(np.abs(directions / self.coordinates.prior_sd).max(axis=1), np.finfo(float).tiny)
+        move = size[:, None] * directions
+        ahead, behind = (((x >= low) & (x <= high)).all(axis=1) for x in (points + move, points - move))
+        behind &= ~ahead | (step > STEP)
+        ends = np.concatenate([points - behind[:, None] * move, points + ahead[:, None] * move])
+        seen, fine = self.observe(ends)
+        usable = fine.reshape(2, -1).all(axis=0) & (ahead | behind)
+        share = np.where(usable, 1.0 / (np.maximum(ahead.astype(float) + behind, 1.0) * size), 0.0)
+        shown = {}
+        for name in self.lanes.fields:
+            before, after = np.split(seen[name], 2)
+            shown[name] = np.nan_to_num(after - before) * share.reshape(-1, *[1] * (before.ndim - 1))
+        return shown
 
     def _offset(self, theta: np.ndarray) -> np.ndarray:
         found = np.zeros((*theta.shape[:2], 3))

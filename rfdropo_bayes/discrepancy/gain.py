@@ -16,7 +16,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
-SPREAD_FROM = 3  # trajectories from which on their spread is part of the explained fraction's interval
+SPREAD_FROM = 3  # trajectories at or above which their spread is part of the explained fraction's interval
 CHANCE = 0.05  # probability that unseen trajectories seem to support an extension that is worth nothing
 # Nats by which densities of a few trajectories must differ to say anything: were the less likely model right, so large
 # a difference would come up in at most `CHANCE` of cases (Markov's inequality: the mean of the ratio is one).

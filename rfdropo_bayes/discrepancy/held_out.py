@@ -122,7 +122,7 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
     A model with a failed rollout of an unseen recording gives no prediction, and later models are not evaluated.
 
     Raises:
-        NoLikelihoodError: the first model's rollout does not end well.
+        NoLikelihoodError: the first model's rollout fails.
     """
     count, every = len(problem.trajectories), len(problem.model.recordings.names)
     fits, judges = [stage.fit for stage in stages], [stage.judge for stage in stages]

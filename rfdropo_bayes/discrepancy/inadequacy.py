@@ -3,7 +3,8 @@
 Under the measurement noise, any effect on the markers gains thousands of nats in a misspecified model: priors have no
 influence, and correlated noise weights wrong increments above wrong poses. While the residuals exceed `POOR` times the
 noise's variance, the model is fitted and extended under white noise of the size of its residuals. Rows are
-down-weighted by the residual correlation time. Repeats do not reduce a model's error: a mean of five counts once.
+down-weighted by the residual correlation time. Repeats do not reduce a model's error: a mean of five counts once. The
+size is unknown: evidences are integrated over it, so that a model that leaves a tenth beats a model that leaves a half.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ def _under(
     """The target under white noise of the size of errors, over the root of the weight of a row."""
     measured, parts, sizes = known.measurements, [], _sizes(known, errors)
     for own, share in zip(measured.columns, shares or [1.0] * len(measured.columns), strict=True):
-        parts.append(Autoregression(sizes[own] / np.sqrt(share), np.ones(1), MISFIT, np.inf))
+        counted = share * float(np.count_nonzero(measured.valid[..., own]))
+        parts.append(Autoregression(sizes[own] / np.sqrt(share), np.ones(1), MISFIT, counted))
     firsts = tuple((group[0],) for group in measured.members)
     once = replace(measured, count=np.minimum(measured.count, 1.0), members=firsts)
     return replace(known, noise=Stacked(tuple(parts)), measurements=once, known=known)

@@ -30,7 +30,7 @@ def unknown_record(answer: Answer) -> dict[str, Any]:
 
 
 def law_record(answer: Answer) -> dict[str, Any] | None:
-    """The law that was found, whether it holds or not; None without one."""
+    """The law that was found, whether it holds or not; None without a law."""
     described = answer.causes.described
     if described is None or described.last is None:
         return None
@@ -133,7 +133,7 @@ def _when(described: Described) -> str:
     members = described.found.map.members(term.port)
     size = np.sqrt(np.mean([row.mean**2 for row in described.found.ports if row.port in members], axis=(0, 1)))
     large = described.found.centre[size > 0.7 * size.max()]
-    return f", most from {large.min():.2g} to {large.max():.2g} s"
+    return f", most from {large.min():.4g} to {large.max():.4g} s"
 
 
 def _stand_ins(described: Described) -> str:
@@ -159,7 +159,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
     found = ", ".join(
         f"{tie.feature.formula(names)} at {tie.term.port.words}{in_words(tie.term.scope)}" for tie in ties
     )
-    return f" Not to be told from it by these data: {found}."
+    return f" Indistinguishable from it in these data: {found}."
 
 
 def ports_sentence(answer: Answer) -> str:

@@ -225,7 +225,7 @@ class Answer:
 
     @property
     def law(self) -> Described | None:
-        """The adopted law; None without one."""
+        """The adopted law; None without an adopted law."""
         found = self.causes.described
         return found if found is not None and found.holds else None
 
@@ -438,7 +438,7 @@ def _far_off(target: FitTarget, fit: Fit) -> str:
     noise, own = target.noise.first.scale, target.measurements.columns[0]
     left = spread(target, fit)[own]
     size, share = 1e3 * np.sqrt(3.0 * np.mean(left**2)), float(np.mean((left / noise) ** 2))
-    return f"; it is far off: judged under white noise of the {size:.2g} mm that it leaves; a row counts {share:.2g}"
+    return f"; it is misspecified: white noise of {size:.2g} mm, the size of its residuals; a row counts {share:.2g}"
 
 
 def _final_screen(last: Named) -> Screen:

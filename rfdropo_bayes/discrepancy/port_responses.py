@@ -18,9 +18,9 @@ from scipy.interpolate import BSpline
 
 from rfdropo_bayes.discrepancy.deadline import about
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
-from rfdropo_bayes.discrepancy.forward import Fields
+from rfdropo_bayes.discrepancy.forward import STEP, Fields
 from rfdropo_bayes.discrepancy.inadequacy import noise_share, rewhitened
-from rfdropo_bayes.discrepancy.port_rollouts import COARSE, FINE, STEP, FeatureTable, as_sensed, signals_of
+from rfdropo_bayes.discrepancy.port_rollouts import FeatureTable, as_sensed, signals_of
 from rfdropo_bayes.discrepancy.score import span
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
@@ -30,7 +30,9 @@ MOST_SPLINES = 40
 """Splines in a recording, of which each takes a rollout at every port; longer recordings get wider knots."""
 DEGREE = 3
 SHARE = 1e-3
-"""Share of a port's size by which a signal is perturbed; a hundred times as much in single precision."""
+"""Share of a port's size by which a signal is perturbed."""
+COARSE = 0.3
+"""The same for an engine in single precision, or with rough motion."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def _response(
     def compute() -> dict[str, np.ndarray]:
         forward, count = target.forward, len(signals)
         usual = forward.lanes.difference
-        step = port.size * (SHARE if usual is None or usual <= FINE else SHARE * COARSE / STEP)
+        step = port.size * (SHARE if usual is None or usual <= STEP else COARSE)
         lane = np.tile(np.arange(forward.count), count)
         w = np.moveaxis(step * signals.reshape(-1, *signals.shape[2:]), 1, 0)
         acting = list(zip(ports.members(port), w, strict=True))

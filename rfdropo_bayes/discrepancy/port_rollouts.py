@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
-from rfdropo_bayes.discrepancy.forward import Fields, Forward, Lanes, Points
+from rfdropo_bayes.discrepancy.forward import STEP, Fields, Forward, Lanes, Points
 from rfdropo_bayes.discrepancy.journal import digest
 from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import Feature, gauges_of, motion_dictionary
@@ -32,12 +32,6 @@ from rfdropo_bayes.simulators.robot_simulator import PASSES, RobotSimulator
 Signals = Float[np.ndarray, "lane row"]
 PREFIX = "law_"
 """Prefix of the names of coefficients."""
-STEP = 1e-4
-"""Step of a forward difference in prior deviations: rounding of 1e-13 m then errs by 1e-9 m a deviation."""
-COARSE = 0.03
-"""The same for an engine in single precision, whose rounding is 1e-5 m, or with rough motion."""
-FINE = 1e-5
-"""Relative steps of an engine's own differences, up to which it counts as smooth."""
 
 
 class Scope(NamedTuple):
@@ -223,6 +217,7 @@ class PortedForward(Forward):
         self.coordinates = with_terms(forward.coordinates, terms)
         added = np.full((len(forward.slots), len(self._own)), -1)
         self.slots = np.concatenate([forward.slots, added], axis=1)
+        self.forget()
 
     @cached_property
     def identity(self) -> str:
@@ -240,15 +235,10 @@ class PortedForward(Forward):
         """See `Forward.with_difference`."""
         return self.instead_of(self.plain.with_difference(step), self.table)
 
-    def tangents(self, points: Points, directions: Points) -> Fields:
-        """See `Forward.tangents`; one-sided differences."""
-        usual = self.lanes.difference
-        step = STEP if usual is None or usual <= FINE else COARSE
-        here, _ = self.observe(points)
-        ahead, _ = self.observe(points + step * directions)
-        wanted = [*self.lanes.fields, "offset"]
-        found = {name: np.nan_to_num((ahead[name] - here[name]) / step) for name in wanted}
-        return found | self.coordinates.gain_tangents(points, directions)
+    @property
+    def _difference(self) -> float:
+        """See `Lanes.difference`; JAX does not see the signals."""
+        return self.lanes.difference or STEP
 
     @property
     def _own(self) -> list[str]:

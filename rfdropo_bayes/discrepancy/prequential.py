@@ -2,7 +2,7 @@
 
 With the model linear around its mode, the predictive density of every block of rows, given all rows before it, is a
 normal one (Dawid 1984, "The prequential approach"); the sum of their logarithms is the log evidence. Parameters are
-taken to be known no better than the prior and the earlier rows say, so that a fit to later rows hides nothing.
+known only as well as from the prior and the earlier rows, so that a fit to later rows hides nothing.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
     at = int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))
     share = "in every block" if len(failing) == len(found.p) else f"in {len(failing)} of {len(found.p)} blocks"
     return (
-        f"The model fails {share} of rows, first from {found.edges[first]:.2g} to {found.edges[first + 1]:.2g} s, most "
-        f"from {found.edges[worst]:.2g} to {found.edges[worst + 1]:.2g} s, and most at marker {markers[at]}."
+        f"The model fails {share} of rows, first from {found.edges[first]:.4g} to {found.edges[first + 1]:.4g} s, most "
+        f"from {found.edges[worst]:.4g} to {found.edges[worst + 1]:.4g} s, and most at marker {markers[at]}."
         + (f" {BEGINNING}" if begins_wrong(found, level) else "")
     )
 

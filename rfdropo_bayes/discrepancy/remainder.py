@@ -81,7 +81,7 @@ class _Part(NamedTuple):
     """Recordings that were measured in the same rows.
 
     Attributes:
-        groups: which.
+        groups: indices of the groups.
         seen: rows in which anything was measured.
         whitener: matrix that whitens the noise of these rows.
     """

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 RANK_TOLERANCE = 1e-5  # of the largest singular value: limit of the base parameters' span
-VISIBLE = 1.0  # a candidate of the size its prior expects must move the whitened data by so much in all
+VISIBLE = 1.0  # least norm of the change of the whitened data by a candidate of the size that its prior expects
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def screen(
     if target.noise.source == RESIDUALS:  # their mean square equals the residuals' by construction
         del observed["variance"], simulated["variance"]
     most = reference.max(axis=1) if seen else np.zeros(bootstraps)
-    if seen:  # without candidates there is no test by them, and no p-value of one that says nothing
+    if seen:  # without candidates their test has no p-value
         observed[DIRECTED], simulated[DIRECTED] = surprises.max(axis=1), most
     tests = []
     for index, residual in enumerate(residuals):

@@ -201,13 +201,13 @@ def _leading(answer: Answer) -> str:
     refits = sorted(answer.causes.refits.items(), key=lambda entry: -entry[1])[:MOST_EXCLUDED]
     if refits:
         brings = ", ".join(f"{spoken(name)} {gained:.0f} nats" for name, gained in refits)
-        return f"of the candidates that were refitted, none is worth it ({brings})"
+        return f"no refitted candidate has the required evidence ({brings})"
     seen = [row for row in answer.causes.screens[0].rows if row.adjusted_p <= answer.problem.rules.family]
     if not answer.causes.screens[0].rows:
-        return "no candidate was screened"
+        return "no candidate was tested"
     if not seen:
-        return "no candidate stands out"
-    return f"{', '.join(spoken(row.name) for row in seen[:MOST_EXCLUDED])} stand out; none was refitted to the end"
+        return "no candidate is significant"
+    return f"significant: {', '.join(spoken(row.name) for row in seen[:MOST_EXCLUDED])}; none was refitted to the end"
 
 
 def _unconverged(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -286,7 +286,7 @@ def _named(finding: dict[str, Any]) -> str:
     surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
     sizes = ", ".join(_size(row) for title, row in given if (title, row) in surest)
     others = [spoken(other) for other in finding["equivalence_class"][1:]]
-    alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
+    alike = f" (indistinguishable from {', '.join(others)} in these data)" if others else ""
     return f"{name} ({sizes}){alike}"
 
 

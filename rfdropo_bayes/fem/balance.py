@@ -96,7 +96,7 @@ def check_effects(effects: BodyEffects) -> None:
             raise InputError(
                 f"forces and energies are not available with {name.replace('_', ' ')}",
                 where="balance",
-                remedy="remove the mechanism, or do without them",
+                remedy="remove the mechanism, or leave out its energies",
             )
 
 

@@ -23,7 +23,7 @@ from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
 
 REPLACED = 0.1  # share of the live points, in each step
-REMAINING = -3.0  # the live points hold so little of the evidence, in logarithm, that it is in
+REMAINING = -3.0  # logarithm of the share of the evidence that the live points hold at the end
 MOST_STEPS = 5000
 SHRINKAGES = 100  # simulated prior volumes behind the evidence's deviation
 EVALUATIONS = 8  # of a slice, roughly: stepping out and shrinking

@@ -141,7 +141,7 @@ def say_step(words: str, *, show: bool | None = None) -> None:
 
     Args:
         words: description of the step, such as "drawing report.html".
-        show: False says nothing, see `Progress`.
+        show: False prints nothing, see `Progress`.
     """
     check_interrupt()
     if show is not False:
@@ -152,7 +152,7 @@ def say_lines(show: bool | None = None) -> Callable[[str], None]:
     """A function that reports interim results on stderr with the elapsed seconds, and responds to Ctrl-C.
 
     Args:
-        show: False says nothing, see `Progress`.
+        show: False prints nothing, see `Progress`.
     """
     began = time.monotonic()
 

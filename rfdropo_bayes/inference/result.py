@@ -96,7 +96,7 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
             word, end = ("lower", low) if side == "low" else ("upper", high)
             hard = np.isclose(end, problem.bounds[name], rtol=1e-6, atol=0.0).any()
             what = f"its {word} bound {end:g}" if hard else f"the {word} end {end:g} of its prior"
-            sentence = f"{name} sits on {what}, which decides there, and not the data"
+            sentence = f"{name} sits on {what}, which decides it instead of the data"
             found.append(Caution(Code.AT_BOUND, sentence))
         elif contradicts(values, prior):
             apart.append(name)

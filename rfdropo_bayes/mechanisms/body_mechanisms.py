@@ -60,7 +60,7 @@ class StiffnessGradient:
 
 
 class AxialStiffness:
-    """The body is stiffer or softer in tension than its bending says; zero is the base simulator."""
+    """The body is stiffer or softer in tension than in bending; zero is the base simulator."""
 
     name = "axial_stiffness"
     stage = "body"
@@ -145,7 +145,7 @@ class BaseTilt:
     """The base is mounted at an angle: gravity turns about axes of the base; zero is the base simulator.
 
     Args:
-        axes: that it turns about, one after the other.
+        axes: axes of successive turns.
     """
 
     name = "base_tilt"

@@ -84,7 +84,7 @@ class Feature(NamedTuple):
     Attributes:
         kind: a key of `KINDS`.
         channels: indices of its commands, or of its `GAUGES`; `OWN` must be replaced before use, see `of`.
-        shape: its time constant [s] or width [m or rad]; None without.
+        shape: time constant [s] or width [m or rad]; None without a shape.
         of_motion: whether it is made of `GAUGES`, which take the place of commands then.
     """
 
@@ -183,7 +183,7 @@ class Feature(NamedTuple):
         return tuple((name, power) for name, power in ((own, length), ("s", seconds)) if power)
 
     def shape_unit(self, command_unit: str) -> str:
-        """Unit of its shape; "-" without one."""
+        """Unit of its shape; "-" without a shape."""
         own = "m" if self.of_motion else command_unit
         return "-" if self.shape is None else own if self.kind == "play" else "s"
 
@@ -252,7 +252,7 @@ def feature_named(
     Args:
         kind: key of `KINDS`.
         commands: names of its commands, including `OWN_NAME` if ``names`` has it; or of its gauges.
-        shape: its time constant or width; None without.
+        shape: time constant or width; None without a shape.
         names: names of the commands, in their order; `OWN_NAME`, if it may be used, comes last. Or `GAUGES`.
         where: location in the file.
         of_motion: whether it is made of gauges.

@@ -233,7 +233,7 @@ class SensingLaw(SignalLaw):
     @property
     def whole_only(self) -> str:
         """See `SignallingMechanism`."""
-        return "it says when markers are seen" if self.port.kind == "observation" else ""
+        return "it changes the times at which markers are seen" if self.port.kind == "observation" else ""
 
     def carried(
         self, w: Float[Array, " time"], position: Float[Array, "time marker 3"], time: Float[Array, " time"]

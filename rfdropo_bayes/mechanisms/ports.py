@@ -56,7 +56,7 @@ class Port(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Its name in sentences, tables and figures: the actuator of a simulator without cables is none of a cable."""
+        """Its name in sentences, tables and figures: a simulator without cables has actuators."""
         return self.spoken or self.name
 
 

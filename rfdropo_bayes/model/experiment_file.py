@@ -50,7 +50,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def override(tables: dict[str, Any], assignment: str, fields: Container[str]) -> None:
-    """Apply one assignment to nested tables in place; a bare name that is none of ``fields`` is a parameter."""
+    """Apply one assignment to nested tables in place; a bare name outside ``fields`` is a parameter."""
     keys, value = parse_assignment(assignment)
     if len(keys) == 1 and keys[0] not in fields:
         tables.get("model", {}).get("priors", {}).pop(keys[0], None)

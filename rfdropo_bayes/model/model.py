@@ -143,7 +143,7 @@ class Model:
 
     @property
     def title(self) -> str:
-        """Heading of reports: as the experiment says, or else its file's name, or else the robot's."""
+        """Heading of reports: the experiment's title, or else the name of its file, or else the robot's name."""
         return self.settings.title or (self.name if self.file is None else self.file.path.stem)
 
     def recordings(self, role: Literal["fit", "test"]) -> list[Trajectory]:

@@ -124,7 +124,7 @@ class ModelSpec:
         return replace(self, mechanisms=(*self.mechanisms, *choose_mechanisms(names, folder=self.folder)))
 
     def tables(self) -> dict[str, Any]:
-        """The tables [noise], [simulator] and [model] of a file that says the same, as far as a file can."""
+        """The tables [noise], [simulator] and [model] of a file with all content that a file can hold."""
         drives = [each.model_dump(mode="json", exclude_unset=True, exclude_none=True) for each in self.drives]
         weighed = [{"parameters": list(each.parameters), "value": each.value, "sd": each.sd} for each in self.weighed]
         given = {
@@ -176,7 +176,7 @@ class RunSettings:
         )
 
     def tables(self) -> dict[str, Any]:
-        """The keys and tables of a file that says the same."""
+        """The keys and tables of an equivalent file."""
         plain = {"seed": self.seed, "title": self.title}
         rest = {name: value for name, value in vars(self).items() if name not in plain}
         return {**{name: value for name, value in plain.items() if value}, **_dumped(rest)}

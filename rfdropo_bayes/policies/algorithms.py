@@ -17,7 +17,7 @@ ACTOR_CRITIC = ("PPO", "A2C")
 OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
 """Arguments that the training sets itself."""
 OBJECTS = ("action_noise", "replay_buffer_class", "rollout_buffer_class")
-"""Arguments that are Python objects, which neither an experiment file nor a checkpoint's settings hold."""
+"""Arguments that are Python objects: experiment files and settings of checkpoints cannot hold them."""
 
 LARGEST_BATCH = 512
 PPO_DEFAULTS: dict[str, Any] = {

@@ -51,7 +51,7 @@ def varied_parameters(randomisation: Randomisation) -> VariedParameters:
     varies = np.ptp(rows, axis=0) > 0.0
     if not varies.any():
         raise InputError(
-            "no parameter differs between episodes, so that a critic has none to see",
+            "no parameter differs between episodes, so a critic has no parameters to see",
             where='[training] critic = "parameters"',
             remedy='leave out critic, or set randomisation = "posterior", "phi" or "uniform"',
         )

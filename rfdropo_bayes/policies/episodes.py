@@ -53,7 +53,7 @@ class EpisodeStep(NamedTuple):
     truncated: Bool[np.ndarray, " lane"]
     distance: Float[np.ndarray, " lane"]  # [m]; of the last good state if the simulation failed
     diverged: Bool[np.ndarray, " lane"]
-    tension: Float[np.ndarray, " lane"]  # largest of any cable at the action's time steps [N]; NaN if none is told
+    tension: Float[np.ndarray, " lane"]  # largest of any cable at the action's time steps [N]; NaN if unknown
     stopped: Bool[np.ndarray, " lane"]  # by the limit on tension
 
 
@@ -233,7 +233,7 @@ class Episodes:
         if found.peak is not None and self.simulator.cable_names:
             tension = np.asarray(found.peak, dtype=float).max(axis=1)
         if self.settings.tension_limit is not None and not np.isfinite(tension[good]).all():
-            raise _without_tensions(self.robot.name, "let its lanes tell Motion.peak, finite, or leave it out")
+            raise _without_tensions(self.robot.name, "let its lanes return finite Motion.peak, or leave it out")
         return tension
 
     def _compare_at_rest(self, rows: Int[np.ndarray, " row"]) -> None:
@@ -329,7 +329,7 @@ def _rows_of(found: Observation, chosen: Bool[np.ndarray, " row"]) -> Observatio
 
 
 def _without_tensions(name: str, remedy: str) -> InputError:
-    return InputError(f"{name} tells no cable tensions between two actions", where="tension_limit", remedy=remedy)
+    return InputError(f"{name} gives no cable tensions between two actions", where="tension_limit", remedy=remedy)
 
 
 def _check_options(option: Mapping[str, Any]) -> None:

@@ -207,7 +207,7 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     """The randomisation, if every value that it can give lies within the hard bounds of a parameter of the simulator.
 
     Raises:
-        InputError: an unknown parameter, or values outside its bounds; of a posterior the number of such draws is said.
+        InputError: an unknown parameter, or values outside its bounds, with the number of such draws of a posterior.
     """
     if isinstance(randomisation, Layers):
         for part in randomisation.parts:
@@ -355,7 +355,7 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
 
 def _require_mechanisms(missing: Sequence[str], robot: Robot | BlackBox | None, where: str) -> None:
     """Raise an InputError if a parameter that the simulator lacks belongs to a mechanism of the library."""
-    for name in REGISTRY:
+    for name in REGISTRY if missing else ():
         (mechanism,) = mechanisms_named([name], robot)
         own = [spec.name for spec in mechanism.parameters if spec.name in missing]
         if own:

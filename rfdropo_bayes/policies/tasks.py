@@ -32,7 +32,7 @@ EPISODE = 100
 PERIOD = 0.05
 """Control period [s]: five steps of SOFA's 10 ms. The authors' robot was driven at 10 Hz, a period of 0.1 s."""
 STEP = 0.005
-"""Most that an action moves a cable [m], unless said otherwise."""
+"""Largest movement of a cable by an action [m], by default."""
 TRACKED_HEIGHTS = (0.0363, 0.0792, 0.1292, 0.179)
 """Heights along the axis at which motion capture tracks the physical trunk [m]."""
 

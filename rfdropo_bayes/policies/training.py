@@ -27,7 +27,7 @@ from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, peak_te
 from rfdropo_bayes.policies.parity import check_exportable
 from rfdropo_bayes.policies.training_config import TrainingTable
 
-EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
+EVALUATION_SEED = 1_000_003  # evaluations play other episodes than the first of a training
 CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
 LAST, BEST = "", "best_"  # prefixes of a checkpoint's files
 STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")

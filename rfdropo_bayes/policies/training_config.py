@@ -29,8 +29,8 @@ class TrainingTable(BaseModel):
     step: float | None = Field(
         default=None,
         gt=0.0,
-        description="most that an action moves a command, in its unit; 5 mm of cable by default, or a twentieth of the "
-        "range of commands that are no lengths",
+        description="largest change of a command by an action, in its unit; 5 mm of cable by default, or a twentieth "
+        "of the range of other commands",
     )
     noise: float = Field(default=0.0, ge=0.0, description="white noise on the observed markers [m]")
     history: int = Field(

@@ -146,7 +146,7 @@ def day_error(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]]
 
 
 def recorded_day_error(record: PosteriorRecord) -> DayError | None:
-    """The error from a fit's file, or its prior; None if the file has no residuals either."""
+    """The error from a fit's file, or its prior; None if the file has neither error nor residuals."""
     given = record.attrs.get(DAY_ERROR)
     if given is not None:
         return DayError.from_dict(given)

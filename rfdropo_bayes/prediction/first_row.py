@@ -27,8 +27,8 @@ from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.prediction.own_fit import fit_own
 
 SMALLEST_ERROR = 1e-6  # [m]
-LEAST_SHARE = 0.1  # of the draws: a row that leaves fewer says that the model is wrong, not which draw is right
-SURE = 0.95  # probability that an error of the stated size leaves less, from which on it is taken for larger
+LEAST_SHARE = 0.1  # of the draws: a row that leaves fewer shows a wrong model, not the right draw
+SURE = 0.95  # probability of a smaller residual under the stated error, above which the error is taken as larger
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 

@@ -74,7 +74,7 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
     if found.unmatched:
         sentence = (
             f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row, and "
-            "count as they are: the prediction may be farther off than its bands say; adapt to a recording of that day"
+            "count as they are: the prediction may miss its bands; adapt to a recording of that day"
         )
         cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
     for name, times in found.far.items():
@@ -286,11 +286,11 @@ def _predictions(
 
 
 def _ended_well(problem: CalibrationProblem, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Batch]:
-    """Noise-free positions and poses of the object, of the rollouts that ended well, and their values."""
+    """Noise-free positions and poses of the object, of the rollouts that succeeded, and their values."""
     position, pose, status = problem.predict_scene(values)
     fine = status == 0
     if not fine.any():
-        raise InputError("no rollout under the posterior ended well", where="prediction", remedy="narrow the priors")
+        raise InputError("no rollout under the posterior succeeded", where="prediction", remedy="narrow the priors")
     return (
         position[fine],
         None if pose is None else pose[fine],

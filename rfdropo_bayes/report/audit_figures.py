@@ -27,7 +27,7 @@ class Residuals:
 
     Attributes:
         main: the residual's dominant pattern over the channels, a coordinate per row [m].
-        share: of the mean square that this pattern holds.
+        share: part of the mean square in this pattern.
         time: [s]; command: of every channel at that time, and its rate per second; tension: of every cable [N].
         position: simulated coordinate along the same pattern [m].
         channels, cables: their names; unit: of the commands.
@@ -105,7 +105,7 @@ class Shown:
         names: names of the tested candidates.
         cosines: cosines between their signatures.
         unseen: time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst:
-            measured, base model, extended model; None without one.
+            measured, base model, extended model; None without the model.
         remainder: time [s], mean and deviation [m] of the final model's residual at the last marker; None if nothing
             remains.
         tracks: replays of unseen recordings.
@@ -257,7 +257,7 @@ def draw_remainder(axes: Axes, shown: Shown) -> None:
         axes.fill_between(time, centre - 2 * width, centre + 2 * width, color=colour, alpha=0.18, linewidth=0)
     axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("left of the last marker [mm]")
+    axes.set_ylabel("residual of the last marker [mm]")
 
 
 @style.styled

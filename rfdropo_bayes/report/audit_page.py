@@ -23,7 +23,7 @@ SECTIONS = (
     ("show", "Where the model fails"),
     ("name", "Candidates"),
     ("measure", "Gain"),
-    ("remainder", "What remains"),
+    ("remainder", "Remaining misfit"),
     ("limits", "Limits"),
 )
 MOST_COSINES = 16

@@ -29,7 +29,7 @@ class BaselineErrors:
         name: key in summary.json.
         title: name for people.
         description: the method, in one sentence.
-        fit, test: its errors; None if it has none.
+        fit, test: errors on fitted and on test recordings; None without such recordings.
         reason: why it could not predict; empty if it could.
     """
 

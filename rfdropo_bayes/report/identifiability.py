@@ -18,7 +18,7 @@ from jaxtyping import Float
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.units import display_unit
 
-TOGETHER = 0.6  # correlation from which on parameters are described jointly
+TOGETHER = 0.6  # correlation at or above which parameters are described jointly
 DETERMINED, FREE = 0.5, 0.8  # contraction against the prior
 RIDGE = 5.0  # standard deviation along a ridge over the next largest one
 NEGLIGIBLE = 0.2  # exponents below this are left out of the words
@@ -164,7 +164,7 @@ def _verdict(sd: float, prior_sd: float | None) -> str:
 
 
 def spread_in_words(sd: float) -> str:
-    """A standard deviation of a logarithm as people say it: +-0.8 %, or a factor of 2.1."""
+    """A standard deviation of a logarithm in words: +-0.8 %, or a factor of 2.1."""
     if sd < 0.5:
         digits = 2 if 100 * sd < 0.1 else 1 if 100 * sd < 10 else 0
         return f"±{100 * sd:.{digits}f} %"

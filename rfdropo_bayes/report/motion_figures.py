@@ -107,7 +107,7 @@ def still(motion: DrawnMotion, instants: Sequence[int] | None = None) -> Figure:
 
 
 def save_still(motion: DrawnMotion, path: Path) -> None:
-    """Write a still as PNG, SVG or PDF, as the name says."""
+    """Write a still as PNG, SVG or PDF, by the suffix of the name."""
     still(motion).savefig(path)
 
 

@@ -38,11 +38,11 @@ SECTIONS = (
     ("data", "Data"),
     ("model", "Model and priors"),
     ("posterior", "Posterior"),
-    ("identifiability", "What the data determine"),
+    ("identifiability", "Determined parameters"),
     ("predictions", "Measured against predicted"),
     ("bands", "Are the bands honest?"),
     ("computation", "Computation"),
-    ("limits", "What this cannot see"),
+    ("limits", "Limits"),
     ("reproduce", "To reproduce"),
 )
 
@@ -121,7 +121,7 @@ def bootstrap_p(p: float, simulated: int) -> str:
 
 
 def p_value(p: float) -> str:
-    """A p-value from a distribution, which holds only so far out."""
+    """A p-value from a distribution; below its limit only the limit is printed."""
     return number(p, 2) if p >= LEAST_P else f"< {LEAST_P:.0e}"
 
 
@@ -310,14 +310,14 @@ def limits(summary: Mapping[str, Any]) -> list[str]:
     sentences = [
         "Every interval is conditional on the simulator being right but for its parameters and the stated noise. A "
         "mechanism that is missing (friction, hysteresis, creep, a delay) is taken up by the parameters, which then "
-        "are precise and wrong. The residuals and the coverage of the bands say whether that is so here.",
+        "are precise and wrong. The residuals and the coverage of the bands show whether this happened here.",
         "Cables whose length is imposed leave one scale free: every stiffness, mass and force multiplied by one factor "
         "gives the same motion. Only ratios are then known, unless a force or a mass was measured.",
     ]
     if not summary["rmse"]["test"]:
         sentences.append("No recording was kept back: the errors are of the fitted data.")
     if not summary.get("noise_floor_mm"):
-        sentences.append("No experiment was repeated, so nothing tells measurement noise from error of the model.")
+        sentences.append("No experiment was repeated: noise and model error cannot be distinguished.")
     if summary["recordings"] and all(r["synthetic"] for r in summary["recordings"]):
         sentences.append("The recordings are synthetic: a simulator made them, and no real robot is described here.")
     masked = sum(r["masked"] for r in summary["recordings"])

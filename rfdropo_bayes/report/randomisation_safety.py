@@ -84,10 +84,10 @@ def _bands(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _against_baselines(summary: Mapping[str, Any]) -> list[str]:
-    """A simulator that predicts the last marker no better than something without one."""
+    """A simulator that predicts the last marker no better than a predictor without physics."""
     own, best = list(summary["rmse"]["test"].values()), best_baseline(summary, "test")
     if own and own[-1] is not None and best is not None and own[-1] >= best[1]:
-        return [f"the simulator predicts no better than one without physics ({best[0]}: {best[1]:.3g} mm)"]
+        return [f"the simulator predicts no better than a predictor without physics ({best[0]}: {best[1]:.3g} mm)"]
     return []
 
 

@@ -1,4 +1,4 @@
-"""What a fit at rest leaves, as pictures: over time, against each command and its way, and by marker."""
+"""Residuals of a fit at rest, as pictures: over time, against each command and its direction, and by marker."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _over_time(axes: Axes, fit: Leftovers, left: Float[np.ndarray, "row 3"]) -> 
             own = fit.recording == number
             label = "xyz"[axis] if number == fit.recording[0] else None
             axes.plot(fit.rows.time[own], left[own, axis], ".", color=colour, markersize=3, label=label)
-    axes.set(xlabel="time [s]", ylabel="left [mm]")
+    axes.set(xlabel="time [s]", ylabel="residual [mm]")
     axes.legend(loc="best", ncols=3)
 
 
@@ -78,7 +78,7 @@ def _by_marker(axes: Axes, markers: tuple[str, ...], left: Float[np.ndarray, "ro
     size = np.sqrt(np.nanmean(np.sum(left**2, axis=2), axis=0))
     axes.barh(range(len(markers)), size, color=style.POSTERIOR)
     axes.set_yticks(range(len(markers)), markers)
-    axes.set(xlabel="left, root mean square [mm]")
+    axes.set(xlabel="residual, root mean square [mm]")
 
 
 def _against_command(axes: Axes, fit: Leftovers, left: Float[np.ndarray, "row 3"], channel: int) -> None:
@@ -86,5 +86,5 @@ def _against_command(axes: Axes, fit: Leftovers, left: Float[np.ndarray, "row 3"
     for way, colour, word in ((1.0, style.TEST, "rose"), (-1.0, style.POSTERIOR, "fell")):
         own = fit.ways[:, channel] == way
         axes.plot(fit.rows.command[own, channel], distance[own], ".", color=colour, markersize=3, label=word)
-    axes.set(xlabel=f"command {channel + 1}", ylabel="left [mm]")
+    axes.set(xlabel=f"command {channel + 1}", ylabel="residual [mm]")
     axes.legend(loc="best", ncols=2)

@@ -8,5 +8,5 @@ END = re.compile(r"(?<=[^\s.]\.)\s+(?=[A-Z])")
 
 
 def sentences(text: str) -> list[str]:
-    """The sentences of a verdict; a full stop inside a number or a name ends none."""
+    """The sentences of a verdict; a full stop inside a number or a name does not end a sentence."""
     return END.split(text)

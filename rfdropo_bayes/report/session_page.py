@@ -17,7 +17,7 @@ SECTIONS = (
     ("result", "Result"),
     ("drives", "Set-points and reached lengths"),
     ("goal", "Distance to the goal"),
-    ("commands", "What the policy commanded"),
+    ("commands", "Commands of the policy"),
     ("timing", "Punctuality"),
     ("events", "Events"),
     ("reproduce", "To reproduce"),

@@ -116,7 +116,7 @@ def residual_figure(recording: RecordingPrediction, settled: int | None) -> Figu
 
     Args:
         recording: measured and predicted.
-        settled: row from which on the pose is held, None if it is not.
+        settled: first row of the held pose; None if the pose is not held.
     """
     rows = style.thin(len(recording.time))
     usable = recording.mask[:, -1]

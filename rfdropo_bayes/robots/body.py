@@ -66,8 +66,8 @@ class Body(RobotTable):
     )
     poisson_stiffening: tuple[tuple[float, float, float], ...] = Field(
         default=(),
-        description="how the stiffness of each layer depends on Poisson's ratio: three coefficients per layer, of "
-        "robots.body.poisson_terms; empty if it does not",
+        description="dependence of the stiffness of each layer on Poisson's ratio: three coefficients per layer, of "
+        "robots.body.poisson_terms; empty for a stiffness without this dependence",
     )
     volume_m3: Positive = Field(
         description="volume of the whole body, clamped part included; the density is the trunk mass over this volume",

@@ -54,7 +54,7 @@ class DriveTravel(RobotTable):
     @model_validator(mode="after")
     def _consistent(self) -> DriveTravel:
         if self.cables != "all" and (not self.cables or len(set(self.cables)) < len(self.cables)):
-            raise ValueError("cables of a drive table are none, or one stands twice")
+            raise ValueError("a drive table needs at least one cable, each listed once")
         if self.count_size == 0.0:
             raise ValueError("count_size of a drive table is zero")
         if self.low is None and self.high is None:

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
-_LEAST_LIMIT = 10.0  # [per mille]: drives tell and limit torque in whole per mille, a tenth of such a limit
+_LEAST_LIMIT = 10.0  # [per mille]: drives report and limit torque in whole per mille, a tenth of this limit
 
 
 class Motor(RobotTable):

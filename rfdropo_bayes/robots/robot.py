@@ -47,11 +47,11 @@ class CommandTiming(RobotTable):
     """Timing of commands."""
 
     unit: Literal["m", "rad", "N", "N m", "-"] = Field(
-        description='of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, or "-" of '
+        description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, or "-" of '
         "drives that are sent volts or a share of their supply; channels.gain has the newtons of the last two",
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
-    dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
+    dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
     usual: Positive | None = Field(
         default=None,
         description="size of usual commands, in their unit: mechanisms have priors in this size; by default "
@@ -83,7 +83,7 @@ class PushScene(RobotTable):
     plate_height_m: float = Field(description="coordinate of the plate's top against gravity")
     contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
     parameters: dict[Name, Parameter] = Field(
-        description="of the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
+        description="the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
         "turn about the vertical [rad], zero if the edges are parallel to the axes",
     )
 
@@ -108,14 +108,14 @@ class Robot(RobotTable):
     time_step_s: Positive = Field(description="time step of the simulation")
     integrator: Literal["euler", "sdirk2"] = Field(
         default="sdirk2",
-        description='how time steps are taken: "sdirk2", of second order, takes two solves a step and comes about ten '
-        'times nearer to the converged motion than "euler", which takes one, as SOFA does',
+        description='scheme of a time step: "sdirk2", of order 2 (1.6 with taut cables), takes two solves a step, and '
+        'its error is about a tenth of the error of "euler", which takes one, as SOFA does',
     )
     initial_state: Literal["rest", "equilibrium"] = Field(
         description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',
     )
     command: CommandTiming = Field(description="unit and timing of commands")
-    channels: Channels = Field(description="from commands to cable displacements")
+    channels: Channels = Field(description="map from commands to cable displacements")
     cables: tuple[Cable, ...] = Field(min_length=1, description="the cables")
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
     markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
@@ -367,7 +367,7 @@ class Robot(RobotTable):
         return low.max(axis=0), high.min(axis=0)
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
-        """Size of each channel's command that pulls a cable by so much [m]: the pull itself, or at nominal parameters
+        """Size of each channel's command for a given pull of a cable [m]: the pull itself, or at nominal parameters
         the angle that moves the cable that moves most."""
         if self.command_unit == "m":
             return np.full(len(self.channel_names), pull)
@@ -394,9 +394,7 @@ class Robot(RobotTable):
             if parameter.each == "cable":
                 for cable in (each.name for each in self.cables if each.unit == "m"):
                     described = f"{parameter.description} (cable {cable})"
-                    table[f"{name}_{cable}"] = changed(
-                        parameter, where=f"robot {self.name}", description=described, each=None
-                    )
+                    table[f"{name}_{cable}"] = parameter.model_copy(update={"description": described, "each": None})
             else:
                 table[name] = parameter
         return table

@@ -390,7 +390,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         """See `ExtendedSimulator.begin_lanes`; the function's own method of this name makes them.
 
         Raises:
-            InputError: it has none.
+            InputError: the function has no `begin_lanes`.
         """
         begin = getattr(self.box.function, "begin_lanes", None)
         if begin is None:
@@ -444,7 +444,7 @@ class ProcessSimulation:
 
     It reads ``{"parameters": {name: number}, "command": [[...], ...], "time_step": s}`` and answers with ``{"position":
     [[[x, y, z], ...], ...]}``, in metres and one entry per row of the command, perhaps with ``"tension": [[...],
-    ...]``. An answer ``{"error": "..."}`` says that these parameters cannot be simulated. The process's stderr stays
+    ...]``. The answer ``{"error": "..."}`` means that these parameters cannot be simulated. The process's stderr stays
     visible.
 
     Args:
@@ -460,7 +460,7 @@ class ProcessSimulation:
         """Simulate one parameter set.
 
         Raises:
-            ArithmeticError: the process says that it cannot.
+            ArithmeticError: the process answers with an error.
             ConnectionError: the process has ended, or does not answer in JSON.
         """
         process = self._running()

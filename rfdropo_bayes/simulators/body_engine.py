@@ -66,7 +66,7 @@ EFFECT_SIZES = BodyEffects(
 QUASI_STATIC: Literal["quasi-static"] = "quasi-static"
 """Motion of a body that is at rest in every row."""
 FAR_WOUND = 10.0
-"""[m] No cable is wound in so far."""
+"""[m] Beyond the displacement of any cable."""
 CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
 FRICTION = 0.1
@@ -98,14 +98,11 @@ class Backend(NamedTuple):
         name: "numba" or "jax".
         precision: precision of "numba"; "jax" uses double precision.
         threads: threads of "numba"; None for all processors.
-        one_sided, difference: settings of derivatives of "numba", see `with_differences`.
     """
 
     name: Literal["numba", "jax"] = "numba"
     precision: Literal["float64", "float32"] = "float64"
     threads: int | None = None
-    one_sided: bool = False
-    difference: float | None = None
 
 
 class CubeInputs(NamedTuple):
@@ -240,7 +237,7 @@ class Engine:
         return self._differentiable(inputs, limit)
 
     def section_loads(self, loads: BodySignals | None) -> SectionLoads | None:
-        """Signals on the body as the engine takes them, with the stations that forces act on; None for none."""
+        """Signals on the body as the engine takes them, with the stations that forces act on; None without signals."""
         return None if loads is None else SectionLoads(*loads, station=self.load_stations)
 
     def initial(
@@ -295,8 +292,7 @@ class Engine:
 
     @cached_property
     def _differentiable(self) -> Any:
-        backend = self.backend
-        return with_differences(self._call, input_sizes, backend.precision, backend.one_sided, backend.difference)
+        return with_differences(self._call, input_sizes, self.backend.precision)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
         rows, cables = inputs.displacement.shape[0] + 1, inputs.displacement.shape[1]

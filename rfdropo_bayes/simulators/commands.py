@@ -74,7 +74,7 @@ def commands_on_grid(
     if len(time) != len(value):
         raise InputError(f"{len(time)} command times for {len(value)} commands", remedy="give one time per command")
     if not len(observation_time):
-        raise InputError("no observation", remedy="give the time of one at least")
+        raise InputError("no observation", remedy="give at least one time")
     for name, clock in (("command", time), ("observation", observation_time)):
         if not np.all(np.isfinite(clock)):
             raise InputError(f"{name} time of row {int(np.argmax(~np.isfinite(clock)))} is not a number")

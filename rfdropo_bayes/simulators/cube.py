@@ -22,7 +22,7 @@ def push_table(robot: Robot) -> PushScene:
     """The robot's cube and plate.
 
     Raises:
-        InputError: the robot has none.
+        InputError: the robot has no cube.
     """
     if robot.push is None:
         raise InputError(

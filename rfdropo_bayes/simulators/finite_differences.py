@@ -1,4 +1,4 @@
-"""Derivatives of a compiled engine: differences along each tangent, one or two rollouts per direction."""
+"""Derivatives of a compiled engine: central differences along each tangent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ Output = TypeVar("Output")
 # Relative perturbation of a central difference. Its error is of second order in it; the rounding error (1e-13 m and
 # 1e-5 m of the positions) is divided by it: near the cube root of the precision both are small.
 DIFFERENCE = {"float64": 1e-5, "float32": 1e-2}
-FORWARD = 1e-7  # of a forward difference, in double precision: its error is of first order in it
 # Sizes that perturbations are relative to, if a value may be zero: [m] of cable, [kg], [m/s2], [1/s], [s].
 LENGTH, MASS, ACCELERATION, MASS_DAMPING, STIFFNESS_DAMPING = 0.005, 0.1, 9.81, 1.0, 0.01
 
@@ -25,7 +24,6 @@ def with_differences(
     call: Callable[[Inputs, Array], Output],
     sizes: Callable[[Inputs], Inputs],
     precision: str,
-    one_sided: bool = False,
     difference: float | None = None,
 ) -> Callable[[Inputs, Array], Output]:
     """``call(inputs, limit)`` with derivatives with respect to the inputs.
@@ -34,12 +32,8 @@ def with_differences(
         call: the rollout; outputs in double precision have derivatives.
         sizes: size of every input, the unit of perturbations.
         precision: precision of the engine, a key of `DIFFERENCE`.
-        one_sided: one rollout per direction in addition to the value's, accurate to 1e-5 for smooth motion and 1e-3
-            otherwise; in double precision only.
-        difference: relative perturbation of a central difference, if motion is too rough for `DIFFERENCE`; see
-            `usable_difference`.
+        difference: relative perturbation, if motion is too rough for `DIFFERENCE`.
     """
-    forward = one_sided and precision == "float64" and difference is None
     width = difference or DIFFERENCE[precision]
 
     @jax.custom_jvp
@@ -49,15 +43,14 @@ def with_differences(
     @motion.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple[Output, Output]:
         (inputs, limit), (directions, _) = primals, tangents
-        step = (FORWARD if forward else width) / _relative_size(sizes(inputs), directions)
+        step = width / _relative_size(sizes(inputs), directions)
 
         def moved(by: Array) -> Output:
             return call(jax.tree.map(lambda x, d: x + by * d, inputs, directions), limit)
 
-        value, ahead = call(inputs, limit), moved(step)
-        behind, apart = (value, step) if forward else (moved(-step), 2.0 * step)
+        value, ahead, behind = call(inputs, limit), moved(step), moved(-step)
         slope = jax.tree.map(
-            lambda a, b: (a - b) / apart if a.dtype == jnp.float64 else np.zeros(a.shape, jax.dtypes.float0),
+            lambda a, b: (a - b) / (2.0 * step) if a.dtype == jnp.float64 else np.zeros(a.shape, jax.dtypes.float0),
             ahead,
             behind,
         )
@@ -74,7 +67,7 @@ JITTER = 3.0
 
 
 def usable_difference(slope: Callable[[float], Float[np.ndarray, "..."]]) -> float:
-    """Smallest step of `LADDER` from which on slopes agree; the largest step if none agree.
+    """Smallest step of `LADDER` at and above which slopes agree; the largest step if none agree.
 
     A motion can be rough: smooth on the smallest scales, with slopes thousands of times the relevant slopes (a
     jittering body of tetrahedra). Rounding is also rough. A curved motion is not: slopes over the smallest step are

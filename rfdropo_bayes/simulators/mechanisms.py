@@ -278,7 +278,7 @@ def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS
 
 
 def code_of(mechanisms: Iterable[Mechanism]) -> bytes:
-    """The files that mechanisms are written in: a name alone does not tell whether its code has changed."""
+    """Source files of mechanisms: their digests show whether the code of a name has changed."""
     found: set[bytes] = set()
     for kind in {type(mechanism) for mechanism in mechanisms}:
         try:

@@ -46,8 +46,8 @@ class TetrahedraTable(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    mesh: str = Field(description="mesh file (VTK, Gmsh), looked for as the recordings are")
-    unit: Literal["m", "cm", "mm"] = Field(description="of its coordinates, which are in the frame of the robot's base")
+    mesh: str = Field(description="mesh file (VTK, Gmsh), in the folders of recordings")
+    unit: Literal["m", "cm", "mm"] = Field(description="unit of its coordinates, in the frame of the robot's base")
     clamp_height: float = Field(description="nodes at or below this height are held [m]")
     frames: Literal["polar", "edges"] = Field(
         default="polar",
@@ -66,7 +66,7 @@ class TetrahedraTable(BaseModel):
     drive_rate: Annotated[float, Field(gt=0.0)] | None = Field(
         default=None,
         description=(
-            'how far the imposed displacement may be from the last measured displacement [m per step]; for "sofa"'
+            'largest change of the imposed displacement from the last measured displacement [m per step]; for "sofa"'
         ),
     )
     marker_cables: tuple[str, ...] = Field(

@@ -131,7 +131,7 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def section_names(self) -> tuple[str, ...]:
-        """Sections of the robot whose orientation is told."""
+        """Sections of the robot with a simulated orientation."""
         return self.robot.section_names
 
     @property

@@ -47,7 +47,7 @@ def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
 
 
 ARM = 0.01
-"""[m] Points that tell a section's orientation lie so far from the axis."""
+"""[m] Distance from the axis of the points that give a section's orientation."""
 
 
 def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:

@@ -455,7 +455,7 @@ def _cautions(found: DayFit) -> list[Caution]:
     if found.excess > MUCH_WORSE:
         sentence = (
             f"the day is fitted {found.excess:.2g} times worse than the fitted days: most of its squared error is of a "
-            "kind that these did not have, and that none of the day's parameters explains; see that the recording and "
+            "kind that the fitted days lack and that no parameter of the day explains; see that the recording and "
             "its commands are right, name more in [model.per_group], or calibrate with it"
         )
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence))

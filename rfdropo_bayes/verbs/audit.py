@@ -374,31 +374,25 @@ def _lanes(
     coordinates: Coordinates,
     workshop: Workshop,
 ) -> Lanes:
-    """The simulator with all candidates; expensive candidates get a simulator of their own. Lanes in the workshop are
-    reused.
+    """The simulator with all candidates, which compiled engines only run for rollouts with some of them: there is one
+    without candidates, and another without expensive ones. Lanes in the workshop are reused.
     """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
     key = repr((*made, markers.tolist(), coordinates.space.fixed, fields))
     if key not in workshop:
-        every = _brisk(whole, markers, fields)
-        slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
+        slow = {m.name: m for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
+        costly = [each.name for m in slow.values() for each in m.parameters]
+        found = Lanes(whole, markers, fields=fields, costly=costly)
         added = whole.mechanisms[len(spec.mechanisms) :]
         kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
-        if len(kept) < len(names):
-            fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), markers, fields)
-            null = coordinates.nominal | coordinates.named(coordinates.null)
-            every = RoutedLanes(fast, every, null)
-        workshop[key] = every
+        null = coordinates.nominal | coordinates.named(coordinates.null)
+        for fewer in [kept, []] if found.difference is not None else []:
+            if len(fewer) < len(names):
+                fast = build_simulator(spec.with_mechanisms(*fewer))
+                found = RoutedLanes(Lanes(fast, markers, fields=fields), found, null)
+        workshop[key] = found
     return workshop[key]
-
-
-def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
-    """Lanes with one-sided differences if available: they are exact enough for optimisation and score tests."""
-    if isinstance(simulator, TrunkSimulator) and not simulator.pushes and simulator.engine.backend.name == "numba":
-        quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
-        return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
-    return Lanes(simulator, marker_index, fields=fields)
 
 
 def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:

@@ -197,7 +197,7 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner |
         return None
     if method not in CLIMBING:
         raise InputError(
-            f"method {method!r} does not climb: it has no use for a start",
+            f"method {method!r} does not optimise, so it needs no start",
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
         )

@@ -143,7 +143,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
             "under test in [data]"
         )
     found.doubts += [
-        f"[model.groups] {group}: {entry!r} is the name of none of the recordings; there are {shortened(named)}"
+        f"[model.groups] {group}: {entry!r} matches no recording; the recordings are {shortened(named)}"
         for group, entry in unmatched(named, experiment.model.groups)
         if named
     ]

@@ -50,7 +50,7 @@ NO_COMMAND = re.compile(
     r"roll|pitch|yaw|r[xyz]|q[xyzw]|quat\w*|euler|rot|orientation)(?![a-z])",
     re.IGNORECASE,
 )
-"""Columns that count or name rows, or tell an orientation."""
+"""Columns that count or name rows, or hold an orientation."""
 BESIDE = re.compile(r"current|temp|volt|power|torque|battery|error", re.IGNORECASE)
 """Readings of a motor beside its command; commands if there is nothing else."""
 NO_PLACE = re.compile(
@@ -127,7 +127,7 @@ class Guess(NamedTuple):
 
     @property
     def counts(self) -> bool:
-        """Whether a unit is one of counts."""
+        """Whether a unit is a unit of counts."""
         return named_columns.COUNTS in (self.command_unit, self.motor_angle_unit if self.motor_angles else "")
 
 
@@ -376,7 +376,7 @@ def _holds_times(table: CsvTable, name: str) -> bool:
         ticks = table.stamps(name, "s").ticks
     except InputError:
         return False
-    return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date of the day alone is none
+    return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date without a time of day is no clock
 
 
 def _seconds(table: CsvTable, time: str | None, unit: str) -> float:

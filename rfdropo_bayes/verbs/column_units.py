@@ -21,7 +21,7 @@ WORD = re.compile(r"[a-z0-9]+")
 UNITS = {unit: unit for unit in ("mm", "cm", "m", "deg", "rad")} | dict.fromkeys(
     ("count", "counts", "cnt", "cnts", "tick", "ticks", "pulse", "pulses", "steps", "qc"), named_columns.COUNTS
 )
-"""Words in the name of a column, and the unit they tell."""
+"""Words in the name of a column, and their unit."""
 FOREIGN = {
     "%": re.compile(r"%|(?<![a-z])(percent|percentage|pct|duty|pwm)(?![a-z])", re.IGNORECASE),
     "V": re.compile(r"volt|[_ .\[(]m?V[\])]?$|^m?V$"),
@@ -38,9 +38,9 @@ TIME_UNITS = {
     **dict.fromkeys(("us", "usec", "micros", "microseconds", "µs", "μs"), "us"),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
 }
-"""Words in the name of a column of times, and the unit they tell."""
+"""Words in the name of a column of times, and their unit."""
 SINCE_1970 = (0.9e9, 4.2e9)
-"""Seconds since 1970 in the years 1998 to 2103: stamps between them tell their unit."""
+"""Seconds since 1970 in the years 1998 to 2103: stamps between them have a known unit."""
 LONGEST_STEP = 100.0
 """Longest time between rows [s] with which such stamps are believed: a counter may run through the same numbers."""
 USUAL_STEP, USUAL_RATE = 0.02, 0.5
@@ -54,7 +54,7 @@ RESTING = 3e-3
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
 METRES_UP_TO = 0.2
-"""No cable of a soft arm is pulled by more metres."""
+"""Largest plausible pull of a cable of a soft arm [m]."""
 
 
 BENT, UPRIGHT = 2.0, 1.1
@@ -68,7 +68,7 @@ class Unit(NamedTuple):
     Attributes:
         unit: unit of most of them.
         others: columns in other units, which convert to it.
-        evidence: why it was guessed; empty if the names or a line of units tell it.
+        evidence: why it was guessed; empty if the names or a line of units have it.
     """
 
     unit: str
@@ -79,7 +79,7 @@ class Unit(NamedTuple):
 def told_unit(table: CsvTable, names: Sequence[str], known: Collection[str] = frozenset(UNITS.values())) -> Unit | None:
     """The unit, one of ``known``, that columns carry in their names, as ``x1_mm``, or in a line of units below them.
 
-    None if no column tells a unit.
+    None if no column has a unit.
 
     Raises:
         InputError: units of several kinds, such as a length and an angle.
@@ -112,7 +112,7 @@ def _kind(unit: str) -> str:
 
 
 def foreign_unit(table: CsvTable, names: Sequence[str]) -> str | None:
-    """The unit of commands that is neither a length nor an angle, if all of some columns tell it."""
+    """The unit of commands that is neither a length nor an angle, if all of some columns have it."""
     for unit, words in FOREIGN.items():
         if names and all(words.search(table.units.get(name, "")) or words.search(name) for name in names):
             return unit
@@ -175,13 +175,13 @@ def _span(names: Sequence[str]) -> str:
 
 
 def told_time_units(table: CsvTable, name: str) -> set[str]:
-    """Units of time that words in a column's name tell, or the line of units below it."""
+    """Units of time by the words in a column's name, or by the line of units below it."""
     words = re.findall(r"[^\W_]+", f"{table.units.get(name, '')}".lower()) or re.findall(r"[^\W_]+", name.lower())
     return {TIME_UNITS[word] for word in words if word in TIME_UNITS}
 
 
 def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = None) -> Unit:
-    """The unit of times that a name or a line of units tells, or else their size and the motion between rows.
+    """The unit of times by a name or a line of units, or else by their size and the motion between rows.
 
     Args:
         table: table with these columns.
@@ -209,7 +209,7 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
 
 
 def command_time_unit(table: CsvTable, time: str | None, duration: float) -> Unit:
-    """The unit of the commands' own times: as told, or the unit in which they last as long as the recording [s]."""
+    """The unit of the commands' own times: as given, or the unit in which they last as long as the recording [s]."""
     found = time_unit(table, time)
     if time is None or not found.evidence or duration <= 0.0 or "1970" in found.evidence:
         return found

@@ -173,7 +173,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
-            remedy="name the parameters that do, and calibrate",
+            remedy="name the parameters that vary between sessions, and calibrate",
         )
     points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
     values = {name: np.full(len(points), value) for name, value in body.items()}
@@ -207,7 +207,7 @@ def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -
     """The group of that name, of the last recording by default, and its recordings.
 
     Raises:
-        InputError: there is none.
+        InputError: no recording has this group.
     """
     found = gather_groups([run.name for run in runs], groups)
     day = group_of(runs[-1].name, groups) if group is None else group

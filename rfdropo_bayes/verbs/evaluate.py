@@ -87,7 +87,7 @@ def evaluate(
         InputError: bad input, a policy for another layout, or a policy given twice.
     """
     if episodes < 1:
-        raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for one at least")
+        raise InputError(f"{episodes} episodes show nothing", where="--episodes", remedy="ask for at least one episode")
     keys = stated(options, TrainingOptions)
     opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
     inherited = _task_of(policies) if model.settings.training is None else {}
@@ -166,7 +166,7 @@ def _episodes_for(
 
 
 def _otherwise_trained(policies: Mapping[str, ExportedPolicy], integrator: str) -> list[str]:
-    """Sentences on policies that were trained with another integrator; one that says nothing was with Euler's."""
+    """Sentences on policies that were trained with another integrator; the default is Euler's."""
     trained = {name: policy.facts.get(INTEGRATOR, "euler") for name, policy in policies.items()}
     return [
         f"{name} was trained with integrator {given!r}, and is evaluated with {integrator!r}."

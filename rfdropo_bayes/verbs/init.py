@@ -112,7 +112,7 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
-    """A guess refined by the robot: units of positions and commands, and no tensions of motors with two cables."""
+    """A guess with units that suit the robot, and without tensions of motors with two cables."""
     if outline.pairs and guess.tensions:
         guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
     if "markers" in outline.assumed:
@@ -140,7 +140,7 @@ def write_first_files(
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
 
     Args:
-        folder: to write to; it is made.
+        folder: folder to write to; it is made.
         outline: the robot.
         recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
             third of the rows of a single recording.
@@ -237,7 +237,7 @@ def _of_poses(first: Trajectory, timed: bool) -> str | None:
 
 
 def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
-    """The first recording to fit; None if it cannot be read, which check says, and the user runs it next."""
+    """The first recording to fit; None if it cannot be read: check reports the fault next."""
     if experiment.data is None:
         return None
     try:

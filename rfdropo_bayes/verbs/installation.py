@@ -50,9 +50,9 @@ def installed_priors(
     """Lines of [model.priors] of a robot as it is installed.
 
     Args:
-        robot: whose lengths they are measured by.
-        recording: whose commands zeros of cables are measured by.
-        frame: in which a rod at rest explains that recording: priors are centred there.
+        robot: robot whose lengths set their sizes.
+        recording: recording whose commands set the sizes of the cables' zeros.
+        frame: frame in which a rod at rest explains that recording; priors are centred there.
         assumed: answers of the robot's outline that were not given, which have wide priors.
     """
     lines = []

@@ -64,7 +64,7 @@ def make_vec(
 
     Args:
         task: "TrunkReach-v0" or "TrunkPush-v0".
-        model: that is simulated; its fixed values hold.
+        model: the simulated model, with its fixed values.
         options: further keys of [training], such as ``observation`` or ``period``.
         fit: a calibration, or its folder, of whose posterior the episodes' parameters are draws;
             nominal values without.

@@ -109,7 +109,7 @@ def _proposed(direction: Direction, proposal: Proposal, axes: tuple[str, str, st
         sentence = f"another arrangement of the commands {better}: {lines}"
         return Caution(Code.ORDER_DOUBTFUL, sentence)
     told = "; or ".join([lines, *others])
-    sentence = f"more than one arrangement {better}, and these recordings do not tell them apart: {told}"
+    sentence = f"more than one arrangement {better}, and these recordings do not distinguish them: {told}"
     return Caution(Code.FRAME_DOUBTFUL if proposal.mirrored else Code.ORDER_DOUBTFUL, sentence)
 
 
@@ -118,7 +118,7 @@ class Compared(NamedTuple):
 
     Attributes:
         words: summary.
-        cautions: on frame, order and unit of the commands.
+        cautions: cautions on frame, order and unit of the commands.
         arrangement: best arrangement of the commands; None without equilibria under them.
     """
 

@@ -55,7 +55,7 @@ def size_of(recordings: Iterable[Paths]) -> Size:
 
 
 def limit_of(command_unit: str) -> float:
-    """The ratio from which on the size of a motion is doubted, by the unit in which a recording keeps its commands."""
+    """The ratio at or above which the size of a motion is doubted, by the unit of a recording's commands."""
     return OFF if command_unit in IMPOSED else FAR_OFF
 
 

@@ -108,7 +108,7 @@ def nominal_markers(spec: ModelSpec, recording: Trajectory, longest: float) -> F
     """Markers of the nominal model that the recording has [m], at its times up to ``longest`` [s].
 
     Raises:
-        InputError: a black box, commands that do not fit, or a rollout that did not end well.
+        InputError: a black box, commands that do not fit, or a rollout that failed.
     """
     simulator = build_robot_simulator(spec)
     commands, values = commands_of(simulator, recording), physical_values(spec, simulator)

@@ -28,7 +28,7 @@ from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, spread_rows
 ROWS, SEARCHED = 100, 60
 """Rows that are simulated by the rod at rest, and of them by arcs."""
 WELL = 0.98
-"""Agreement from which on no other arrangement is looked for."""
+"""Agreement at or above which no other arrangement is looked for."""
 ALIKE = 1.3
 """Ratio of two shares of unexplained motion below which the simpler arrangement is taken, and alternatives are
 named.

@@ -79,7 +79,7 @@ class Read(NamedTuple):
         """The line for [data.columns] that turns the positions read, and then shifts them [m]."""
         if not self.unit:
             return f"a shift by {_millimetres(shift)} mm"
-        # A robot that rests bent tells no more than millimetres.
+        # A robot that rests bent gives a position to within millimetres.
         origin = np.round(self.origin - (turn @ self.turn).T @ shift, 3) / METRES[self.unit]
         return f"origin = [{', '.join(f'{value:g}' for value in origin + 0.0)}]"
 

@@ -222,7 +222,7 @@ def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
 
 def _check_noise(record: PosteriorRecord, noise: str) -> None:
     """Raise an InputError if an experiment's noise model differs from a posterior's."""
-    fitted = record.attrs.get(NOISE, noise)  # earlier posteriors do not say
+    fitted = record.attrs.get(NOISE, noise)  # earlier posteriors lack it
     if noise != fitted:
         raise InputError(
             f"the posterior was fitted with noise = {fitted!r}, the experiment says {noise!r}",

@@ -43,7 +43,7 @@ PRIOR_DRAWS = 2000
 KNOWN = 0.01  # relative error with which a part is weighed, or a parameter measured by itself
 TENSION_ERROR = 0.05  # relative error of tensions that are not measured yet
 TURNS, STILL = 200, 1e-10  # of the rotation to readable directions
-NAMES, REMEDIES = 6, 3  # most that a sentence names: of parameters, the largest parts, and of remedies, the best
+NAMES, REMEDIES = 6, 3  # most parameters and most remedies in a sentence
 BY_ITSELF = "measured by itself"
 
 
@@ -188,7 +188,7 @@ def preflight(
         share: rows of ``runs`` over those of the fit, if they are some of its rows only.
 
     Raises:
-        InputError: no parameter to infer, or no prior draw whose rollouts end well.
+        InputError: no parameter to infer, or no prior draw whose rollouts succeed.
     """
     begun = clock.perf_counter()
     model = _precise(model)
@@ -297,7 +297,7 @@ def _slopes(
     start: np.ndarray,
     difference: float,
 ) -> tuple[_Slopes, np.ndarray, float, Result]:
-    """Derivatives at draws of the prior, which draws ended well, seconds of a parameter set, and the worst result.
+    """Derivatives at draws of the prior, which draws succeeded, seconds of a parameter set, and the worst result.
 
     Steps are at least the relative ``difference`` that a rough simulator asks for.
     """

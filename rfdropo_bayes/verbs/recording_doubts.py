@@ -206,7 +206,7 @@ def _placements(robot: Robot, recordings: Sequence[Trajectory], columns: CsvColu
 
 
 def _copies(recordings: Sequence[Trajectory]) -> list[Caution]:
-    """Recordings of the same content: noise never repeats, so that one of them is a copy."""
+    """Recordings of the same content: noise never repeats, so one recording is a copy."""
     alike: dict[str, list[str]] = {}
     for recording in recordings:
         alike.setdefault(recording.sha256, []).append(recording.name)

@@ -55,9 +55,9 @@ class Registration(NamedTuple):
     """How a recording lies to its robot at rest.
 
     Attributes:
-        frame: that brings the robot to the recording; None if the robot does not explain the motion in any.
-        arrangement: of the commands, if another arrangement than the written one explains much more.
-        evidence: for the arrangement, in words.
+        frame: frame that brings the robot to the recording; None if the robot explains the motion in no frame.
+        arrangement: order of the commands, if it explains much more than the written order.
+        evidence: reason for the arrangement, in words.
     """
 
     frame: Frame | None
@@ -89,8 +89,8 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool) -> Registr
     """Bring the robot of a model, at rest and at nominal values, to a recording.
 
     Args:
-        spec: of a robot that can be at rest.
-        recording: as it is read now.
+        spec: model of a robot that can be at rest.
+        recording: recording as it is read at present.
         scaled: whether the body's length is not known, so that lengths may be scaled.
     """
     nothing = Registration(None)

@@ -17,9 +17,9 @@ from rfdropo_bayes.verbs.order_finder import arranged
 from rfdropo_bayes.verbs.rest_fit import KEPT, OWN, Estimate, RestFit, fit_at_rest
 
 MISREAD = 2.0
-"""Error over that of the best predictor without physics from which on the description itself is doubted."""
+"""Error over that of the best predictor without physics at or above which the description itself is doubted."""
 DRIFTS, WAYS = 0.25, 0.1
-"""Shares of what a fit leaves that a drift, and the way in which a command last changed, must explain to be said."""
+"""Least shares of the residuals that a drift, and the direction of a command's last change, must explain."""
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg")}
 
 

@@ -30,7 +30,7 @@ DRAWS = 400
 SHORTEST = 1e-2
 """Shortest trial step, relative to the full step."""
 KEPT = 0.7
-"""Share of its prior standard deviation from which on a parameter counts as undetermined."""
+"""Share of its prior standard deviation at or above which a parameter counts as undetermined."""
 SMALLEST = 1e-5
 """Smallest noise [m]."""
 
@@ -81,7 +81,7 @@ class RestFit(NamedTuple):
         each: error of every marker on the unfitted rows.
         fitted, other: numbers of fitted rows and of rows with these errors.
         tested: whether these are rows of test recordings.
-        rows: that are shown, of all recordings; residual: measured less computed [m]; ways: whether each command was
+        rows: shown rows of all recordings; residual: measured less computed [m]; ways: whether each command was
             last changed upwards (1) or downwards (-1); recording: number of each row's recording.
     """
 

@@ -190,7 +190,7 @@ def _known_markers(names: Sequence[str], simulator: AnySimulator) -> list[str]:
 
 
 def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], index: int) -> Trajectory:
-    """The simulated motion as a recording that says it is synthetic, and how it was made."""
+    """The simulated motion as a recording with a note that it is synthetic, and how it was made."""
     source, position, simulator = found.source, found.position, model.simulator
     noise, seed = model.spec.stated, model.settings.seed
     if noise is not None:

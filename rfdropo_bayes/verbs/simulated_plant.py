@@ -96,7 +96,7 @@ def true_simulator(
             raise InputError(
                 f"its {what} are {found}, those of {robot.name} {wanted}",
                 where=f"plant {base.name}",
-                remedy="deploy a robot that has the same",
+                remedy="deploy a robot with the same values",
             )
     table = spec.simulator
     held = {name: value for name, value in spec.fixed.items() if table.push or name not in OBJECT}

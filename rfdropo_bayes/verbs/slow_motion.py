@@ -1,4 +1,4 @@
-"""Whether a recording moves so slowly that a quasi-static motion is likely enough, told without a simulation."""
+"""Whether a recording moves so slowly that a quasi-static motion is likely enough; needs no simulation."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
 MOST_TURN = np.pi
 """Largest turn of a body [rad] by its cables."""
 MISREAD = 5.0
-"""Ratio of the measured motion and this estimate from which on a guessed unit is given up for one that explains it."""
+"""Ratio of the measured motion and this estimate at or above which another unit replaces a guess."""
 STEPS = 81  # along the body
 
 

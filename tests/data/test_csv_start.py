@@ -74,3 +74,15 @@ def test_new_commands_begin_as_the_fitted_recordings_do(tmp_path: Path, spec: Da
     np.testing.assert_array_equal(said.initial_command, said.command[0])
     assert common_beginning([found["zero"], found["zero"]]) == "zero"
     assert common_beginning([found["zero"], found["first"]]) is None
+
+
+def test_new_poses_at_rest_have_the_command_of_their_own_row(tmp_path: Path) -> None:
+    """Also after a fit whose recordings began with zero or with their first command."""
+    columns = {**COLUMNS, "commands_with_poses": True}
+    spec = DataSpec.model_validate({"format": "csv", "fit": ["fitted.csv"], "columns": columns})
+    table = command_columns(CsvColumns.model_validate(columns), TIME, COMMAND + 0.01)
+    poses = {f"{axis}{m}": 100.0 * m + k + np.arange(len(TIME)) for m in (1, 2) for k, axis in enumerate("xyz")}
+    pd.DataFrame(table | poses).to_csv(tmp_path / "next.csv", index=False)
+    for begun in ("zero", "first", None):
+        found = load_unseen(spec, tmp_path, "next.csv", begun=begun)
+        np.testing.assert_allclose(np.vstack([found.initial_command, found.command]), COMMAND + 0.01, atol=1e-12)

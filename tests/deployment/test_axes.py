@@ -133,7 +133,7 @@ def test_an_emergency_names_the_drives_of_its_node(rigs) -> None:
         drive.reading = Reading(0x40, 0, 0, 0.0)
     heard = drives.network.subscribers[objects.EMCY + 2][-1]
     heard(objects.EMCY + 2, bytearray(objects.EMERGENCY.pack(0x2310, 1, b"")), 0.0)
-    with pytest.raises(Stop, match="drive 'down' or 'right' says 0x2310"):
+    with pytest.raises(Stop, match="drive 'down' or 'right' reports 0x2310"):
         watch.check(Tick(1, 0.0, 0.0, 0), None)
 
 

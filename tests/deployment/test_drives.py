@@ -219,7 +219,7 @@ def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig
         drive.reading = Reading(0x40, 0, 0, 0.0)
     watch.check(tick, None)
     heard(left, bytearray(objects.EMERGENCY.pack(0x2310, 1, b"")), 0.0)
-    with pytest.raises(Stop, match="drive 'left' says 0x2310"):
+    with pytest.raises(Stop, match="drive 'left' reports 0x2310"):
         watch.check(tick, None)
 
 

@@ -122,7 +122,7 @@ def test_a_rated_torque_in_micronewton_metres_is_named_and_the_unit_makes_it_rig
         (12_000_000, "uN m", "1,000 times too large.*write rated_torque_n_m in N m"),
         (500, "mN m", "this is another motor"),
         (15_000, "mN m", "this is another motor"),
-        (0, "uN m", "tell the drive which motor it has"),
+        (0, "uN m", "set the motor of the drive"),
     ],
 )
 def test_a_wrong_rated_torque_is_another_unit_or_another_motor(rigs, found: int, unit: str, message: str) -> None:
@@ -180,7 +180,7 @@ def test_the_greatest_speed_is_written_in_the_stated_unit(rigs, unit: str | None
     ("told", "units", "message"),
     [
         ({0x60AA: RPM_PER_S}, Units(acceleration="counts/s2"), "0x60AA is 0x00C00300. than counts/s2"),
-        ({0x60AA: 0x00414300}, Units(), "not known here .0x60AA is 0x00414300"),
+        ({0x60AA: 0x00414300}, Units(), "unknown unit of accelerations .0x60AA is 0x00414300"),
         ({0x60A9: MRPM}, Units(), "not in rpm .0x60A9 is 0xFDB44700.*speed_unit"),
     ],
 )

@@ -52,20 +52,22 @@ def test_a_fit_seen_under_the_measurements_noise_is_what_that_noise_makes_of_its
 
 
 def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
-    """Under the measurement's noise the same step brings a hundred times as much."""
+    """Half a nat a row for each factor e of the squared residual; the measurement's noise gives ten times as much."""
     asked, judge, fit = far
     search = ExtensionSearch(judge, asked.candidates, asked.rules, 0)
     screen = search.screened(fit)
     assert screen.omnibus.p == 1 / (1 + asked.rules.bootstraps)
     better = search.refit(fit, screen.row("play"))
     rows = np.count_nonzero(fit.residual)
-    assert asked.rules.evidence < better.log_evidence - fit.log_evidence < 0.5 * rows
+    shrunk = np.log((fit.residual @ fit.residual) / (better.residual @ better.residual))
+    assert asked.rules.evidence < better.log_evidence - fit.log_evidence < 0.5 * rows * shrunk
     known = judge.measured
     alone, both = climb(known, fit.x, fit.free), climb(known, better.x, better.free)
     assert both.log_evidence - alone.log_evidence > 10.0 * (better.log_evidence - fit.log_evidence)
     assert not far_off(known, both.x)
 
 
+@pytest.mark.slow
 def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_right(far):
     asked, *_ = far
     answer = audit(replace(asked, rules=replace(asked.rules, bootstraps=199)))

@@ -76,7 +76,7 @@ def test_a_model_that_cannot_simulate_unseen_recordings_is_not_supported(monkeyp
 
     def stops(target, fit, seed):
         if play in fit.free:
-            raise NoLikelihoodError("a rollout at the optimum did not end well", where="audit", remedy="none")
+            raise NoLikelihoodError("a rollout at the optimum failed", where="audit", remedy="none")
         return predict(target, fit, seed)
 
     monkeypatch.setattr(held_out, "_predict", stops)

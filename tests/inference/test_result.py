@@ -65,7 +65,7 @@ def test_an_end_of_the_prior_between_the_bounds_is_named(ends, draws, said):
     problem = OneParameter(lambda key, n: jax.random.uniform(key, (n,), minval=low, maxval=high), (0.0, 100.0))
     problem.prior_ends = {"x0": ends}
     found = prior_cautions(problem, {"x0": draws[None]})
-    assert [caution.sentence for caution in found] == [f"{said}, which decides there, and not the data"] * bool(said)
+    assert [caution.sentence for caution in found] == [f"{said}, which decides it instead of the data"] * bool(said)
 
 
 def normal(key, n):

@@ -67,7 +67,7 @@ def test_commands_stay_in_the_range_of_the_actuators_and_move_by_a_share_of_it(t
         (ARM, {"goals": None}, "the task has no goals for this robot"),
         (ARM, {"task": "TrunkPush-v0"}, "has no cube to push"),
         (ARM.replace(' ctrlrange="-1 1"', ""), {}, "nothing limits the command 'a'"),
-        (ARM, {"tension_limit": 1.0}, "tells no cable tensions between two actions; name its cables"),
+        (ARM, {"tension_limit": 1.0}, "gives no cable tensions between two actions; name its cables"),
     ],
 )
 def test_what_a_task_needs_is_said(tmp_path, text, changes, said):
@@ -77,6 +77,7 @@ def test_what_a_task_needs_is_said(tmp_path, text, changes, said):
         )
 
 
+@pytest.mark.slow
 def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(tmp_path):
     """An episode's largest pull is that of a whole rollout, the force that a new command exerts at once included."""
     model = model_of(tmp_path, cables={"b": "b"})
@@ -122,5 +123,5 @@ def test_a_policy_is_trained_evaluated_and_filmed(tmp_path):
     found = rb.evaluate(model, [tmp_path / "policy"], tmp_path / "no_cables", episodes=8, film=False)
     assert found["tension_limit_n"] is None
     assert "tension_limit of 50 N is left out: the model has no cables" in found["otherwise_trained"][0]
-    with pytest.raises(InputError, match="tells no cable tensions"):
+    with pytest.raises(InputError, match="gives no cable tensions"):
         rb.evaluate(model, [tmp_path / "policy"], tmp_path / "asked", episodes=8, film=False, tension_limit=50.0)

@@ -140,7 +140,7 @@ def test_a_limit_where_no_tension_is_told_is_refused(monkeypatch, peak) -> None:
     lanes.reset([0])
     act = lanes.session.act
     monkeypatch.setattr(lanes.session, "act", lambda commands: act(commands)._replace(peak=peak))
-    with pytest.raises(InputError, match=r"smooth_arm tells no cable tensions .* Motion\.peak"):
+    with pytest.raises(InputError, match=r"smooth_arm gives no cable tensions .* Motion\.peak"):
         lanes.act(np.zeros((1, CHANNELS)))
 
 

@@ -59,7 +59,10 @@ def test_without_grounds_against_it_is_safe(run, summary):
     ("change", "words"),
     [
         (lambda s: s["coverage"].update({"0.9": 0.6}), "hold only 60 %"),
-        (lambda s: s["rmse"]["test"].update({list(s["rmse"]["test"])[-1]: 1e3}), "no better than one without physics"),
+        (
+            lambda s: s["rmse"]["test"].update({list(s["rmse"]["test"])[-1]: 1e3}),
+            "no better than a predictor without physics",
+        ),
         (lambda s: s["parameters"]["sigma"].update(r_hat=1.4), "independent runs disagree about sigma"),
         (lambda s: s["parameters"]["sigma"].update(ess_bulk=3.0), "fewer than 100 effective draws of sigma"),
         (lambda s: s["cautions"].extend(said([LEAP, LAST])), "10 rollouts ran out"),

@@ -107,7 +107,7 @@ def test_what_does_not_fit_a_recording_is_said(tables, words):
         ({"low": 0.012}, "low of a drive table is not below high"),
         ({"start": 0.013}, "start of a drive table is not between low and high"),
         ({"high": None}, "neither low nor high"),
-        ({"cables": (), "high": 0.1}, "cables of a drive table are none"),
+        ({"cables": (), "high": 0.1}, "a drive table needs at least one cable"),
         ({"cables": ("a", "b"), "low": (-0.1,)}, "one for each of its named cables"),
         ({"count_size": 0}, "count_size of a drive table is zero"),
         ({"beyond": "dropped"}, "beyond"),

@@ -38,7 +38,7 @@ def test_another_arrangement_is_named_with_the_lines_that_mend_it():
 def test_arrangements_that_explain_a_motion_as_well_are_named_beside_each_other():
     lines = ('commands = ["c1", "c4", "c3", "c2"] in [data.columns]',)
     (caution,) = motion_cautions(Motion(WELL, FITS, Proposal(0.97, lines, ("azimuth_deg",))), columns("mm"), "m")
-    assert "do not tell them apart" in caution.sentence
+    assert "do not distinguish them" in caution.sentence
     assert "; or azimuth_deg" in caution.sentence
     mirrored = Direction(0.0, 0.3, 0.96, 0.0)
     (caution,) = motion_cautions(Motion(mirrored, FITS, Proposal(0.96, lines, (), True)), columns("mm"), "m")

@@ -30,7 +30,7 @@ OFFSETS = ("offset_x", "offset_y", "offset_z")
 """Parameters that shift measured against simulated positions [m]."""
 
 LEVER = 0.02
-"""[m] A turn counts among features as the way of points so far from the centre."""
+"""[m] Distance from the centre of the point whose path stands for a turn among the features."""
 
 OBJECT_NOISE = ParameterSpec(
     "object_noise",
@@ -249,7 +249,7 @@ def draw_object_error(
     values: Mapping[str, Any],
     known: Autoregression | None = None,
 ) -> Float[Array, "time 7"]:
-    """A body's poses with a realisation of the noise of centre and turn, of which there is none in the first row."""
+    """A body's poses with a realisation of the noise of centre and turn; the first row has no noise."""
     error = _error(key, time, values, known)
     half = 0.5 * jnp.linalg.norm(error[:, 1], axis=1, keepdims=True)
     turn = jnp.concatenate([0.5 * jnp.sinc(half / jnp.pi) * error[:, 1], jnp.cos(half)], axis=1)

@@ -29,7 +29,7 @@ LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
 INNOVATIONS = "innovations"  # white: the size of slow residuals that the rows before do not predict
 MISFIT = "misfit"  # white, of the size of a misspecified model's residuals
-SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
+SLOW = 0.9  # share that the rows before predict, at or above which a model's residuals are not taken for noise alone
 INDEPENDENT = 0.05  # p-value of independence, below which columns are taken to share noise
 LEAST_ROWS = 3  # for each column, to estimate correlations at all
 
@@ -40,11 +40,11 @@ class Autoregression:
 
     Attributes:
         scale: marginal standard deviation of each column, in the column's unit.
-        autocorrelation: at lags 0 ... p; its length gives the order.
+        autocorrelation: values at lags 0 ... p; its length gives the order.
         source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's
             residuals are noise of such a process).
         freedom: degrees of freedom of the variance; infinite if stated.
-        correlation: of the columns at one time; None if they are independent.
+        correlation: correlation of the columns at one time; None if they are independent.
         step: time between rows [s] that the lags count; None if unknown, and rows of any rate count equally.
         paces: time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then
             have an axis of these recordings before the time axis.

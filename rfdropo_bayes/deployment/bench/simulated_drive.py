@@ -20,7 +20,7 @@ from rfdropo_bayes.deployment.cia402 import (
 from rfdropo_bayes.deployment.objects import EmergencyCode, Object, of_axis
 from rfdropo_bayes.deployment.vendors import told_counts
 
-_HELD = 0.05  # [s]: a faulty drive holds for so long after a quick stop
+_HELD = 0.05  # [s]: time for which a faulty drive holds after a quick stop
 _LAG = 0.004  # [s]: time constant of a tuned position loop of 40 Hz
 
 

@@ -270,7 +270,7 @@ class SimulatedNode:
         self._send(cob, data[:-1] if self.fault is SimulatedFault.SHORT_TPDO else data)
 
     def emergency(self, code: int, detail: bytes = b"", register: int = 0x01) -> None:
-        """Send an emergency message; code 0 says that the error has gone."""
+        """Send an emergency message; code 0 means that the error has gone."""
         self.error_field = int(code) or self.error_field
         self._send(objects.EMCY + self.number, objects.EMERGENCY.pack(code, register, detail.ljust(5, b"\0")))
 

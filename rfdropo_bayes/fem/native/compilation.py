@@ -21,7 +21,7 @@ from numba.core.typed_passes import NativeLowering, NopythonRewrites
 from numba.core.untyped_passes import InlineClosureLikes
 
 NEEDLESS = (NopythonRewrites, InlineClosureLikes)
-"""Passes for expressions of arrays and for functions within functions, of which kernels have none."""
+"""Passes for expressions of arrays and for functions within functions, which kernels do not use."""
 
 
 def _new_library(state: Any) -> CPUCodeLibrary:

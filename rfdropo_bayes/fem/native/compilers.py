@@ -2,7 +2,7 @@
 
 Ours (`compilation`) rest on private parts of Numba. They are used without asking with the versions that they are tested
 with. With another version a small program is compiled and run first; if that fails in any way, Numba compiles the
-kernels its own way, which takes longer to compile and gives the same numbers. See docs/native.md.
+kernels its own way, which takes longer to compile and gives the same numbers. See CONTRIBUTING.md.
 """
 
 from __future__ import annotations

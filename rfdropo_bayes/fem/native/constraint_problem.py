@@ -48,7 +48,7 @@ push is accepted as solved: 52 of 192 rollouts of nearly incompressible trunks t
 1e-5.
 """
 ROUNDING = 0.03
-"""Share of that error up to which the velocities are rounded."""
+"""Largest rounding of the velocities, as a share of that error."""
 RATIO = TANGENT_SOFTNESS / NORMAL_SOFTNESS
 
 

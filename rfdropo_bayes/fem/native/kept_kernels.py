@@ -1,7 +1,7 @@
 """Compiled kernels in the user's cache folder: compiled once for all copies of the package and all processes.
 
 Numba keeps a kernel beside its source, so each clone and each environment compiles it again, which takes half a minute.
-The digest in a kernel's name says all that Numba's own stamp of the source says. If several processes need a kernel at
+The digest in a kernel's name replaces Numba's own stamp of the source. If several processes need a kernel at
 the same time, the first compiles it and the others wait for it.
 """
 

@@ -11,7 +11,7 @@ from itertools import count as counting
 
 @cache
 def _workers(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads that wait for lane blocks; a forked ``process`` has none of its parent's."""
+    """Threads that wait for lane blocks; a forked ``process`` starts its own."""
     return ThreadPoolExecutor(threads, f"lanes_{process}")
 
 

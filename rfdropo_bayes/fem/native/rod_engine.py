@@ -83,7 +83,7 @@ class Run(NamedTuple):
 
     @property
     def commanded(self) -> Bool[np.ndarray, " batch"]:
-        """Whether all commands are numbers: a cable whose displacement is none would count as slack."""
+        """Whether all commands are finite: a cable with a displacement of NaN would count as slack."""
         batch, schedule = self.batch, self.schedule
         known = np.ones(batch.count, dtype=bool)
         moved = batch.displacement[: batch.count, : schedule.steps * batch.start.shape[1]]
@@ -173,7 +173,7 @@ class NativeRod:
         """Roll out a batch.
 
         Args:
-            material: fields with a leading batch axis, or without one to serve the whole batch.
+            material: fields with a leading batch axis; a field without this axis serves the whole batch.
             displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
             start: cable displacements [m] whose static equilibrium is the initial state, as in
                 ``fem.static_equilibrium``; None starts undeformed.
@@ -183,7 +183,7 @@ class NativeRod:
             stride: number of steps between recorded states.
             cube: for an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
                 at the start; mass [kg], side [m], radius of gyration [m] and coefficient of friction.
-            loads: loads that change from step to step; None for none.
+            loads: loads that change from step to step; None without loads.
 
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.

@@ -65,7 +65,7 @@ def place_directors(work, station, token):
 
 @kernel
 def set_factors(samples, factors, work, stage, wide, token):
-    """Factors of a stage, which impacts make so much longer."""
+    """Factors by which impacts lengthen a stage."""
     loss = load(work.loss, 0, token)
     length, drag = fill(stage.length, samples.damping, token) * wide, load(samples.damping, 0, token) * loss
     one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)

@@ -99,7 +99,7 @@ def native_lanes(dtype: Any) -> int:
 
 
 def lane_token(lanes: int) -> tuple[int, ...]:
-    """The argument that tells a kernel its number of lanes at compile time."""
+    """The argument that gives a kernel its number of lanes at compile time."""
     return (0,) * lanes
 
 

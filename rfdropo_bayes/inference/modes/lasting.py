@@ -145,7 +145,7 @@ def _widened(
 
 
 def lasting_cautions(lasting: Mapping[str, Lasting]) -> list[Caution]:
-    """A caution for each channel whose rows count so much less than one that intervals are wider by a fifth."""
+    """A caution for each channel whose down-weighted rows widen intervals by more than a fifth."""
     return [
         Caution(
             Code.RESIDUALS_LAST,

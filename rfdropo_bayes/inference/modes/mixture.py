@@ -1,7 +1,7 @@
 """Several optima: which of them explain the data about as well, and how a posterior mixes them.
 
-Densities alone do not say it. A simulator is wrong in ways that last from row to row, so that neighbouring rows repeat
-one piece of evidence: under white noise optima that follow the data equally well lie hundreds of nats apart. Optima are
+Densities alone do not decide this. Errors of a simulator last from row to row, so that neighbouring rows repeat one
+piece of evidence: under white noise optima that follow the data equally well lie hundreds of nats apart. Optima are
 therefore compared by the rows' log densities, whose differences are as certain as their autocorrelation lets them be
 (as the differences between models of Vehtari, Gelman & Gabry 2017, for series).
 """

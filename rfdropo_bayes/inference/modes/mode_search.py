@@ -172,7 +172,7 @@ def find_modes(
         chosen: selects from the final optimisations; by default all within `RIVAL` nats of the best.
 
     Raises:
-        InputError: a problem without residuals whose likelihood JAX cannot differentiate either.
+        InputError: a problem without residuals whose likelihood JAX cannot differentiate.
         NoLikelihoodError: none of the draws has a positive likelihood.
     """
     horizons, target_at = _targets(problem, config)

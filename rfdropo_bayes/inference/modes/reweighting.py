@@ -32,10 +32,10 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 CANDIDATE_SHARE = 0.25  # of a budget that optimisations leave to candidates
 FEWEST_CANDIDATES = 20
 ROUNDS = 4
-FIRST = 100  # candidates that tell whether the normals need weights
-ALIKE = 0.98  # effective share of the first candidates from which on their weights count as equal
+FIRST = 100  # candidates that decide whether the normals need weights
+ALIKE = 0.98  # effective share of the first candidates at or above which their weights count as equal
 DEGREES = 5.0  # of freedom of the wide candidates
-ENOUGH, TOO_FEW = 100.0, 20.0  # effective draws: fewer are said, and still fewer must not be used
+ENOUGH, TOO_FEW = 100.0, 20.0  # effective draws: fewer are reported; below the second limit they must not be used
 LIKE = 0.1  # share of the candidates that counts if the normal describes the posterior
 
 
@@ -73,7 +73,7 @@ def reweighted(
         weights: weights of the mixture.
         candidates: number of rollouts, at most.
         key: random key.
-        ledger: is charged; candidates without a likelihood are counted there.
+        ledger: counts rollouts, and candidates without a likelihood.
         count: number of draws.
         by_evidence: let the exact posterior decide between the optima, and not the weights.
 

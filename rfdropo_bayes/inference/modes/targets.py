@@ -223,7 +223,7 @@ def _noise_coordinates(determinant: Callable, u: np.ndarray, width: float = 0.05
     steps = width * np.eye(len(u))
     values = determinant(np.concatenate([u[None], u + steps, u - steps]))
     changes = np.abs(values[1:] - values[0]).reshape(2, len(u))
-    # A rollout that fails says nothing; its other side does.
+    # The other side of a failed rollout still gives a difference.
     return np.max(np.where(np.isfinite(changes), changes, 0.0), axis=0) > 1e-2 + 1e-6 * abs(values[0])
 
 

@@ -105,7 +105,7 @@ def step_log_likelihood(
 
     Args:
         features: rollouts of ONE parameter distribution.
-        alive: rollouts that ended well; at least two.
+        alive: rollouts that succeeded; at least two.
         observed: the trajectory, in the units of the features.
         mask: observed entries that count.
         variance_floor: floor of the variance in squared units of the features; a scalar, or one value per feature.

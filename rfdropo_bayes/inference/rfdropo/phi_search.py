@@ -224,7 +224,7 @@ def run(
     state, centre = _search(problem, config, plan, search_key, checkpoint, logbook)
     if not np.isfinite(state.losses).any():
         raise InputError(
-            f"no candidate had half of its rollouts end well ({dict(state.ledger.excluded)})",
+            f"at least half of the rollouts of every candidate failed ({dict(state.ledger.excluded)})",
             where="[inference] search",
             remedy="narrow the search ranges to parameters that the simulator can handle",
         )

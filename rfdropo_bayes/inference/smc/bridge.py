@@ -9,7 +9,7 @@ stiffness over mass, leave a thin ridge. In logarithms it is a straight line, wh
 coordinates that bend towards the bounds of a prior it is a curve, on which a sampler hardly moves. The price is a wall
 at each bound: there is no density beyond it.
 
-The curvature of the prior at an optimum says little about directions without information from the likelihood. Along a
+The curvature of the prior at an optimum is a poor guide in directions without information from the likelihood. Along a
 ridge between two bounds the optimum lies at an end, and the density falls off within a short distance of it. Each
 optimum therefore has a second distribution as long as the ridge, from the likelihood's curvature and the prior's mean
 and covariance.

@@ -51,12 +51,12 @@ CLOSE = 1e-2  # nats below its optimum at which an optimisation may end: the sam
 STEPS = 12.0  # typical steps of an optimisation at each horizon
 CLIMBED = 0.6  # share of the work that is done after the optimisations, for a progress bar
 SCORING = 0.1  # share of the budget for the evidence of the blocks
-SCREEN = 64  # prior draws, the best of which tells the likelihood's information
+SCREEN = 64  # prior draws; the likelihood's information is taken at the best
 MARGIN = 3.0  # cost of real posteriors over the estimate, which assumes normality and even data
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
 MOVES = 4.0  # of a stage: about 3 if the posterior is normal, otherwise more
 FARTHEST = 5.0  # prior deviations of a value at most; farther values mean a conflict of prior and data
-INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # a short prefix says little: its posterior is near the prior
+INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # the posterior of a short prefix is near the prior
 MOST_STEPS = 12  # of the optimisation from the optimum of all rows to the optimum of a prefix
 MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
@@ -236,7 +236,7 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
         problem: problem to sample.
         config: settings of the sampler.
         key: random key.
-        ledger: is charged.
+        ledger: counts the rollouts.
 
     Raises:
         NoLikelihoodError: none of the draws has a positive likelihood.

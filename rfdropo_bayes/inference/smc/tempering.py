@@ -254,7 +254,7 @@ def stage(
 ) -> tuple[Population, StageInfo]:
     """Reweight towards ``stop``; resample and move unless the end was reached with enough effective particles.
 
-    ``moves`` = 0 says that the budget allows none: the stage leaps to the end of the path and only resamples.
+    ``moves`` = 0 means that the budget is spent: the stage leaps to the end of the path and only resamples.
     """
     population, info, kept = advance(population, tuning.target_ess, stop, leap=moves == 0)
     if kept or not np.isfinite(info.log_evidence_increment):

@@ -2,7 +2,7 @@
 
 An address is ``kind/name/attribute``: ``joint/elbow/damping``. The number of an element, from zero, replaces its name
 if it has none, and ``*`` in a name matches any text: the parameter is then a factor on all of them. Options have no
-name: ``option/gravity_z``. docs/your_simulator.md has the table of `ATTRIBUTES`.
+name: ``option/gravity_z``. docs/reference/mujoco.md lists `ATTRIBUTES`.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ class _Scalar:
 
 
 def element_names(model: Any, kind: str) -> list[str]:
-    """Names of all elements of a kind, in their order; the number of one that has none."""
+    """Names of all elements of a kind, in their order; an element without a name has its number."""
     import mujoco
 
     count = model.nflex if kind == "flex" else getattr(model, COUNTS[kind])
@@ -208,7 +208,7 @@ def number_of(model: Any, kind: str, name: str | int, *, where: str) -> int:
     """Number of an element, by its name or number.
 
     Raises:
-        InputError: there is none, with the nearest names.
+        InputError: no element has this name; the nearest names are listed.
     """
     names = element_names(model, kind)
     if str(name) in names:
