@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -133,6 +135,17 @@ class _Source(NamedTuple):
         """Identity of the recording, regardless of rows."""
         return self.observations.resolve(), self.episode
 
+    def shares_rows(self, other: _Source) -> bool:
+        """Whether a row belongs to both, parts of the same recording."""
+        first, last = self.rows or (0, sys.maxsize - 1)
+        start, end = other.rows or (0, sys.maxsize - 1)
+        low, high = max(first, start), min(last, end)
+        if low > high:
+            return False
+        step = self.every // math.gcd(self.every, other.every) * other.every
+        later = range(max(low, start), min(high, low + step) + 1)
+        return any((row - first) % self.every == 0 and (row - start) % other.every == 0 for row in later)
+
 
 def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "fit") -> list[Trajectory]:
     """Read the recordings of one role, checked, masked and resampled, in the order of the file (globs sorted).
@@ -234,15 +247,12 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
 def _check_split(fit: list[_Source], test: list[_Source]) -> None:
     for tested in test:
         for fitted in fit:
-            if tested.recording == fitted.recording:
-                first, last = tested.rows or (0, float("inf"))
-                start, end = fitted.rows or (0, float("inf"))
-                if first <= end and start <= last:
-                    raise InputError(
-                        "a test recording shares rows with a recording that is fitted",
-                        where=str(tested.observations),
-                        remedy="split by recording, or give rows that do not overlap",
-                    )
+            if tested.recording == fitted.recording and tested.shares_rows(fitted):
+                raise InputError(
+                    "a test recording shares rows with a recording that is fitted",
+                    where=str(tested.observations),
+                    remedy="split by recording, or give rows that do not overlap",
+                )
 
 
 def _distinct_names(recordings: list[Trajectory], sources: list[_Source], listed: list[_Source]) -> list[Trajectory]:
