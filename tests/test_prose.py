@@ -6,6 +6,7 @@ blackjax and diffrax. docs/glossary.md has the terms to use.
 
 from __future__ import annotations
 
+import json
 import re
 from functools import cache
 from pathlib import Path
@@ -88,9 +89,30 @@ def test_the_words_of_a_room_are_plain(room: str, kind: str) -> None:
     assert faults(written(room)[kind]) == []
 
 
+def test_pages_of_results_are_plain() -> None:
+    """Text of the templates of reports, without tags and expressions."""
+    text = "\n".join(path.read_text(encoding="utf-8") for path in sorted(PACKAGE.glob("report/templates/*.j2")))
+    text = re.sub(r"\{%.*?%\}|\{\{.*?\}\}|<(script|style).*?</\1>", "", text, flags=re.DOTALL)
+    assert faults(re.sub(r"<[^>]*>", "|", text)) == []
+
+
+@pytest.mark.parametrize("path", sorted(REPOSITORY.glob("notebooks/*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_are_plain(path: Path) -> None:
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    text = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    assert faults(re.sub(r"`[^`]*`", "", text)) == []
+
+
 def test_documents_are_plain() -> None:
-    pages = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    pages = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    assert faults(re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", text, flags=re.DOTALL)) == []
+
+
+def test_reports_are_plain() -> None:
+    folders = ("reports", "examples", "models")
+    pages = [page for folder in folders for page in sorted((REPOSITORY / folder).rglob("README.md"))]
+    text = "\n\n".join(page.read_text(encoding="utf-8") for page in pages)
     assert faults(re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", text, flags=re.DOTALL)) == []
 
 

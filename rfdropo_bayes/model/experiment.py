@@ -34,16 +34,16 @@ class WeighedTable(ExperimentTable):
     parameters: list[str] = Field(
         min_length=1, description="parameters whose sum was measured; payload_mass@NAME belongs to the recording NAME"
     )
-    value: float = Field(description="the sum, in their unit")
+    value: float = Field(description="measured sum, in the unit of the parameters")
     sd: float = Field(gt=0.0, description="standard deviation of the measurement")
 
 
 class LawTermTable(ExperimentTable):
     """A term of [[model.laws]]: a coefficient times a feature."""
 
-    coefficient: str = Field(description="name of its parameter, zero of which is no effect")
+    coefficient: str = Field(description="name of its parameter; zero has no effect")
     feature: str = Field(description="kind of the feature, see docs/mechanisms.md")
-    commands: list[str] = Field(default_factory=list, description="commands that the feature is made of")
+    commands: list[str] = Field(default_factory=list, description="commands of the feature")
     motion: list[str] = Field(
         default_factory=list,
         description="motion in their place, at ports of the body: tip x, tip y, tip z or tip distance, from the first "
@@ -66,7 +66,7 @@ class LawTable(ExperimentTable):
     port: str = Field(
         description='port at which it acts, such as "cable left", "stiffness" or "marker m3 along the body"'
     )
-    terms: list[LawTermTable] = Field(min_length=1, description="the signal is their sum")
+    terms: list[LawTermTable] = Field(min_length=1, description="terms, whose sum is the signal")
 
 
 class ModelTable(ExperimentTable):
@@ -98,8 +98,8 @@ class ModelTable(ExperimentTable):
     )
     groups: dict[str, str | list[str]] = Field(
         default_factory=dict,
-        description="recordings that have a set-up in common (a day, a robot), by names or wildcards; one in no group"
-        " is a group of its own",
+        description="recordings with a common set-up (a session, a robot), by names or wildcards; a recording in no "
+        "group forms its own",
     )
     drives: list[DriveTravel] = Field(
         default_factory=list,
@@ -107,33 +107,33 @@ class ModelTable(ExperimentTable):
     )
     per_group: dict[str, float] = Field(
         default_factory=dict,
-        description="parameters that differ between groups about the value they share: the scale of the half-normal "
-        "prior of their standard deviation between groups, in their unit, which is inferred; a name such "
-        "as initial_displacement stands for all cables' parameters, with one standard deviation",
+        description="parameters that differ between groups, with the scale of the half-normal prior of their standard "
+        "deviation between groups, in their unit; a name such as initial_displacement stands for the parameters of all "
+        "cables, with one standard deviation",
     )
     only_in: dict[str, str | list[str]] = Field(
         default_factory=dict,
-        description="parameters that recordings of the named groups have and others do not: each of these groups has a "
-        "value, all others the nominal one, at which a mechanism does nothing",
+        description="parameters of the named groups alone: each of these groups has a value, and all other recordings "
+        "have the nominal value, at which a mechanism has no effect",
     )
     tension: bool = Field(
         default=False,
-        description="the recordings' cable tensions are data, with a relative noise tension_noise that is inferred "
-        "and a tension_gain that is 1 unless it has a prior",
+        description="use recorded cable tensions; their relative noise tension_noise is inferred, and tension_gain is "
+        "1 unless it has a prior",
     )
     motor_angle: bool = Field(
         default=False,
-        description="the recordings' motor angles are data, with a noise motor_angle_noise that is inferred",
+        description="use recorded motor angles; their noise motor_angle_noise is inferred",
     )
     orientation: bool = Field(
         default=False,
-        description="the recordings' orientations of sections are data, with a noise orientation_noise that is "
-        "inferred and a turn of the frame, frame_turn_x, _y and _z, that is zero unless it has a prior",
+        description="use recorded orientations of sections; their noise orientation_noise is inferred, and the turn of "
+        "the frame (frame_turn_x, _y and _z) is zero unless it has a prior",
     )
     object_pose: bool = Field(
         default=False,
-        description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and, "
-        "unless noise is white, object_correlation_time; it starts at the first of them",
+        description="use recorded poses of the pushed body, which starts at its first pose; object_noise, "
+        "object_turn_noise and, unless noise is white, object_correlation_time are inferred",
     )
     weighed: list[WeighedTable] = Field(
         default_factory=list,
@@ -158,8 +158,8 @@ class SimulatorTable(ExperimentTable):
     push: bool = Field(default=False, description="put the robot's cube and plate before the trunk")
     drives: Literal["robot", "direct"] = Field(
         default="robot",
-        description='"direct": commands act at once, without the robot\'s ramp and dead time; drives are modelled '
-        "to mechanisms such as command_delay",
+        description='"direct": commands act at once, without the robot\'s ramp and dead time; add the drives '
+        "as mechanisms such as command_delay",
     )
     tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
     engine: Literal["auto", "jax", "numba"] = Field(
@@ -173,10 +173,10 @@ class SimulatorTable(ExperimentTable):
     time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
     integrator: Literal["euler", "sdirk2"] | None = Field(
         default=None,
-        description='"sdirk2", of second order, takes two solves a step and comes about ten times nearer to the '
-        'converged motion than "euler", which takes one, as SOFA does; the robot\'s by default',
+        description='"sdirk2", of order 2 (1.6 with taut cables), takes two solves a step; its error is about a tenth '
+        'of the error of "euler", which takes one, as SOFA does; the robot\'s by default',
     )
-    refine: int = Field(default=1, ge=1, le=16, description="cut every element of the robot's rod into this number")
+    refine: int = Field(default=1, ge=1, le=16, description="number of pieces of every element of the robot's rod")
     threads: int | None = Field(default=None, ge=1, description="threads of the engine; one per processor by default")
 
     @model_validator(mode="after")

@@ -69,6 +69,7 @@ def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
     assert not far_off(known, both.x)
 
 
+@pytest.mark.slow
 def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_right(far):
     asked, *_ = far
     answer = audit(replace(asked, rules=replace(asked.rules, bootstraps=199)))
