@@ -43,7 +43,7 @@ class RecordingEntry(BaseModel):
         default=None, description="keep observation rows first to last only, both included, counted from 0"
     )
     every: int = Field(
-        default=1, ge=1, description="keep every so many of these rows: rows at rest are many, and alike"
+        default=1, ge=1, description="with k, keep each k-th of these rows: a fit of poses at rest needs few"
     )
     episodes: list[int] | None = Field(
         default=None, description="numbers of a LeRobotDataset's episodes; all by default"
@@ -98,7 +98,7 @@ class DataSpec(BaseModel):
         return self
 
     def piece(self, whole: Trajectory, rows: tuple[int, int] | None, every: int = 1) -> Trajectory:
-        """Every so many rows of first to last of a recording, with the commands of `lead_in`; all of it without rows.
+        """Each ``every``-th row of first to last of a recording, with the commands of `lead_in`; all of it without rows.
 
         Commands with a clock of their own may begin long before the recording does.
         """
