@@ -207,7 +207,7 @@ def write_first_files(
         outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=evidence)
         robot.write_text(robot_text(outline), encoding="utf-8")
         made = Robot.load(robot)
-        beside = {
+        beside: dict[str, Any] = {
             key: [names[column] for column in found.arrangement.columns]
             for key in ("commands", "tensions", "motor_angles")
             if (names := getattr(guess, key))
@@ -279,12 +279,11 @@ def _entries(
         entries = [{**entry, "commands": file} for entry, file in zip(entries, sent, strict=True)]
     elif guess.format == lerobot.FORMAT and len(entries) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
-        parts = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
-        entries = [{**entries[0], "episodes": part} for part in parts]
-    if parts and len(entries) == 1:
-        entries = entries * len(parts)
-    if len(parts) == len(entries):
-        entries = [{**entry, **part} for entry, part in zip(entries, parts, strict=True)]
+        shares = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
+        entries = [{**entries[0], "episodes": share} for share in shares]
+    if parts and len(entries) in (1, len(recordings)):
+        whole = entries * len(parts) if len(entries) == 1 else entries
+        entries = [{**entry, **part} for entry, part in zip(whole, parts, strict=True)]
     tables = [", ".join(f"{key} = {quoted(value)}" for key, value in entry.items()) for entry in entries]
     return [
         quoted(entry["observations"]) if len(entry) == 1 else f"{{{text}}}"
