@@ -59,11 +59,25 @@ MESH = Setting(
     },
 )
 
+# A hundred and twenty poses a recording, of a body with four times the elements; the zeros of its cables are unknown.
+REST = Setting(
+    commands=CommandsTable(
+        duration=60.0, interval=2.0, step=0.005, low=0.0, high=0.01, sample_time=0.5, recordings=["any"]
+    ),
+    audited={"motion": "quasi-static"},
+    made={"motion": "quasi-static", "refine": 4},
+    priors={
+        "young_modulus": {"distribution": "LogNormal", "median": 2e6, "sigma": 0.5},
+        "initial_displacement": {"distribution": "Normal", "loc": 0.0, "scale": 5e-4},
+    },
+)
+
 
 @dataclass(frozen=True)
 class Condition:
     """One kind of data set: how many effects of which size, whether the library has them, whether the audit is given
-    repeats, from which it takes the noise, whether markers share most of that, and whether the body is a mesh."""
+    repeats, from which it takes the noise, whether markers share most of that, and whether the body is a mesh or at
+    rest."""
 
     name: str
     effects: int
@@ -72,6 +86,7 @@ class Condition:
     repeats: bool = True
     shared: bool = False
     mesh: bool = False
+    rest: bool = False
 
     @property
     def right(self) -> tuple[str, ...]:
@@ -85,6 +100,8 @@ class Condition:
         """Meshes and time steps; where nothing is to be found, such that they differ by a rho of at most .02."""
         if self.mesh:
             return MESH
+        if self.rest:
+            return REST
         if self.effects:
             return Setting()
         audited, made = {"refine": 4, "time_step": 0.005}, {"refine": 5, "time_step": 0.05 / 11}
@@ -100,6 +117,8 @@ CONDITIONS = (
     Condition("null_without_repeats", 0, 0.0, repeats=False),
     Condition("null_shared_noise", 0, 0.0, shared=True),
     Condition("null_mesh", 0, 0.0, mesh=True),
+    Condition("rest_rho_0.5", 1, 0.5, rest=True),
+    Condition("null_rest", 0, 0.0, rest=True),
 )
 
 

@@ -75,17 +75,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
-# Rooms whose tests run programs of JAX once, for milliseconds. To optimise these takes a fifth of what such tests cost.
-UNOPTIMISED_ROOMS = ("bayes", "inference")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def programs_that_run_once_are_not_optimised(request: pytest.FixtureRequest):
-    """Let JAX compile in haste in `UNOPTIMISED_ROOMS`."""
-    room = request.path.relative_to(Path(__file__).parent).parts[0]
-    jax.config.update("jax_disable_most_optimizations", room in UNOPTIMISED_ROOMS)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+@pytest.hookimpl(tryfirst=True)  # before the fixtures, which compile as well
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let JAX compile in haste for tests that are not slow: they run each program for milliseconds, and to optimise it
+    takes a third of what they cost."""
+    jax.config.update("jax_disable_most_optimizations", item.get_closest_marker("slow") is None)
 
 
 MOST_MEMORY = 2.5e9  # bytes of a process above which what JAX compiled for earlier modules is dropped

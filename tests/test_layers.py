@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -73,6 +74,7 @@ def imported_modules(source: str, package: list[str]) -> set[str]:
     return names
 
 
+@functools.cache
 def imports_of(path: Path) -> set[str]:
     package = ["rfdropo_bayes", *path.relative_to(PACKAGE).parts[:-1]]
     return imported_modules(path.read_text(), package)

@@ -176,7 +176,7 @@ class ExtensionSearch:
         finer = None
         clock, forward = self.target.forward.deadline, self.target.forward
         count = screening_rollouts(self.target, free)
-        apart = 2.0 * forward.compiling if forward.lanes.costly and not without else 0.0  # of slow rollouts, and slopes
+        apart = 0.0 if without else forward.compiling * forward.lanes.later
         self.report(f"score tests of {len(free)} candidates: {count} rollouts, {about(count * forward.pace + apart)}")
         with clock.stage("screening"):
             probes = probe_all(self.target, fit, free)

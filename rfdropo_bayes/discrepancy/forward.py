@@ -103,6 +103,11 @@ class Lanes:
             return 3
         return 1 if self.difference <= STEP else 2
 
+    @property
+    def later(self) -> float:
+        """Time to compile what only rollouts with candidates need, in times that the first program takes."""
+        return 0.0
+
     def with_difference(self, step: float) -> Self:
         """The same with differences over another step."""
         changed = copy.copy(self)
@@ -186,6 +191,11 @@ class RoutedLanes(Lanes):
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
         self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    @property
+    def later(self) -> float:
+        """See `Lanes.later`: a program takes time as its mechanisms do, counted by their parameters."""
+        return len(self.slow.physical) / len(self.fast.physical) * (1.0 + self.slow.later)
 
     def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)

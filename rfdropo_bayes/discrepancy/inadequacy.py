@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS
+from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, RESIDUALS
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
 from rfdropo_bayes.inference import lasting_series
@@ -24,6 +24,7 @@ from rfdropo_bayes.inference import lasting_series
 POOR = 2.0  # squared residual per value, in the noise's variance, above which a model is misspecified
 ROUNDS = 6  # of noise and fit in turn
 SETTLED = 0.1  # relative change of the noise between rounds
+QUICK = 0.5  # share that the rows before predict, up to which residuals beside a misspecified model are noise
 
 
 def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
@@ -33,6 +34,21 @@ def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
         return False
     residual = known.recall("left", [x], lambda: {"residual": known.residual(x[None])[0]})["residual"]
     return bool(residual @ residual > POOR * np.count_nonzero(residual))
+
+
+def leaves_noise(before: Stacked, left: Stacked) -> bool:
+    """Whether residuals of an extended model are noise.
+
+    Poses that follow each other closely make any misfit slow. An autoregression would explain what is left of it, and
+    its innovations would give an artefact hundreds of nats. Beside a misspecified model, noise is therefore quick.
+
+    Args:
+        before: noise beside the base model.
+        left: noise beside the extended model.
+    """
+    if left.source == INNOVATIONS:
+        return False
+    return before.source != INNOVATIONS or max(part.remembered for part in left.parts) <= QUICK
 
 
 def fit_with_noise(

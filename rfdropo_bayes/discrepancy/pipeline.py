@@ -32,7 +32,7 @@ from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, Extension
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, noise_distance
 from rfdropo_bayes.discrepancy.held_out import HeldOut, Kept, keep_supported
-from rfdropo_bayes.discrepancy.inadequacy import as_measured, spread
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, leaves_noise, spread
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.naming import Named, name_causes, without_each_other
 from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
@@ -408,8 +408,9 @@ def _named(begun: Named) -> Iterator[Named]:
     target = first.search.target
     if not first.steps or target.measured.noise.source not in (RESIDUALS, INNOVATIONS):
         return
+    before = target.measured.noise
     target = replace(target.measured, noise=residual_noise(first.judge, first.fit))
-    if target.noise.source == INNOVATIONS:  # as far off as before
+    if not leaves_noise(before, target.noise):
         return
     begun.search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
     *_, again = name_causes(begun.search.under(target), climb(target, first.base.x, first.base.free))

@@ -205,9 +205,23 @@ def physical_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float
 
 def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *, where: str) -> None:
     """Raise InputError for a parameter that the model does not have, and name the mechanism that has it."""
-    specs, chosen = model_specs(spec, simulator), asdict(spec.channels)
+    specs = model_specs(spec, simulator)
     known = [each.name for each in specs]
-    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
+    unknown = [name for name in names if name not in known and not any(each.startswith(f"{name}_") for each in known)]
+    further = parameters_elsewhere(spec, simulator) if unknown else {}
+    for name in unknown:
+        for remedy, absent in further.items():
+            if name in [each.name for each in absent]:
+                raise InputError(f"the model has no parameter {name!r}", where=where, remedy=f"{remedy}, or remove it")
+        check_names([name], specs, where=where)
+
+
+def parameters_elsewhere(spec: ModelSpec, simulator: AnySimulator) -> dict[str, Sequence[ParameterSpec]]:
+    """Parameters that a model could have, by the change of the model that adds them."""
+    chosen = asdict(spec.channels)
+    further: dict[str, Sequence[ParameterSpec]] = {
+        f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]
+    }
     if spec.simulator.motion == QUASI_STATIC:
         damping = {name: found for name, found in robot_of(spec).parameters.items() if name in DAMPING}
         further['set [simulator] motion = "dynamic"'] = specs_of(damping)
@@ -215,13 +229,7 @@ def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *
     further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
     for mechanism in mechanisms_named(REGISTRY, simulator.robot):
         further[f"add {mechanism.name!r} to [model] mechanisms"] = mechanism.parameters
-    for name in names:
-        if name in known or any(each.startswith(f"{name}_") for each in known):
-            continue
-        for remedy, absent in further.items():
-            if name in [each.name for each in absent]:
-                raise InputError(f"the model has no parameter {name!r}", where=where, remedy=f"{remedy}, or remove it")
-        check_names([name], specs, where=where)
+    return further
 
 
 def check_spec(spec: ModelSpec, simulator: AnySimulator) -> None:

@@ -355,7 +355,7 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
 
 def _require_mechanisms(missing: Sequence[str], robot: Robot | BlackBox | None, where: str) -> None:
     """Raise an InputError if a parameter that the simulator lacks belongs to a mechanism of the library."""
-    for name in REGISTRY:
+    for name in REGISTRY if missing else ():
         (mechanism,) = mechanisms_named([name], robot)
         own = [spec.name for spec in mechanism.parameters if spec.name in missing]
         if own:

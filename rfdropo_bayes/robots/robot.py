@@ -394,9 +394,7 @@ class Robot(RobotTable):
             if parameter.each == "cable":
                 for cable in (each.name for each in self.cables if each.unit == "m"):
                     described = f"{parameter.description} (cable {cable})"
-                    table[f"{name}_{cable}"] = changed(
-                        parameter, where=f"robot {self.name}", description=described, each=None
-                    )
+                    table[f"{name}_{cable}"] = parameter.model_copy(update={"description": described, "each": None})
             else:
                 table[name] = parameter
         return table

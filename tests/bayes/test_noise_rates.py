@@ -59,6 +59,7 @@ def test_a_longer_memory_is_read_at_the_lags_of_other_rates():
     np.testing.assert_allclose(noise.resampled(2.0 * SLOW).autocorrelation, np.array(lags)[[0, 2, 4, 6]])
 
 
+@pytest.mark.slow
 def test_draws_forget_after_the_same_time_at_every_rate():
     """4000 draws know a correlation to 0.016; four times that."""
     noise, rows = FIRST.at(STEPS), 6

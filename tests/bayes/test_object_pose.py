@@ -197,6 +197,7 @@ def test_what_is_lacking_is_said():
         ObjectPose.gather(object(), [recording()], 30)
 
 
+@pytest.mark.slow
 def test_methods_that_compare_rollouts_see_the_way_and_the_turn_of_the_body():
     """Columns are those of the tip, of the centre and of the turn; noise has the sizes and the start of the model's."""
     chosen = problem(recording(), lost=(7,))

@@ -27,6 +27,9 @@ SPECS = (
     ParameterSpec("offset_x", "m", -0.1, 0.1, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.01}, ""),
 )
 
+DRAWS = 4000
+"""One number for all tests: JAX compiles its random numbers for each shape."""
+
 
 def space():
     return build_scopes(
@@ -35,7 +38,7 @@ def space():
 
 
 def test_a_parameter_of_single_recordings_is_free_there_and_absent_elsewhere():
-    values = space().sample(jax.random.key(0), 3)
+    values = space().sample(jax.random.key(0), DRAWS)
     assert set(values) == {"young_modulus", "poisson_ratio", "offset_x@a", "offset_x@b"}
     np.testing.assert_array_equal(space().values_in("b", values)["offset_x"], values["offset_x@b"])
     assert space().values_in("c", values)["offset_x"] == 0.0  # the nominal one
@@ -54,7 +57,7 @@ def test_a_parameter_of_single_recordings_is_free_there_and_absent_elsewhere():
 def test_a_prior_ends_where_it_says_or_at_the_hard_bounds(prior, ends):
     parameter = build_scopes(SPECS, {"young_modulus": prior}, {}, ["a"])["young_modulus"]
     np.testing.assert_allclose(parameter.ends, ends, rtol=1e-6)
-    drawn = parameter.prior.sample(jax.random.key(2), (500,))
+    drawn = parameter.prior.sample(jax.random.key(2), (DRAWS,))
     assert np.all((drawn >= ends[0]) & (drawn <= ends[1]))
 
 
@@ -73,13 +76,16 @@ def test_a_prior_without_ends_or_with_one_has_no_more(bounds, prior, ends):
 
 def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobian():
     chosen = space()
-    values = chosen.sample(jax.random.key(1), 50)
+    values = chosen.sample(jax.random.key(1), DRAWS)
     u = chosen.to_unconstrained(values)
     back = chosen.from_unconstrained(u)
     for name in chosen.names:
         np.testing.assert_allclose(back[name], values[name], rtol=1e-10)
     # Density in u = density in physical units times |dx/du|, the latter by automatic differentiation.
-    slope = jax.vmap(jax.jacfwd(lambda row: jnp.stack([chosen.from_unconstrained(row)[n] for n in chosen.names])))(u)
+    whole = jax.jit(
+        jax.vmap(jax.jacfwd(lambda row: jnp.stack([chosen.from_unconstrained(row)[n] for n in chosen.names])))
+    )
+    slope = whole(u)
     expected = chosen.log_prior(values) + jnp.linalg.slogdet(slope)[1]
     np.testing.assert_allclose(chosen.log_prior_unconstrained(u), expected, rtol=1e-9)
 
@@ -128,7 +134,7 @@ def test_groups_of_recordings_deviate_from_what_all_share():
     chosen = pooled_space()
     deviations = {f"offset_x_deviation@{group}" for group in ("january", "april", "c")}
     assert set(chosen.names) == {"young_modulus", "offset_x", *deviations}
-    values = chosen.sample(jax.random.key(0), 4000)
+    values = chosen.sample(jax.random.key(0), DRAWS)
     own = {r: chosen.values_in(r, values)["offset_x"] for r in ("a1", "a2", "b", "c")}
     np.testing.assert_array_equal(own["a1"], own["a2"])
     np.testing.assert_allclose(own["b"] - own["a1"], sum_of(values, "april") - sum_of(values, "january"), atol=1e-15)
@@ -143,15 +149,15 @@ def sum_of(values, group):
 
 def test_a_climb_starts_from_a_group_s_own_deviation_and_from_no_other_s():
     earlier = {"offset_x": {"": np.full(3, 0.01)}, "offset_x_deviation": {"january": np.full(3, 0.001)}}
-    values = pooled_space().sample_around(earlier, jax.random.key(1), 50)
+    values = pooled_space().sample_around(earlier, jax.random.key(1), DRAWS)
     np.testing.assert_allclose(values["offset_x_deviation@january"], 0.001, rtol=1e-12)
-    assert len(np.unique(values["offset_x_deviation@april"])) == 50
+    assert len(np.unique(values["offset_x_deviation@april"])) == DRAWS
 
 
 def test_the_first_draw_around_an_earlier_posterior_is_its_first():
     earlier = {"young_modulus": {"": np.linspace(1.1e6, 2e6, 30)}, "offset_x": {"": np.linspace(0.001, 0.01, 30)}}
-    for seed in range(5):
-        values = pooled_space().sample_around(earlier, jax.random.key(seed), 3)
+    for seed in range(3):
+        values = pooled_space().sample_around(earlier, jax.random.key(seed), DRAWS)
         np.testing.assert_allclose(values["young_modulus"][0], 1.1e6)
         assert values["offset_x"][0] == pytest.approx(0.001)
         assert len(np.unique(values["young_modulus"])) > 1
@@ -194,15 +200,18 @@ def test_a_spread_between_groups_that_is_inferred_is_that_of_the_deviations():
     Jacobian; held at a value, the space is that of a known spread."""
     space = hierarchical()
     assert space.scales == {"offset_spread": tuple(f"offset_x_deviation@{g}" for g in ("january", "april", "c"))}
-    values = space.sample(jax.random.key(0), 20000)
+    values = space.sample(jax.random.key(0), DRAWS)
     ratio = values["offset_x_deviation@april"] / values["offset_spread"]
-    assert np.std(ratio) == pytest.approx(1.0, rel=0.03)  # 5 standard errors
-    assert np.std(values["offset_spread"]) == pytest.approx(0.002 * np.sqrt(1 - 2 / np.pi), rel=0.05)
-    few = {name: column[:20] for name, column in values.items()}
-    u = space.to_unconstrained(few)
-    np.testing.assert_allclose(space.from_unconstrained(u)["offset_x_deviation@c"], few["offset_x_deviation@c"])
-    slope = jax.vmap(jax.jacfwd(lambda row: jnp.stack([space.from_unconstrained(row)[n] for n in space.names])))(u)
-    expected = space.log_prior(few) + jnp.linalg.slogdet(slope)[1]
+    assert np.std(ratio) == pytest.approx(1.0, rel=0.06)  # 5 standard errors
+    assert np.std(values["offset_spread"]) == pytest.approx(0.002 * np.sqrt(1 - 2 / np.pi), rel=0.08)
+    u = space.to_unconstrained(values)
+    back = space.from_unconstrained(u)["offset_x_deviation@c"]
+    np.testing.assert_allclose(back, values["offset_x_deviation@c"], rtol=1e-7, atol=1e-15)
+    whole = jax.jit(
+        jax.vmap(jax.jacfwd(lambda row: jnp.stack([space.from_unconstrained(row)[n] for n in space.names])))
+    )
+    slope = whole(u)
+    expected = space.log_prior(values) + jnp.linalg.slogdet(slope)[1]
     np.testing.assert_allclose(space.log_prior_unconstrained(u), expected, rtol=1e-9)
     held = hierarchical(0.001)
     assert "offset_spread" not in held.names
@@ -239,7 +248,7 @@ def test_a_posterior_says_whose_each_parameter_is():
 
 def test_what_is_held_acts_where_it_did():
     chosen = every_kind()
-    values = {name: float(column[0]) for name, column in chosen.sample(jax.random.key(0), 1).items()}
+    values = {name: float(column[0]) for name, column in chosen.sample(jax.random.key(0), DRAWS).items()}
     held = {name: values[name] for name in ("offset_x_deviation@january", "poisson_ratio@b", "young_modulus")}
     rest = {name: value for name, value in values.items() if name not in held}
     for recording in ("a1", "b", "c"):

@@ -92,7 +92,7 @@ def serve_on_one_processor(folder: Path, plant: str, where: str) -> str:
     [
         # Linux clears the threads of an ended process out of /proc, and whoever waits for the process helps.
         pytest.param("with_threads", "own", marks=pytest.mark.slow),
-        ("Slow", "here"),
+        pytest.param("Slow", "here", marks=pytest.mark.slow),
     ],
 )
 def test_drives_on_one_processor_answer_and_end(tmp_path: Path, plant: str, where: str) -> None:

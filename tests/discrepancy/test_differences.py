@@ -126,6 +126,7 @@ def test_what_both_days_lack_is_no_difference():
     assert "No parameter and no mechanism is found to differ" in content["sentence"]
 
 
+@pytest.mark.slow
 def test_nothing_is_named_where_nothing_changed():
     content = found(compared({}, {}, 5))
     assert content["verdict"] == "no_discrepancy"

@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, REPEATS, RESIDUALS
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.base_fit import base_model, first_target, residual_noise
 from rfdropo_bayes.discrepancy.extension import ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import climb
-from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, far_off, spread
+from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, far_off, leaves_noise, spread
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.pipeline import audit
 
@@ -67,6 +69,7 @@ def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
     assert not far_off(known, both.x)
 
 
+@pytest.mark.slow
 def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_right(far):
     asked, *_ = far
     answer = audit(replace(asked, rules=replace(asked.rules, bootstraps=199)))
@@ -95,3 +98,20 @@ def test_slow_residuals_are_a_misfit_and_no_autoregression_explains_them():
     assert np.mean(found["slow"].scale) < 10.0 * NOISE  # of waves of 14 in the root mean square
     assert (found["quick"].source, found["quick"].order) == (RESIDUALS, 1)
     np.testing.assert_allclose(np.mean(found["quick"].scale), NOISE, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("before", "left", "memory", "noise"),
+    [
+        (INNOVATIONS, RESIDUALS, 0.93, False),  # 86 % predicted: less than before, and still a misfit
+        (INNOVATIONS, RESIDUALS, 0.6, True),
+        (RESIDUALS, RESIDUALS, 0.93, True),  # the base model's own noise was such an autoregression
+        (RESIDUALS, INNOVATIONS, 0.0, False),
+    ],
+)
+def test_beside_a_misspecified_model_only_quick_residuals_are_noise(before, left, memory, noise):
+    first, second = (
+        Stacked((Autoregression(np.full(3, NOISE), np.array([1.0, rho]), source, np.inf),))
+        for source, rho in ((before, 0.0), (left, memory))
+    )
+    assert leaves_noise(first, second) == noise

@@ -299,6 +299,7 @@ def test_signals_are_timed_from_the_first_row_on():
     np.testing.assert_allclose(early.centre, plain.centre - 4 * STEP, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_law_that_follows_the_motion_takes_no_rollouts_for_what_is_measured():
     """A term at a marker beside one on the body: the first changes what is seen, and the second alone what moves."""
     question = asked(101)

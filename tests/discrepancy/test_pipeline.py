@@ -149,6 +149,7 @@ def on_a_coarse_mesh(asked, error=LARGE, left=0.0):
     return replace(asked, lanes=Lanes(Coarse(error), np.arange(4)), finer=(finer, commands))
 
 
+@pytest.mark.slow
 def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
     """Once the finer simulator is the model, candidates are refitted, and recordings predicted, with it."""
     answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 0.15}, 102)))
@@ -287,6 +288,7 @@ def run_out(clock):
     clock.looks = 0
 
 
+@pytest.mark.slow
 def test_an_audit_whose_time_is_up_before_a_refit_says_which_candidates_stand_out():
     answer, content = stopped_at("joint test", run_out)
     assert (content["verdict"], content["out_of_time"], content["stopped"]) == ("no_verdict", True, "time")
@@ -319,6 +321,7 @@ def test_ctrl_c_ends_an_audit_with_what_is_known():
     assert [finding["mechanism"] for finding in content["findings"]] == ["play"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [None, {"gain": 1.0, "bend": 0.0}])
 def test_the_rollouts_that_are_announced_for_the_base_model_are_about_those_it_takes(start):
     lines: list[str] = []
@@ -452,6 +455,7 @@ class Stopping(Toy):
         return super().rollout(values | {"play": 20.0 * jnp.maximum(values["play"] - 1.0, 0.0)}, commands, steps)
 
 
+@pytest.mark.slow
 def test_an_effect_is_found_between_a_point_that_does_nothing_and_one_that_does_far_too_much():
     asked = replace(problem({**TRUTH, "play": 0.4}, 2), lanes=Lanes(Stopping(), np.arange(4)))  # at 1.02 here
     target, base = base_model(asked, 0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.base_fit import base_model
@@ -51,6 +52,7 @@ class Ridge(Toy):
         return super().rollout(values | {"delay": ratio, "bend": jnp.zeros(())}, commands, steps)
 
 
+@pytest.mark.slow
 def test_a_wider_prior_leaves_a_ratio_that_motion_tells_however_curved_its_line_is():
     """A first-order step to the wider prior leaves the line on which the ratio is constant."""
     asked = problem({"gain": 1.3, "bend": 0.0, "delay": 40.0}, 3)

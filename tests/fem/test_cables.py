@@ -63,6 +63,7 @@ def test_many_nearly_dependent_cables_never_fail(seed):
     assert np.all(np.abs(left + longest)[tension > 1e-9 * tension.max()] < 1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_of_cables_is_solved_as_each():
     rng = np.random.default_rng(0)
     factor = rng.normal(size=(40, 5, 4))
@@ -97,14 +98,19 @@ def test_rows_are_the_derivatives_of_the_lengths(places):
         frame = rotation(turned(quaternion, change[3:]))
         return lengths(courses(layout, thread, position + change[:3], frame))
 
-    course = courses(layout, thread, position, rotation(quaternion))
-    rows = station_rows(layout, thread, course.lever, course.pull, 5)
-    expected = jax.jacobian(length)(jnp.zeros((6, 5)))
+    @jax.jit
+    def course_and_rows(place, turn):
+        course = courses(layout, thread, place, rotation(turn))
+        return course, station_rows(layout, thread, course.lever, course.pull, 5)
+
+    course, rows = course_and_rows(position, quaternion)
+    expected = jax.jit(jax.jacobian(length))(jnp.zeros((6, 5)))
     np.testing.assert_allclose(jnp.moveaxis(rows, 2, 0), jnp.swapaxes(expected, 1, 2), atol=1e-13)
-    on_lanes = jax.vmap(laned(lambda p, q, t: courses(layout, t, p, rotation(q))), (0, 0, None))
+    on_lanes = jax.jit(jax.vmap(laned(lambda p, q, t: courses(layout, t, p, rotation(q))), (0, 0, None)))
     many = on_lanes(position[None], quaternion[None], thread)
     np.testing.assert_allclose(many.length[0], course.length, rtol=1e-14)
-    listed = laned(lambda lever, pull, t: station_rows(layout, t, lever, pull, 5))(course.lever, course.pull, thread)
+    listing = jax.jit(laned(lambda lever, pull, t: station_rows(layout, t, lever, pull, 5)))
+    listed = listing(course.lever, course.pull, thread)
     np.testing.assert_allclose(listed, rows, atol=1e-15)
     for route, points, anchor, rest in zip(
         routes(layout, BODY), guides, ANCHORS, rest_lengths(layout, BODY), strict=False

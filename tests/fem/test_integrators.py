@@ -170,6 +170,7 @@ def test_a_still_bar_stays_still_for_a_minute():
     assert np.abs(found.position - found.position[:, :1]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_energy_is_not_gained():
     """A bar that is let go swings, without any damping of its own: what the steps lose is little, and never gained."""
     system, _, _ = bar()

@@ -49,6 +49,7 @@ def settled():
     return run(*loads())
 
 
+@pytest.mark.slow
 def test_large_deflections_are_the_published_ones(settled):
     state, info = settled
     assert np.all(info.converged)

@@ -53,6 +53,7 @@ def stiff_and_heavy(system: fem.System, material: fem.Material) -> tuple[np.ndar
     return np.asarray(whole - mass)[np.ix_(free, free)], np.asarray(mass)[np.ix_(free, free)]
 
 
+@pytest.mark.slow
 def test_frequencies_are_those_of_beams():
     """Bending of a slender cantilever (Euler and Bernoulli), and its twist and stretch."""
     length, elements = 1.0, 20

@@ -13,7 +13,14 @@ ASK = "from rfdropo_bayes.fem.native.simd import native_lanes; print(native_lane
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names of x86-64 processors")
-@pytest.mark.parametrize(("name", "lanes"), [("x86-64-v2", "2 4"), ("x86-64-v3", "4 8"), ("x86-64-v4", "8 16")])
+@pytest.mark.parametrize(
+    ("name", "lanes"),
+    [
+        pytest.param("x86-64-v2", "2 4", marks=pytest.mark.slow),
+        ("x86-64-v3", "4 8"),
+        pytest.param("x86-64-v4", "8 16", marks=pytest.mark.slow),
+    ],
+)
 def test_lanes_fill_the_registers_of_the_processor_that_is_compiled_for(name, lanes) -> None:
     variables = {**os.environ, "NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""}
     assert subprocess.check_output([sys.executable, "-c", ASK], env=variables, text=True).strip() == lanes

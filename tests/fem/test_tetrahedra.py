@@ -126,6 +126,7 @@ def pulled_beam(frames):
     return body, route_cables(body, anchors, guides), locate(body, np.array([[0.01, 0.01, 0.08], [0.004, 0.015, 0.05]]))
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_batch_lane_or_threads():
     body, cables, points = pulled_beam("polar")
     rng = np.random.default_rng(5)

@@ -156,6 +156,7 @@ def test_a_critic_that_sees_the_gain_knows_what_an_episode_is_worth(tmp_path, cr
     assert low < np.corrcoef(values, gains)[0, 1] < high
 
 
+@pytest.mark.slow
 def test_a_training_is_reproducible_and_goes_on_after_a_kill(tmp_path) -> None:
     """Bit for bit, and the input floor acts as without parameters."""
     whole = train(Points, TABLE, tmp_path / "whole", seed=3, gamma=0.9)

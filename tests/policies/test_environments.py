@@ -127,6 +127,7 @@ def test_gymnasium_makes_the_tasks_by_name() -> None:
     assert np.array_equal(seen[:, 63:66], info["goal"].astype(np.float32))
 
 
+@pytest.mark.slow
 def test_an_episode_is_recorded_as_a_video(tmp_path) -> None:
     pytest.importorskip("moviepy", reason="an extra that RecordVideo needs")
     env = gymnasium.make(REACH, actions="continuous", render_mode="rgb_array", period=0.1)

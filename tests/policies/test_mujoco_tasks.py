@@ -77,6 +77,7 @@ def test_what_a_task_needs_is_said(tmp_path, text, changes, said):
         )
 
 
+@pytest.mark.slow
 def test_the_pull_of_an_actuator_is_told_and_limited_where_it_is_named_a_cable(tmp_path):
     """An episode's largest pull is that of a whole rollout, the force that a new command exerts at once included."""
     model = model_of(tmp_path, cables={"b": "b"})

@@ -73,6 +73,7 @@ def test_failed_simulations_are_counted():
     assert told[0].startswith("3 of 100 simulations failed")
 
 
+@pytest.mark.slow
 def test_stopped_episodes_are_counted_and_leave_a_median_that_is_no_number():
     seen = played(failed=1)
     pulls = [replace(each, tension=100.0, stopped=each.case > 40) for each in seen.episodes]
@@ -103,7 +104,7 @@ def test_the_page_tells_of_tensions_and_of_what_speaks_against_the_posterior():
     assert "Warning" not in render_policy(SUMMARY, seen, "My arm", "")
 
 
-@pytest.mark.parametrize("count", [1, 4, 7])
+@pytest.mark.parametrize("count", [1, 4, pytest.param(7, marks=pytest.mark.slow)])
 def test_every_parameter_has_its_panel_however_the_grid_fills(count: int):
     values = {f"p{k}": np.linspace(1.0, 2.0, 20) for k in range(count)}
     figure = draws_figure(values, np.full(20, 0.01))

@@ -52,6 +52,7 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
     assert np.corrcoef(drawn)[0, 1] == pytest.approx(covariance[0, 1] / sd.prod(), abs=0.1)
 
 
+@pytest.mark.slow
 def test_coordinates_that_err_together_count_as_fewer():
     """Eight coordinates with a correlation of 0.9 are seldom better than one: 120 days, whose zeros are known.
 

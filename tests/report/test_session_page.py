@@ -110,7 +110,7 @@ def test_commands_that_no_drive_carried_out_are_no_data():
     assert not any("under fit" in step for step in steps)
 
 
-@pytest.mark.parametrize(("channels", "rows"), [(1, 20), (9, 20), (2, 6)])
+@pytest.mark.parametrize(("channels", "rows"), [(1, 20), pytest.param(9, 20, marks=pytest.mark.slow), (2, 6)])
 def test_a_page_is_drawn_for_any_number_of_drives(channels, rows):
     page = render_session(session(channels=channels, rows=rows))
     assert page.count("<td>a very long") == channels

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.native.rod_engine import NativeRod
+from rfdropo_bayes.fem.section_loads import SectionLoads
 from rfdropo_bayes.robots import Cone, Cylinder, Disks, Robot, Tube, known_robots, section_profile
 
 L, R, TIP = 0.2, 0.014, 0.009
@@ -79,18 +82,17 @@ def test_sections_follow_each_other():
 
 def test_a_force_at_the_tip_bends_disks_as_a_stepped_beam():
     """Euler and Bernoulli's deflection, integral of F (L - z)^2 / E I; short steps of a slender beam, 2 %."""
-    import jax.numpy as jnp
-
-    from rfdropo_bayes import fem
-
     young, force, length = 1e6, 1e-4, 0.2
     body = section_profile([Disks(length_m=length, disks=5, radius_m=0.01, thickness_m=0.01, backbone_radius_m=0.003)])
-    system = fem.System(fem.profile_rod(**body.arrays()), fem.without_cables())
+    rod = fem.profile_rod(**body.arrays())
+    system, end = fem.System(rod, fem.without_cables()), fem.attach(rod, np.array([[0.0, 0.0, length]]))
     material = fem.material(system, young_modulus=young, poisson_ratio=0.45, density=1.0, gravity=(0.0, 0.0, 0.0))
-    acting = jnp.zeros((len(body.station_m), 6)).at[-1, 0].set(force)
-    found, info = fem.static_equilibrium(system, fem.prepare(system, material), jnp.zeros(0), acting)
-    assert bool(info.converged)
-    tip = float(found.position[-1, 0])
+    none, rows = np.zeros((1, 2)), np.tile([force, 0.0, 0.0], (1, 2, 1, 1))
+    loads = SectionLoads(rows, none, none, np.zeros((1, 2, 3)), (len(body.station_m) - 1,))
+    rest = NativeRod(system, end, 0.01, threads=1, integrator="quasi-static")
+    found = rest.rollout(material, np.zeros((1, 1, 0)), loads=loads)
+    assert found.converged.all()
+    tip = found.position[0, -1, 0, 0]
     z = np.array(body.station_m)
     steps = (length - z[:-1]) ** 3 - (length - z[1:]) ** 3
     expected = np.sum(force * steps / (3 * young * np.array(body.bending_moment_area_m4)[:, 0]))

@@ -108,6 +108,7 @@ def test_a_batch_is_one_call_and_a_lost_rollout_leaves_its_neighbours_alone(sofa
     assert np.isfinite(together.position).all()
 
 
+@pytest.mark.slow
 def test_a_prefix_has_the_rows_of_the_whole(sofa):
     commands = pulls(sofa)
     whole, part = sofa.rollout({}, commands), sofa.rollout({}, commands, jnp.asarray(10))
@@ -121,6 +122,7 @@ def test_single_precision_stays_close(mesh, sofa):
     np.testing.assert_allclose(single.position, sofa.rollout({}, commands).position, atol=3e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_motion(sofa):
     commands = pulls(sofa)
 
@@ -133,6 +135,7 @@ def test_derivatives_are_those_of_the_motion(sofa):
     np.testing.assert_allclose(slope, (tip(young + step) - tip(young - step)) / (2 * step), rtol=1e-3, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_pretension_pulls_before_any_command(mesh, sofa):
     commands = pulls(sofa)._replace(step=np.zeros((30, 8)))
     slack = sofa.rollout({}, commands).tension
@@ -149,6 +152,7 @@ def test_drives_of_the_robot_stop_at_their_limits(mesh):
     assert float(simulator.displacements(values, commands).max()) == pytest.approx(0.07)
 
 
+@pytest.mark.slow
 def test_body_mechanisms_are_nested_and_act(mesh, sofa):
     names = ["payload", "stiffness_gradient", "base_tilt"]
     extended = trunk(mesh, mechanisms=names, **SOFA)

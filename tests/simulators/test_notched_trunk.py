@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.linalg import eigh
 
 from rfdropo_bayes import fem
@@ -19,6 +20,7 @@ from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assem
 SOLID = {0.3: (0.66627, 0.74924, 3.36383), 0.45: (0.57813, 0.81058, 3.67431), 0.49: (0.41748, 0.95778, 4.34233)}
 
 
+@pytest.mark.slow
 def test_sag_and_modes_are_those_of_the_solid():
     """By the second derivatives of the elastic energy at rest."""
     robot, discretisation = Robot.load("trunk_sofa"), Discretisation(0.01)

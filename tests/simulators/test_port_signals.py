@@ -119,6 +119,7 @@ def test_levels_are_read_linearly_and_stand_still_beyond_the_ends():
     assert np.allclose(slope[1:], [-1.0, -3.0, -5.0])
 
 
+@pytest.mark.slow
 def test_signals_on_a_body_with_a_cube_are_refused():
     simulator = build_robot_simulator(
         ModelSpec(find_robot("trunk_sofa", Path()), simulator=SimulatorTable(push=True, time_step=STEP))

@@ -142,6 +142,7 @@ def test_a_batch_gives_the_numbers_of_its_rollouts(rollout, trunk, commands, pre
     np.testing.assert_array_equal(again.object_pose[4:8], found.object_pose)
 
 
+@pytest.mark.slow
 def test_touching_surfaces_keep_their_distance(rollout):
     """The trunk lies on the cube: no point comes nearer than the contact distance, beyond the step's linearisation."""
     found = rollout(cube_mass=5.0, friction=0.9, cube_y=REST_HEIGHT)
@@ -160,7 +161,7 @@ def test_contacts_act_equally_on_both_sides():
     scene, rest = pushing.engine.scene, state_at_rest(assembly.system)
     values = pushing.complete({"cube_y": jnp.asarray(-0.035), "cube_yaw": jnp.asarray(0.3)})
     cube, start = pushing.body_inputs(values)[1]
-    touch = find_contacts(scene, cube, start, rest.position, rest.orientation)
+    touch = jax.jit(lambda: find_contacts(scene, cube, start, rest.position, rest.orientation))()
     rows = np.moveaxis(np.asarray(touch.rows), 2, 0)  # (row, station, 6)
     on_trunk, on_cube = rows.reshape(-1, 3, *rows.shape[1:]), np.asarray(touch.on_cube)
     between = slice(8, 8 + (len(on_cube) - 8) // 2)
@@ -226,6 +227,7 @@ def test_derivatives_pass_through_sliding_contacts(beside, commands):
         np.testing.assert_allclose(found, (ahead - behind) / (2.0 * step), rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_rollout_that_is_lost_says_so(rollout):
     assert int(rollout(cube_mass=float("nan")).status) == Result.DIVERGED
 

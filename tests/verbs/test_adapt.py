@@ -59,6 +59,7 @@ def fit(zeros):
     return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, screen=32), test=unseen, seed=0, show=False)
 
 
+@pytest.mark.slow
 def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
@@ -224,6 +225,7 @@ def test_the_folder_of_a_day_keeps_the_values_of_the_recordings_that_were_fitted
         assert again.record.flat(name).mean() == pytest.approx(found.record.flat(name).mean(), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_errors_last_as_long_in_rows_of_another_rate(adapted):
     """The model's error forgets its sign over one row of the fit; nothing moves along y. Standard error: 0.02."""
     for step in (STEP, 2.0 * STEP):
@@ -252,6 +254,7 @@ def test_as_many_draws_as_were_asked_for_are_no_verdict(adapted):
     assert adapted.verdict != "unsafe"
 
 
+@pytest.mark.slow
 def test_a_piece_of_a_recording_belongs_to_its_group(known, zeros):
     """By name in the fit and in the prediction of a further piece."""
     run = recorded(["morning"], zeros[9:10], 30)[0]
@@ -329,6 +332,7 @@ def test_fitted_days_under_other_commands_are_unseen(zeros):
     assert of_unseen_days([repeat, other, new], DAYS, days, None) == ["new"]
 
 
+@pytest.mark.slow
 def test_what_is_masked_after_the_first_seconds_is_no_rest(known, zeros):
     run = recorded(["b"], zeros[1:2], 51)[0]
     mask = run.position_mask & (run.time < 0.5)[:, None]
@@ -448,6 +452,7 @@ def test_the_command_refuses_a_folder_without_a_posterior(tmp_path):
     assert "holds no posterior.nc" in str(found.exception)
 
 
+@pytest.mark.slow
 def test_a_day_that_one_row_determines_needs_no_motion() -> None:
     assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=0.0), 0.0, 0.002, 0.005).startswith(
         "The first row"

@@ -19,10 +19,10 @@ from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs import check as check_verb
+from rfdropo_bayes.verbs import numerical_error
 from rfdropo_bayes.verbs.check import Check, run_check
 from rfdropo_bayes.verbs.motion_direction import Direction, Paths, direction_doubt, direction_of
 from rfdropo_bayes.verbs.numerical_error import (
-    NumericalError,
     measure_numerical_error,
     nominal_markers,
     numerical_error_lines,
@@ -55,27 +55,40 @@ def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> 
         monkeypatch.setattr(check_verb, "save_recording", lambda recording, rest, file: file.touch())
 
 
-def checked(
-    tmp_path: Path, commands: str = FOUR, more: str = "", priors: str = "young_modulus", time: np.ndarray | None = None
-) -> Check:
-    """What check says of a recording of the demo that was written as CSV, with other times where they are given."""
-    demo = Trajectory.load(DEMO)
-    columns = {"t": demo.time if time is None else time}
-    for k, point in enumerate(np.moveaxis(demo.position, 1, 0), start=1):
+@cache
+def demo() -> Trajectory:
+    """The recording that all tests change."""
+    return Trajectory.load(DEMO)
+
+
+@cache
+def demo_table() -> pd.DataFrame:
+    """The demo in millimetres, as a CSV file has it."""
+    columns = {"t": demo().time}
+    for k, point in enumerate(np.moveaxis(demo().position, 1, 0), start=1):
         columns |= {f"{axis}{k}": 1e3 * point[:, i] for i, axis in enumerate("xyz")}
-    columns |= {f"c{k}": 1e3 * values for k, values in enumerate(demo.command_at(demo.time).T, start=1)}
-    pd.DataFrame(columns).to_csv(tmp_path / "run.csv", index=False)
+    columns |= {f"c{k}": 1e3 * values for k, values in enumerate(demo().command_at(demo().time).T, start=1)}
+    return pd.DataFrame(columns)
+
+
+def written(
+    tmp_path: Path, commands: str = FOUR, more: str = "", priors: str = "young_modulus", time: np.ndarray | None = None
+) -> Path:
+    """An experiment with a recording of the demo that was written as CSV, with other times where they are given."""
+    table = demo_table() if time is None else demo_table().assign(t=time)
+    table.to_csv(tmp_path / "run.csv", index=False)
     path = tmp_path / "own.toml"
     path.write_text(EXPERIMENT.format(commands=commands, more=more, priors=priors))
-    return run_check(path, tmp_path / "pictures")
+    return path
+
+
+def checked(tmp_path: Path, **changes) -> Check:
+    """What check says of what was `written`."""
+    return run_check(written(tmp_path, **changes), tmp_path / "pictures")
 
 
 def demo_spec(integrator: str) -> ModelSpec:
     return ModelSpec(Robot.load("smooth_arm"), simulator=SimulatorTable(integrator=integrator))
-
-
-def demo_error(integrator: str) -> NumericalError:
-    return measure_numerical_error(demo_spec(integrator), Trajectory.load(DEMO))
 
 
 def text_of(found: Check) -> str:
@@ -126,20 +139,19 @@ def test_everything_that_is_wrong_is_said_at_once(tmp_path):
     assert any("did you mean 'young_modulus'" in p for p in mistyped.problems)
 
 
-def moved(change) -> tuple[list[str], Trajectory]:
+def moved(change) -> list[str]:
     """Hints for a recording of the demo whose positions were changed."""
-    demo = Trajectory.load(DEMO)
-    dataset = demo.dataset.copy(deep=True)
-    dataset["position"] = dataset["position"].copy(data=change(demo.position))
-    return placement_hints(Robot.load("smooth_arm"), Trajectory(dataset)), demo
+    dataset = demo().dataset.copy(deep=True)
+    dataset["position"] = dataset["position"].copy(data=change(demo().position))
+    return placement_hints(Robot.load("smooth_arm"), Trajectory(dataset))
 
 
 def test_a_recording_in_place_needs_no_hint():
-    assert moved(lambda position: position)[0] == []
+    assert moved(lambda position: position) == []
 
 
 def test_a_moved_origin_is_named():
-    (hint,), _ = moved(lambda position: position + np.array([0.3, 0.0, -0.2]))
+    (hint,) = moved(lambda position: position + np.array([0.3, 0.0, -0.2]))
     assert "a shift by (-2" in hint or "a shift by (-3" in hint
     assert "give offset_x, offset_y and offset_z priors as wide" in hint
 
@@ -150,13 +162,13 @@ MILLIMETRES = {"sample_time": 0.05, "commands": ["c"], "command_unit": "m", "pos
 @pytest.mark.parametrize(("unit", "axes"), [("mm", ("x", "y", "z")), ("cm", ("z", "x", "y"))])
 def test_the_line_that_moves_the_origin_leaves_nothing_to_correct(unit, axes):
     """Read with one origin, the hint's takes its place, whatever turn the axes make."""
-    demo, robot = Trajectory.load(DEMO), Robot.load("smooth_arm")
+    robot = Robot.load("smooth_arm")
     columns = CsvColumns(**MILLIMETRES, position_unit=unit, axes=axes, origin=(7.0, 0.0, 0.0))
     base = np.array([0.3, -0.1, 0.4])
-    in_file = demo.position @ axes_matrix(axes) + base
+    in_file = demo().position @ axes_matrix(axes) + base
 
     def read(table: CsvColumns) -> list[str]:
-        dataset = demo.dataset.copy(deep=True)
+        dataset = demo().dataset.copy(deep=True)
         shifted = in_file - METRES[unit] * np.array(table.origin)
         dataset["position"] = dataset["position"].copy(data=shifted @ axes_matrix(table.axes).T)
         return placement_hints(robot, Trajectory(dataset), table)
@@ -168,13 +180,9 @@ def test_the_line_that_moves_the_origin_leaves_nothing_to_correct(unit, axes):
 
 
 def test_a_first_row_with_one_marker_says_so():
-    def change(position):
-        return position + 0.3
-
-    demo = Trajectory.load(DEMO)
-    dataset = demo.dataset.copy(deep=True)
-    dataset["position"] = dataset["position"].copy(data=change(demo.position))
-    mask = demo.position_mask.copy()
+    dataset = demo().dataset.copy(deep=True)
+    dataset["position"] = dataset["position"].copy(data=demo().position + 0.3)
+    mask = demo().position_mask.copy()
     mask[0, 1:] = False
     dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
     (hint,) = placement_hints(Robot.load("smooth_arm"), Trajectory(dataset))
@@ -184,8 +192,7 @@ def test_a_first_row_with_one_marker_says_so():
 @cache
 def demo_motion() -> Paths:
     """The demo beside its nominal model."""
-    demo = Trajectory.load(DEMO)
-    return Paths(nominal_markers(demo_spec("sdirk2"), demo, 20.0), demo.position, demo.position_mask)
+    return Paths(nominal_markers(demo_spec("sdirk2"), demo(), 20.0), demo().position, demo().position_mask)
 
 
 def turned(matrix: np.ndarray) -> Direction:
@@ -238,16 +245,16 @@ def test_a_left_handed_frame_is_named_with_the_axes_that_mend_it(axes):
 @pytest.mark.parametrize("axes", [(2, 0, 1), (1, 2, 0)])
 def test_turned_axes_are_named(axes):
     """An arm that is straight along z shows where z went, not how far it turned about itself."""
-    (hint,), _ = moved(lambda position: position[..., list(axes)])
+    (hint,) = moved(lambda position: position[..., list(axes)])
     named = hint.split("axes = ")[1].split("]")[0]
     assert named.split(", ")[2].strip('"') == "xyz"[axes.index(2)]
 
 
 def test_axes_are_named_as_the_file_needs_them():
     """Of a recording that was read with wrong axes, the hint's axes take their place and leave none to correct."""
-    demo, robot, axes = Trajectory.load(DEMO), Robot.load("smooth_arm"), ("y", "z", "x")
-    dataset = demo.dataset.copy(deep=True)
-    file = demo.position @ axes_matrix(("x", "z", "-y"))  # what reads right with these axes
+    robot, axes = Robot.load("smooth_arm"), ("y", "z", "x")
+    dataset = demo().dataset.copy(deep=True)
+    file = demo().position @ axes_matrix(("x", "z", "-y"))  # what reads right with these axes
     dataset["position"] = dataset["position"].copy(data=file @ axes_matrix(axes).T)
     columns = CsvColumns(**MILLIMETRES, position_unit="m", axes=axes)
     (hint,) = placement_hints(robot, Trajectory(dataset), columns)
@@ -259,8 +266,7 @@ def test_axes_are_named_as_the_file_needs_them():
 
 
 def test_recordings_alike_share_a_note(tmp_path):
-    checked(tmp_path)
-    path = tmp_path / "own.toml"
+    path = written(tmp_path)
     (tmp_path / "again.csv").write_bytes((tmp_path / "run.csv").read_bytes())
     text = path.read_text().replace('fit = ["run.csv"]', 'fit = ["run.csv", "again.csv"]')
     path.write_text(text.replace('position_unit = "mm"', 'position_unit = "mm"\naxes = ["x", "z", "-y"]'))
@@ -274,12 +280,11 @@ def test_recordings_alike_share_a_note(tmp_path):
 )
 def test_pulls_longer_than_the_body_are_doubtful_and_those_beyond_a_limit_a_note(tmp_path, factor, doubtful):
     """Commands in another unit than the file says; a line for each recording, whatever its cables."""
-    checked(tmp_path)
-    run = pd.read_csv(tmp_path / "run.csv")
+    path, run = written(tmp_path), demo_table().copy()
     names = [name for name in run if name.startswith("c")]
     run[names] *= factor * 8.0 / np.abs(run[names].to_numpy()).max()  # mm
     run.to_csv(tmp_path / "run.csv", index=False)
-    found = run_check(tmp_path / "own.toml", tmp_path / "pictures")
+    found = run_check(path, tmp_path / "pictures")
     doubts = [line for line in found.doubts if "pulls that no body of" in line]
     assert bool(doubts) == doubtful
     assert not doubts or "look at command_unit" in doubts[0]
@@ -288,11 +293,10 @@ def test_pulls_longer_than_the_body_are_doubtful_and_those_beyond_a_limit_a_note
 
 def listed(tmp_path: Path, *copies: str, fit: str, test: str = "[]", more: str = "") -> Check:
     """What check says of copies of one recording, some of them under the names of folders."""
-    checked(tmp_path, more=more)
+    path = written(tmp_path, more=more)
     for copy in copies:
         (tmp_path / copy).parent.mkdir(exist_ok=True)
         (tmp_path / copy).write_bytes((tmp_path / "run.csv").read_bytes())
-    path = tmp_path / "own.toml"
     path.write_text(path.read_text().replace('fit = ["run.csv"]', f"fit = {fit}\ntest = {test}"))
     return run_check(path, tmp_path / "pictures")
 
@@ -328,8 +332,7 @@ def test_a_copy_of_a_recording_is_doubtful_and_the_last_line_says_so(tmp_path):
 
 def rewritten(tmp_path: Path, old: str, new: str, change: Callable[[pd.DataFrame], object] | None = None) -> Check:
     """What check says after the experiment, and perhaps the table of its recording, were changed by hand."""
-    checked(tmp_path)
-    path, file = tmp_path / "own.toml", tmp_path / "run.csv"
+    path, file = written(tmp_path), tmp_path / "run.csv"
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
@@ -372,8 +375,7 @@ def test_a_robot_file_that_is_not_there_is_compared_with_those_beside_it(tmp_pat
 
 
 def test_a_group_that_names_no_recording_is_doubtful(tmp_path):
-    found = checked(tmp_path)
-    path = tmp_path / "own.toml"
+    path = written(tmp_path)
     path.write_text(path.read_text() + '[model.groups]\nmonday = ["run", "runn_*"]\n')
     found = run_check(path, tmp_path / "pictures")
     assert [doubt for doubt in found.doubts if "monday: 'runn_*' matches no recording" in doubt] == found.doubts
@@ -390,8 +392,7 @@ def test_a_group_that_names_no_recording_is_doubtful(tmp_path):
 )
 def test_a_mass_that_no_soft_robot_has_is_doubtful_wherever_it_is_given(tmp_path, table, doubtful):
     """Within the bounds of the robot's file, and heavier than any metal."""
-    checked(tmp_path)
-    path = tmp_path / "own.toml"
+    path = written(tmp_path)
     path.write_text(path.read_text() + table)
     found = run_check(path, tmp_path / "pictures")
     assert not found.problems
@@ -400,8 +401,7 @@ def test_a_mass_that_no_soft_robot_has_is_doubtful_wherever_it_is_given(tmp_path
 
 @pytest.mark.parametrize("key", ["candidates", "exclude"])
 def test_a_mechanism_that_an_audit_would_not_find_is_a_problem(tmp_path, key):
-    checked(tmp_path)
-    path = tmp_path / "own.toml"
+    path = written(tmp_path)
     path.write_text(path.read_text() + f'[audit]\n{key} = ["backlsh"]\n')
     (problem,) = run_check(path, tmp_path / "pictures").problems
     assert "backlsh" in problem
@@ -409,20 +409,19 @@ def test_a_mechanism_that_an_audit_would_not_find_is_a_problem(tmp_path, key):
 
 
 def test_two_markers_of_the_same_columns_are_refused(tmp_path):
-    checked(tmp_path)
-    path = tmp_path / "own.toml"
+    path = written(tmp_path)
     path.write_text(path.read_text().replace('["x4", "y4", "z4"]', '["x3", "y3", "z3"]'))
     with pytest.raises(InputError, match="markers 3 and 4 of positions have the same columns"):
         run_check(path, tmp_path / "pictures")
 
 
 def test_markers_in_another_order_are_named():
-    (hint,), _ = moved(lambda position: position[:, ::-1])
+    (hint,) = moved(lambda position: position[:, ::-1])
     assert "m1, m2, m3, m4 look like m4, m3, m2, m1" in hint
 
 
 def test_a_wrong_unit_stretches_the_robot():
-    hints, _ = moved(lambda position: 10.0 * position)
+    hints = moved(lambda position: 10.0 * position)
     assert any("apart in the first row" in hint and "position_unit" in hint for hint in hints)
 
 
@@ -460,14 +459,15 @@ def test_stamps_of_arrival_and_a_clock_that_jumps_are_doubtful(tmp_path):
     assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.doubts)
 
 
-def test_the_numerical_error_of_step_and_mesh_is_said():
+def test_the_numerical_error_of_step_and_mesh_is_said(monkeypatch):
     """On the demo's own commands a quarter of Euler's step moves the markers by far more than one of SDIRK2's; the
     elements are within 1 % of the way, and the body is too fast to be at rest in every row."""
-    found = {name: demo_error(name) for name in ("euler", "sdirk2")}
+    found = {name: measure_numerical_error(demo_spec(name), demo()) for name in ("euler", "sdirk2")}
     assert found["sdirk2"].time_step < 0.2 * found["euler"].time_step
     assert 0.0 < found["sdirk2"].elements < 0.01 * found["sdirk2"].way
     assert not found["sdirk2"].rest.enough
-    lines = numerical_error_lines(demo_spec("euler"), Trajectory.load(DEMO))
+    monkeypatch.setattr(numerical_error, "measure_numerical_error", lambda spec, recording: found["euler"])
+    lines = numerical_error_lines(demo_spec("euler"), demo())
     assert lines[0][0] == "numerics"
     assert "a quarter of the time step (10 ms, euler)" in lines[0][1]
     assert lines[1][1].startswith("twice the elements:")

@@ -94,6 +94,7 @@ def test_only_the_first_row_is_seen_and_sets_the_frame(posterior, tmp_path):
     np.testing.assert_allclose(start.mean(axis=0), 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_marker_that_the_model_knows_best_sets_the_frame(posterior, tmp_path):
     """All weight on the first marker: it agrees in the first row, draw by draw, and the others keep their error."""
     record = PosteriorRecord.load(posterior / "posterior.nc")

@@ -165,6 +165,7 @@ def test_the_cost_is_that_of_the_budget():
     assert "common scale" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_an_arm_of_mujoco_with_stiff_drives_leaves_a_common_scale(tmp_path):
     pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"

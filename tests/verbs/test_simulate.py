@@ -37,6 +37,12 @@ drive_rate = 0.001
 [model.priors]
 young_modulus = {{}}
 """
+ROD = """
+robot = "smooth_arm"
+seed = 3
+[model.priors]
+young_modulus = {}
+"""
 COMMANDS = """
 [commands]
 duration = 0.5
@@ -170,17 +176,23 @@ def write(path: Path, *parts: str) -> Path:
     return path
 
 
-def test_a_simulated_recording_is_found_again(bar, tmp_path, monkeypatch, capsys):
-    made = write(tmp_path / "made.toml", bar.read_text(), COMMANDS)
+@pytest.mark.parametrize("body", ["rod", pytest.param("mesh", marks=pytest.mark.slow)])
+def test_a_simulated_recording_is_found_again(body, bar, tmp_path, monkeypatch, capsys):
+    if body == "mesh":
+        text, commands = bar.read_text(), COMMANDS
+    else:
+        text, commands = ROD, COMMANDS.replace("low = -0.05\nhigh = 0.05", "low = 0.0\nhigh = 0.01")
+    made = write(tmp_path / "made.toml", text, commands)
     assert simulate(made, tmp_path / "made", monkeypatch, capsys)["error_mm"] is None
     data = f'[data]\nformat = "netcdf"\nfit = ["{tmp_path}/made/trajectory.nc"]\n'
-    again = write(tmp_path / "again.toml", bar.read_text(), data)
+    again = write(tmp_path / "again.toml", text, data)
     assert simulate(again, tmp_path / "again", monkeypatch, capsys)["error_mm"]["max"] < 1e-6
     softer = simulate(again, tmp_path / "softer", monkeypatch, capsys, "young_modulus=1e6")
     assert softer["parameters"] == {"young_modulus": 1e6}  # set on the command line
     assert softer["error_mm"]["max"] > 1.0
 
 
+@pytest.mark.slow
 def test_the_mesh_is_looked_for_beside_the_experiment(bar, bar_mesh, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     text = bar.read_text().replace(str(bar_mesh), "mine.vtk") + COMMANDS

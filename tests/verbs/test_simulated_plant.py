@@ -53,8 +53,8 @@ def test_the_cube_goes_where_a_rollout_takes_it(robot: Robot) -> None:
 
 def test_the_cube_is_seen_with_the_markers_noise(robot: Robot) -> None:
     plant = trunk(robot, marker_noise=NOISE, seed=3, **SCENE)
-    seen = np.array([plant.advance(np.zeros(8), 0.0).object_pose for _ in range(400)])
-    np.testing.assert_allclose(seen[:, :3].std(axis=0), NOISE, rtol=0.15)
+    seen = np.array([plant.advance(np.zeros(8), 0.0).object_pose for _ in range(100)])
+    np.testing.assert_allclose(seen[:, :3].std(axis=0), NOISE, rtol=0.25)
     np.testing.assert_allclose(np.linalg.norm(seen[:, 3:], axis=1), 1.0)
     # Half the angle about the vertical, which points 17.5 mm from the centre show.
-    np.testing.assert_allclose(seen[:, 4].std(), 0.5 * NOISE / 0.0175, rtol=0.15)
+    np.testing.assert_allclose(seen[:, 4].std(), 0.5 * NOISE / 0.0175, rtol=0.3)

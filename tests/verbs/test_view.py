@@ -97,6 +97,7 @@ def test_a_still_shows_trunk_and_cube(recording, tmp_path):
     assert orange > 0.005
 
 
+@pytest.mark.slow
 def test_an_animation_has_a_frame_for_every_instant(recording, tmp_path):
     (path,) = run_view(recording, tmp_path / "motion.gif", [], None)
     with Image.open(path) as picture:

@@ -64,9 +64,14 @@ class Autoregression:
         return len(self.autocorrelation) - 1
 
     @property
+    def remembered(self) -> float:
+        """Share of the variance that the rows before predict."""
+        return 1.0 - float(self.predictors[1][-1] ** 2)
+
+    @property
     def doubtful(self) -> bool:
         """Whether it was taken from residuals of a model that change more slowly than the noise of a measurement."""
-        slow = self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
+        slow = self.source == RESIDUALS and self.remembered > SLOW
         return slow or self.source == INNOVATIONS
 
     @property

@@ -266,6 +266,6 @@ def _cables(
         np.ascontiguousarray(np.concatenate([np.zeros(shape), *weight])[:, :width], dtype=dtype),
         layout.anchor.astype(dtype),
         np.concatenate([np.zeros(0), *segment]).astype(dtype),
-        np.asarray(limits.displacement, dtype=dtype),
+        np.ascontiguousarray(limits.displacement, dtype=dtype),
         float(limits.rate),
     )

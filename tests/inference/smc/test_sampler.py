@@ -195,6 +195,7 @@ def test_settings_are_checked(wrong):
         SmcConfig(**wrong)
 
 
+@pytest.mark.slow
 def test_a_ridge_is_followed_by_few_particles():
     """Two parameters seen through their sum only, to 1 in 1000 of their spread: 150 particles know its direction."""
     problem = LinearGaussian(n_rows=8, d=4)
