@@ -98,7 +98,7 @@ class DataSpec(BaseModel):
         return self
 
     def piece(self, whole: Trajectory, rows: tuple[int, int] | None, every: int = 1) -> Trajectory:
-        """Each ``every``-th row of first to last of a recording, with the commands of `lead_in`; all without ``rows``.
+        """Each ``every``-th row, first to last, with the commands of `lead_in`; all rows without ``rows``.
 
         Commands with a clock of their own may begin long before the recording does.
         """

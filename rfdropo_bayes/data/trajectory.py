@@ -355,9 +355,8 @@ class Trajectory:
         return piece.with_attributes(settings={FIRST_COMMAND: {"rule": "given", "why": why}})
 
     def thin(self, every: int, timed: bool = True) -> Trajectory:
-        """Each ``every``-th observation row, from the first on; all commands stay.
-
-        Without ``timed`` rows have no times of their own: those that stay follow each other as all rows did.
+        """Each ``every``-th observation row, from the first; commands stay. Without ``timed``, rows have no times of
+        their own: kept rows follow each other as all rows did.
         """
         dataset = self.dataset.isel(time=slice(None, None, every)).assign_attrs(name=f"{self.name}[::{every}]")
         if not timed:
