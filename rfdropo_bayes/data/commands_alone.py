@@ -23,10 +23,11 @@ def commands_alone(
     row: int = 0,
     start_file: str = "",
     motor_angle: Float[np.ndarray, "row channel"] | None = None,
+    poses: bool = False,
 ) -> Trajectory:
     """Commands with at most a start pose; the recording begins at the first command.
 
-    Observations are due at the times of the commands, and once one interval after the last command.
+    Observations are due at the times of the commands, and once one interval after the last command unless ``poses``.
 
     Args:
         origin: origin of the commands.
@@ -36,12 +37,14 @@ def commands_alone(
         row: number of the row with the start pose; ignored if there is a single row.
         start_file: file of the start pose.
         motor_angle: motor angles [rad], NaN if unknown.
+        poses: whether the pose of a row belongs to its own command, as with ``commands_with_poses``.
 
     Raises:
         InputError: a start without that row.
     """
     time = sent.command_time
-    clock = np.append(time, time[-1] + (sample_time(time) if len(time) > 1 else 1.0))
+    settled = poses and len(time) > 1
+    clock = time if settled else np.append(time, time[-1] + (sample_time(time) if len(time) > 1 else 1.0))
     position = np.zeros((len(clock), len(marker_names), 3))
     mask = np.zeros(position.shape[:2], dtype=bool)
     if start is not None:
@@ -51,7 +54,7 @@ def commands_alone(
         seen = np.isfinite(first).all(axis=1)
         position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
     return Trajectory.build(
-        replace(origin, settings={"unseen": True}),
-        replace(sent, initial_command=sent.command[0]),
+        replace(origin, settings={"unseen": True, **({"settled_poses": True} if settled else {})}),
+        sent.of_poses() if settled else replace(sent, initial_command=sent.command[0]),
         Measured(clock, position, marker_names, mask, motor_angle=motor_angle),
     )

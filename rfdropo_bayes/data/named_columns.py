@@ -323,21 +323,19 @@ def read_tables(
     command = _commands(table, source, columns)
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = _angles(table, columns)
-    first = command[0]
-    if columns.commands_with_poses:
-        # A command acts from half-way between two rows on, so that clocks of any step see it in its own row.
-        sent, command = 0.5 * (time[: len(command) - 1] + time[1 : len(command)]), command[1:]
+    commands = SentCommands(sent, command, *_channels(columns), command[0], _largest(columns))
+    commands = commands.of_poses() if columns.commands_with_poses else commands
     notes = [*faults.notes, *_timing_notes(table, columns, time)]
     if columns.command_time is not None:
-        notes += command_notes(sent, command)
+        notes += command_notes(commands.command_time, commands.command)
     seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)
-    notes += _counter_notes(table, source, columns, Motion(sent, time, seen))
+    notes += _counter_notes(table, source, columns, Motion(commands.command_time, time, seen))
     settings = faults._replace(notes=notes).settings
     settings |= {"settled_poses": True} if columns.commands_with_poses else {}
     settings |= {} if angle is None else {"motor_angle_hold": hold_time(time, angle)}
     return Recorded(
         replace(origin or origin_of(table, columns), settings=settings),
-        SentCommands(sent, command, *_channels(columns), first, _largest(columns)),
+        commands,
         Measured(
             time=time,
             position=fill_missing(time, position),

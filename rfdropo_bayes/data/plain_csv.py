@@ -68,6 +68,7 @@ def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row:
         start=None if start is None else points(start, columns, mask_missing=True),
         row=row,
         start_file="" if start is None else str(start.path),
+        poses=columns.commands_with_poses,
     )
 
 

@@ -68,6 +68,14 @@ class SentCommands:
     initial_command: Float[np.ndarray, " cable"] | None = None
     largest: float | None = None
 
+    def of_poses(self) -> SentCommands:
+        """The same of rows whose poses belong to their own commands: a command acts from half-way between its row and
+        the row before on, so that clocks of any step see it in its own row.
+        """
+        time, command = np.asarray(self.command_time), np.asarray(self.command)
+        between = 0.5 * (time[:-1] + time[1:])
+        return replace(self, command_time=between, command=command[1:], initial_command=command[0])
+
     def believed(self) -> SentCommands:
         """The same, of which the largest is to be believed: commands of a simulator or of a controller's own log."""
         size = np.abs(np.asarray(self.command, dtype=float))

@@ -86,3 +86,7 @@ def test_new_poses_at_rest_have_the_command_of_their_own_row(tmp_path: Path) -> 
     for begun in ("zero", "first", None):
         found = load_unseen(spec, tmp_path, "next.csv", begun=begun)
         np.testing.assert_allclose(np.vstack([found.initial_command, found.command]), COMMAND + 0.01, atol=1e-12)
+    pd.DataFrame(table).to_csv(tmp_path / "alone.csv", index=False)
+    alone = load_unseen(spec, tmp_path, "alone.csv", begun="zero")
+    np.testing.assert_allclose(alone.time, TIME - TIME[0], atol=1e-12)
+    np.testing.assert_allclose(alone.command_at(alone.time), COMMAND + 0.01, atol=1e-12)
