@@ -37,7 +37,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
 
-from .conftest import PATIENT, Rig
+from .conftest import PATIENT, SEEN_LATE, Rig
 from .policies import linear_policy
 
 SLOW = DrivesTable(answer_s=2.0)
@@ -59,6 +59,7 @@ def dry_run(tmp_path_factory) -> tuple[Path, Deployment]:
     policy = turning(folder / "policy.onnx", Robot.load("motor_arm"))
     settings = Deployment(
         robot="motor_arm", duration_s=2.0, policy=PolicyTable(file=str(policy)), drives=SLOW, safety=PATIENT,
+        sensor=SEEN_LATE,
         simulation=SimulationSettings(settings={"stiffness": 300.0, "pretension": 3.0}),
     )  # fmt: skip
     outcome = rb.deploy(settings, "dry-run", folder / "session")
