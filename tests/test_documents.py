@@ -221,6 +221,7 @@ def test_the_engine_of_a_document_moves(tmp_path: Path) -> None:
     np.testing.assert_allclose(run.position[:, 0, 2], 0.3)
 
 
+@pytest.mark.slow
 def test_the_problem_of_a_document_is_inferred() -> None:
     """The scripts of inference.md that follow each other: a line through five points."""
     script = ast.parse(block("docs/inference.md", "import jax.numpy"))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,7 +15,7 @@ from rfdropo_bayes.data import lerobot
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
 from rfdropo_bayes.data.first_command import begun_from
 from rfdropo_bayes.data.mapped_formats import FOLDERS, MAPPED, read_mapped
-from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.data.named_columns import ROWS, CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -39,6 +41,9 @@ class RecordingEntry(BaseModel):
     )
     rows: tuple[int, int] | None = Field(
         default=None, description="keep observation rows first to last only, both included, counted from 0"
+    )
+    every: int = Field(
+        default=1, ge=1, description="with k, keep each k-th of these rows: a fit of poses at rest needs few"
     )
     episodes: list[int] | None = Field(
         default=None, description="numbers of a LeRobotDataset's episodes; all by default"
@@ -92,11 +97,14 @@ class DataSpec(BaseModel):
             raise ValueError(f"format {self.format!r} {takes} [data.columns] table (columns= of rb.read)")
         return self
 
-    def piece(self, whole: Trajectory, rows: tuple[int, int] | None) -> Trajectory:
-        """Rows first to last of a recording, with the commands of `lead_in`; all of it without rows.
+    def piece(self, whole: Trajectory, rows: tuple[int, int] | None, every: int = 1) -> Trajectory:
+        """Each ``every``-th row, first to last, with the commands of `lead_in`; all rows without ``rows``.
 
         Commands with a clock of their own may begin long before the recording does.
         """
+        if every > 1:
+            timed = self.columns is None or self.columns.time != ROWS
+            return self.piece(whole, rows).thin(every, timed)
         if rows is None and whole.command_time[0] >= -self.lead_in:
             return whole
         if rows is None:
@@ -118,6 +126,7 @@ class _Source(NamedTuple):
     commands: Path | None
     zero_command: bool
     rows: tuple[int, int] | None
+    every: int
     initial_command: InitialCommand
     episode: int | None
 
@@ -125,6 +134,17 @@ class _Source(NamedTuple):
     def recording(self) -> tuple[Path, int | None]:
         """Identity of the recording, regardless of rows."""
         return self.observations.resolve(), self.episode
+
+    def shares_rows(self, other: _Source) -> bool:
+        """Whether a row belongs to both, parts of the same recording."""
+        first, last = self.rows or (0, sys.maxsize - 1)
+        start, end = other.rows or (0, sys.maxsize - 1)
+        low, high = max(first, start), min(last, end)
+        if low > high:
+            return False
+        step = self.every // math.gcd(self.every, other.every) * other.every
+        later = range(max(low, start), min(high, low + step) + 1)
+        return any((row - first) % self.every == 0 and (row - start) % other.every == 0 for row in later)
 
 
 def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "fit") -> list[Trajectory]:
@@ -151,7 +171,7 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
             loaded[key] = begun_from(_read(spec, source), rule)
             said = loaded[key].name, loaded[key].first_command
             logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
-        recording = spec.piece(loaded[key], source.rows)
+        recording = spec.piece(loaded[key], source.rows, source.every)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources, [*fit, *test])
 
@@ -186,7 +206,7 @@ def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Itera
         for match in find_files(entry.observations, base, folders=spec.format in FOLDERS):
             zero = entry.commands == NO_COMMANDS
             for episode in _episodes(spec, entry, match):
-                yield _Source(match, commands, zero, entry.rows, entry.initial_command, episode)
+                yield _Source(match, commands, zero, entry.rows, entry.every, entry.initial_command, episode)
 
 
 def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | list[None]:
@@ -227,15 +247,12 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
 def _check_split(fit: list[_Source], test: list[_Source]) -> None:
     for tested in test:
         for fitted in fit:
-            if tested.recording == fitted.recording:
-                first, last = tested.rows or (0, float("inf"))
-                start, end = fitted.rows or (0, float("inf"))
-                if first <= end and start <= last:
-                    raise InputError(
-                        "a test recording shares rows with a recording that is fitted",
-                        where=str(tested.observations),
-                        remedy="split by recording, or give rows that do not overlap",
-                    )
+            if tested.recording == fitted.recording and tested.shares_rows(fitted):
+                raise InputError(
+                    "a test recording shares rows with a recording that is fitted",
+                    where=str(tested.observations),
+                    remedy="split by recording, or give rows that do not overlap",
+                )
 
 
 def _distinct_names(recordings: list[Trajectory], sources: list[_Source], listed: list[_Source]) -> list[Trajectory]:

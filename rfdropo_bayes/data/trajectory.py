@@ -354,6 +354,16 @@ class Trajectory:
         why = f"in force {earlier}before row {first}"
         return piece.with_attributes(settings={FIRST_COMMAND: {"rule": "given", "why": why}})
 
+    def thin(self, every: int, timed: bool = True) -> Trajectory:
+        """Each ``every``-th observation row, from the first; commands stay. Without ``timed``, rows have no times of
+        their own: kept rows follow each other as all rows did.
+        """
+        dataset = self.dataset.isel(time=slice(None, None, every)).assign_attrs(name=f"{self.name}[::{every}]")
+        if not timed:
+            clocks = {"time": dataset.time / every, "command_time": dataset.command_time / every}
+            dataset = dataset.assign_coords(clocks)
+        return Trajectory(dataset)
+
     def resample(self, sample_time: float) -> Trajectory:
         """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).
 

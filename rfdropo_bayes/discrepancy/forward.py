@@ -210,7 +210,7 @@ class RoutedLanes(Lanes):
     ) -> tuple[Fields, np.ndarray]:
         """See `Lanes.roll`."""
         slow = self._needs_slow(theta)
-        routes = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
+        routes: list[tuple[np.ndarray, Lanes, Any]] = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
         order, found = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []
         for mask, lanes, kept in routes:
             if mask.any():

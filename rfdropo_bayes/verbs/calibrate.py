@@ -117,17 +117,17 @@ def calibrate(
     config = make_config(table.method, inference_options(table)) if method is None else method
     name, chosen = method_of(config), model.settings.seed if seed is None else seed
     problem, draws = model.problem(runs, earlier_draws(fit, name)), MOST_DRAWS
-    timed = method is None and table.minutes is not None and table.rollouts is None
-    if timed:
+    minutes = table.minutes if method is None and table.rollouts is None else None
+    if minutes is not None:
         per_set = rollout_seconds(problem, jax.random.key(chosen))
         fitted, tested = (sum(len(run.time) for run in part) for part in (runs, test))
-        budget = budget_within(table.minutes, per_set, (fitted + tested) / fitted)
+        budget = budget_within(minutes, per_set, (fitted + tested) / fitted)
         resumed = Path(out) if resume and out is not None else None
         config, draws = _budgeted(config, budget.rollouts, resumed), budget.draws
     said = {"method": name, **options_table(config)}
     tables = model.record(
         {"title": model.title, "seed": chosen, "inference": said},
-        {"seed": seed, "inference": said if timed or method is not None else None},
+        {"seed": seed, "inference": said if minutes is not None or method is not None else None},
     )
     work = partial(_fit, Fitting(model, problem, config, runs, test, chosen, draws))
     if out is None:

@@ -15,7 +15,7 @@ from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.sample_times import sample_time
 
 DELAYS = (0.0, 0.1, 0.2, 0.4)
-"""[s] of a motion after its commands."""
+"""Tried delays of the motion behind its commands [s]."""
 MOST_ROWS = 2000
 """Rows of a recording that are used."""
 JUST_BEFORE = 1e-6

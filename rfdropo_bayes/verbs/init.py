@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.command_lag import left_by_rows
-from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, rows_to_fit
+from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, parts_of
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
@@ -190,9 +190,9 @@ def write_first_files(
     timed = guess.time is not None or guess.sample_time is not None
     frame = [f"{line}  # ASSUMED: found from the first row" for line in _frame(plain, made, guess)]
     slow = slow_motion(made, first) if timed else NO_MOTION
-    rows = rows_to_fit(first) if len(recordings) == 1 else None
+    parts = parts_of(first, len(recordings), rests=slow is not None, timed=timed)
     poses = _of_poses(first, timed) if slow is not None and guess.command_time is None else None
-    tables = partial(tables, rows=rows, poses=poses)
+    tables = partial(tables, parts=parts, poses=poses)
     placed = write(tables(frame=frame), slow, first)
     seen = _first_recording(placed, folder)
     columns = None if placed.data is None else placed.data.columns
@@ -207,7 +207,7 @@ def write_first_files(
         outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=evidence)
         robot.write_text(robot_text(outline), encoding="utf-8")
         made = Robot.load(robot)
-        beside = {
+        beside: dict[str, Any] = {
             key: [names[column] for column in found.arrangement.columns]
             for key in ("commands", "tensions", "motor_angles")
             if (names := getattr(guess, key))
@@ -270,19 +270,20 @@ def _head(name: str) -> list[str]:
 
 
 def _entries(
-    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, rows: tuple[list[int], list[int]] | None
+    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, parts: Sequence[Mapping[str, Any]]
 ) -> list[str]:
-    """The recordings as entries of fit and test; one that stands alone twice if its rows are divided."""
+    """The recordings as entries of fit and test; a single recording twice if its rows are divided."""
     entries: list[dict[str, Any]] = [{"observations": os.path.relpath(path, folder)} for path in recordings]
     if commands:
         sent = [os.path.relpath(path, folder) for path in commands]
         entries = [{**entry, "commands": file} for entry, file in zip(entries, sent, strict=True)]
     elif guess.format == lerobot.FORMAT and len(entries) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
-        parts = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
-        entries = [{**entries[0], "episodes": part} for part in parts]
-    if rows is not None and len(entries) == 1:
-        entries = [{**entries[0], "rows": part} for part in rows]
+        shares = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
+        entries = [{**entries[0], "episodes": share} for share in shares]
+    if parts and len(entries) in (1, len(recordings)):
+        whole = entries * len(parts) if len(entries) == 1 else entries
+        entries = [{**entry, **part} for entry, part in zip(whole, parts, strict=True)]
     tables = [", ".join(f"{key} = {quoted(value)}" for key, value in entry.items()) for entry in entries]
     return [
         quoted(entry["observations"]) if len(entry) == 1 else f"{{{text}}}"
@@ -311,18 +312,18 @@ def data_tables(
     gravity: str = "",
     frame: Sequence[str] = (),
     cables: Sequence[str] = (),
-    rows: tuple[list[int], list[int]] | None = None,
+    parts: Sequence[Mapping[str, Any]] = (),
     poses: str | None = None,
     order: str | None = None,
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
     ``frame`` are the lines of axes and origin with their evidence, if a recording determines them; ``cables`` the
-    robot's, one for each command, if tensions of them were measured; ``rows`` the rows to fit and to test of a single
-    recording; ``poses`` the reason to take each command for that of the pose in its row; ``order`` the reason for
-    another order of the commands than the file's.
+    robot's, one for each command, if tensions of them were measured; ``parts`` see `parts_of`; ``poses`` the reason to
+    take each command for that of the pose in its row; ``order`` the reason for another order of the commands than the
+    file's.
     """
-    entries = _entries(folder, recordings, commands, guess, rows)
+    entries = _entries(folder, recordings, commands, guess, parts)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
     lost = lost_positions(recordings, guess)
     counted = f" ({', '.join(f'{name}: {count} empty cells' for name, count in lost.items())})" if lost else ""

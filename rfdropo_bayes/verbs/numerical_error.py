@@ -26,7 +26,7 @@ LIMIT = MORE_ELEMENTS**2 / (MORE_ELEMENTS**2 - 1)
 rod is of second order.
 """
 LONGEST, LONGEST_MESH = 20.0, 2.0
-"""[s] that are simulated of a recording, of a rod and of tetrahedra, each of whose steps takes 100 times as long."""
+"""Longest simulated part of a recording [s], of a rod and of tetrahedra, whose steps take 100 times as long."""
 SOLVES = 4.0
 """Linear solves that a row of a quasi-static motion takes on average, at most."""
 ENOUGH = 0.01

@@ -182,7 +182,7 @@ def test_a_recording_is_moved_to_a_group_from_the_one_that_named_it():
 def test_what_cannot_be_pooled_is_refused():
     with pytest.raises(InputError, match="a1 is in two groups: january and winter"):
         gather_groups(["a1"], {**DAYS, "winter": "*1"})
-    with pytest.raises(InputError, match=r"about a value that all share.*also name it under \[model.priors\]"):
+    with pytest.raises(InputError, match=r"about a shared value.*also name it under \[model.priors\]"):
         build_scopes(SPECS, {"young_modulus": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.1, {"april": ("b",)})})
     with pytest.raises(InputError, match="the spread between groups is 0"):
         build_scopes(SPECS, {"offset_x": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.0, {"april": ("b",)})})

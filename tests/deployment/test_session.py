@@ -208,6 +208,7 @@ def test_homing_finds_the_tension_and_keeps_it(tmp_path: Path) -> None:
         assert home.tension_n == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
     homing = HomingTable(rate_m_s=0.02, travel_m=0.01, rounds=1)
     simulation = SimulationSettings(settings={"stiffness": 0.0, "pretension": 0.0})

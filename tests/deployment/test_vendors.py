@@ -335,6 +335,7 @@ def epos4(sheet: Write) -> str:
     )
 
 
+@pytest.mark.slow
 def test_the_example_of_the_documentation_drives_an_epos4(sheet: Write, tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "deployment.md").read_text()
     block = page.split("[drives]\n", 1)[1].split("    [policy]", 1)[0]

@@ -47,12 +47,12 @@ def test_the_clock_counts_what_another_program_takes():
         with clock.stage("base model"):
             while time.monotonic() < clock.began + 0.5:
                 pass
+        elapsed, waited = time.monotonic() - clock.began, clock.waited
     finally:
         other.kill()
         other.communicate()
         os.sched_setaffinity(0, mine)
-    spent = clock.profile["base model"]
-    assert 0.25 * spent < clock.waited < spent
+    assert 0.12 < waited < elapsed
     assert clock.left == pytest.approx(clock.share - (time.monotonic() - clock.began) / 60.0, abs=1e-3)
 
 

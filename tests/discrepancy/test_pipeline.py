@@ -80,6 +80,7 @@ def test_a_lone_effect_is_explained_with_its_size():
     assert "play" in content["sentence"]
 
 
+@pytest.mark.slow
 def test_an_effect_too_small_to_say_how_much_it_explains_is_named_and_not_belittled():
     content = found({"play": 0.04}, 12)
     assert content["findings"][0]["mechanism"] == "play"
@@ -95,6 +96,7 @@ def test_effects_that_look_the_same_are_one_class():
     assert content["next_experiment"]["separates"] == content["findings"][0]["equivalence_class"]
 
 
+@pytest.mark.slow
 def test_a_shape_that_means_nothing_at_null_is_found_on_its_grid():
     content = found({"creep": 0.6, "creep_time": 0.6}, 3)
     assert content["findings"][0]["mechanism"] == "creep"
@@ -102,6 +104,7 @@ def test_a_shape_that_means_nothing_at_null_is_found_on_its_grid():
     assert abs(time["mean"] - 0.6) < 4 * time["sd"]
 
 
+@pytest.mark.slow
 def test_a_small_effect_at_a_place_is_found_though_larger_ones_were_tried():
     content = found({"wall": 0.15, "wall_place": 0.4}, 6)
     assert content["findings"][0]["mechanism"] == "wall"
@@ -191,6 +194,7 @@ def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(l
     assert "shorten [simulator] time_step" not in content["sentence"]
 
 
+@pytest.mark.slow
 def test_beside_an_error_of_the_mesh_below_the_noise_causes_are_named():
     answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 1.0}, 102), SMALL))
     assert [step.name for step in answer.causes.steps] == ["play"]
@@ -404,6 +408,7 @@ def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
         np.testing.assert_array_equal(shown[name], other[name])
 
 
+@pytest.mark.slow
 def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeypatch):
     """A large misfit makes the linear extrapolation a poor start; here no rollout ends well beyond a tenth of it."""
 
@@ -434,6 +439,7 @@ class Turning(Toy):
         return super().rollout(values | {"lag": size**2, "play": values["play"] + 0.05 * size}, commands, steps)
 
 
+@pytest.mark.slow
 def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
     asked = replace(problem({**TRUTH, "delay": 1.0}, 2), lanes=Lanes(Turning(), np.arange(4)))
     target, base = base_model(asked, 0)
@@ -604,6 +610,7 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     assert content["gain"]["rmse_extended_mm"] < content["gain"]["rmse_base_mm"]
 
 
+@pytest.mark.slow
 def test_a_step_that_a_later_one_carries_is_not_adopted():
     """A search that named a useless step first, then play: only play is left, refitted, with the size that it has."""
     asked = unrepeated({"play": 3.0}, 7)
@@ -633,6 +640,7 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     assert stayed.names == ["play", "creep"]
 
 
+@pytest.mark.slow
 def test_a_step_that_a_later_one_makes_needless_is_taken_out():
     """A useless delay before play goes; play before a delay stays."""
     asked = unrepeated({"play": 3.0}, 7)

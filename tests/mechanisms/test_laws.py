@@ -79,6 +79,8 @@ PORTS = ["cable left", "every cable", "command delay", "force x at the tip", "st
          "marker m3 x", "marker m3 along the body", "camera y", "camera turn z", "camera scale",
          "observation delay"]  # fmt: skip
 
+SAME_WAY = ("damping", "marker m3 x", "camera y", "camera scale", "observation delay")  # as another port acts
+
 
 @pytest.fixture(scope="module")
 def without_law():
@@ -88,7 +90,10 @@ def without_law():
     return plain, given, np.asarray(plain.rollout({}, given).position)
 
 
-@pytest.mark.parametrize("port", PORTS)
+@pytest.mark.parametrize(
+    "port",
+    [pytest.param(port, marks=[pytest.mark.slow] * (port in SAME_WAY)) for port in PORTS],
+)
 def test_a_law_of_zero_changes_no_bit_and_another_one_acts(without_law, port):
     _, given, still = without_law
     acting = build_robot_simulator(spec(law(port, "magnitude", commands=["left"])))

@@ -150,6 +150,7 @@ class LoggedAndKilled(Killed, Logged):
     """Both."""
 
 
+@pytest.mark.slow
 def test_a_kill_in_the_middle_of_a_leg_changes_nothing(tmp_path) -> None:
     """Neither the curve nor the log of episodes, which holds each one once."""
     table = TABLE.model_copy(update={"steps": 4 * LEG, "evaluate_every": LEG})
@@ -260,6 +261,7 @@ class KilledEarly(Points):
         return super().step_wait()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on_from_its_start(trained, tmp_path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train(KilledEarly, TABLE, tmp_path, seed=3, gamma=0.9)

@@ -1,5 +1,7 @@
 """The robot as it is installed: sizes of its priors follow the robot and its recording."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ from rfdropo_bayes.verbs.installation import (
     installed_mechanisms,
     installed_priors,
     largest_pull,
-    rows_to_fit,
+    parts_of,
 )
 
 
@@ -77,9 +79,20 @@ def test_commands_that_never_move_leave_zeros_fixed():
 
 
 def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
-    assert rows_to_fit(run("rad", 1.0, rows=90)) == ([0, 59], [60, 89])
-    assert rows_to_fit(run("rad", 1.0, rows=40)) is None
-    assert rows_to_fit(None) is None
+    assert parts_of(run("rad", 1.0, rows=90), 1, rests=True, timed=True) == [{"rows": [0, 59]}, {"rows": [60, 89]}]
+    assert parts_of(run("rad", 1.0, rows=40), 1, rests=True, timed=True) == []
+    assert parts_of(None, 1, rests=False, timed=True) == []
+
+
+def test_of_many_rows_at_rest_a_fit_takes_some():
+    many = run("rad", 1.0, rows=1200)
+    parts = partial(parts_of, many)
+    assert parts(1, rests=False, timed=True) == [{"rows": [0, 799]}, {"rows": [800, 1199]}]
+    assert parts(1, rests=True, timed=True) == [{"rows": [0, 799], "every": 2}, {"rows": [800, 1199]}]
+    between = [{"rows": [0, 1199], "every": 3}, {"rows": [1, 1199], "every": 3}]
+    assert parts(1, rests=True, timed=False) == between
+    assert parts(3, rests=True, timed=True) == [{"every": 6}, {"every": 6}, {}]
+    assert parts(3, rests=False, timed=True) == []
 
 
 def test_a_budget_in_minutes_follows_the_time_of_a_rollout():

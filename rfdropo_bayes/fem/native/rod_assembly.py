@@ -453,6 +453,9 @@ def assemble_element(tables, samples, factors, element, work, whole, predicted, 
     if held and not predicted and not still:
         _hold_rates(work.element, token)
     add_forces(element, work.element, work.field, token)
+    if still:
+        for i in range(SIZE):
+            store(work.element, STRESS + i, load(work.stress, SIZE * element + i, token))
     add_element_tangent(tables, factors, element, work, whole, held, samples.present[BENDING], still, token)
 
 

@@ -113,6 +113,7 @@ class RodWork(NamedTuple):
     pushed: Float[np.ndarray, "stations3 lanes"]  # forces on the sections in a step [N]
     given: Float[np.ndarray, "stations3 lanes"]
     branch: Float[np.ndarray, "values lanes"]  # strains of the dashpots, times the elements' length
+    stress: Float[np.ndarray, "values lanes"]  # of the elements, as it turns in the matrix of an equilibrium
 
 
 class Runs(NamedTuple):

@@ -99,7 +99,7 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
     state = dict.fromkeys(
-        ("velocity", "solution", "field", "before", "sudden", "branch"),
+        ("velocity", "solution", "field", "before", "sudden", "branch", "stress"),
         stations * SIZE,
     )
     once = (

@@ -148,8 +148,8 @@ class RodSession:
         first, and every ``stride``.
 
         Raises:
-            InputError: a session that was not started, displacements of another shape, or loads if and only if its
-                lanes started without loads.
+            InputError: a session that was not started, displacements of another shape, or loads in some calls
+                only: a session has loads in every call, also in reset, or in none.
         """
         engine = self.engine
         if self._run is None:

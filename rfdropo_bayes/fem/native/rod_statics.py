@@ -10,7 +10,7 @@ from rfdropo_bayes.fem.equilibrium import LONGEST_STEP
 from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import PANEL
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.rod_assembly import add_forces, add_station_loads, measure_element, place_stress
+from rfdropo_bayes.fem.native.rod_assembly import STRESS, add_forces, add_station_loads, measure_element, place_stress
 from rfdropo_bayes.fem.native.rod_constraints import hold
 from rfdropo_bayes.fem.native.rod_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.rod_step import condense_increment, gather_cables, move_stations, near, place_directors
@@ -18,6 +18,7 @@ from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
 from rfdropo_bayes.fem.native.simd import (
     any_greater,
     fill,
+    fma,
     fnma,
     kernel,
     load,
@@ -60,8 +61,11 @@ def _largest(tables, first, field, token):
 
 
 @kernel
-def _choose_way(tables, work, moving, token):
-    """Limit ``solution``, and take less of it if increments do not shrink; returns what those after it may add up to.
+def _choose_way(tables, factors, work, moving, token):
+    """Share of ``solution`` to go, limited in length and less if increments do not shrink; and what the increments
+    after it may add up to.
+
+    A lane that goes its whole way takes the forces that turn into the next matrix again.
 
     All that are left are no more than a geometric series that goes on as the last two did: Newton's method converges
     faster.
@@ -75,11 +79,30 @@ def _choose_way(tables, work, moving, token):
     share = where_greater(far, longest, longest / far, one)
     share = where_greater(share * wide, widest, widest / wide, share)
     share = where_greater(grown, zero, SLOWER * share, share)
-    for row in range(SIZE * tables.held, SIZE * tables.stations):
-        store(work.solution, row, share * load(work.solution, row, token))
     store(work.largest, 0, where_greater(moving, zero, size, before))
+    whole = where_greater(one, share, zero, moving)
+    store(factors.turning, 0, where_greater(whole, zero, one, load(factors.turning, 0, token)))
     alone = where_greater(before, fill(0.5 * UNBOUNDED, work.frame, token), one, grown)
-    return where_greater(alone, zero, size, size * (size / (before - size)))
+    return share, where_greater(alone, zero, size, size * (size / (before - size)))
+
+
+@kernel
+def _follow_stress(tables, samples, factors, work, share, token):
+    """Let the stresses that turn in the matrix go a share of their way to those of the increment in ``velocity``,
+    without its second order: in a thin rod that order of a rotation is a large force along the axis.
+
+    As in Newton's method with independent stresses (Magisano, Leonetti and Garcea 2017, "How to improve efficiency and
+    robustness of the Newton method in geometrically non-linear structural problem discretized via displacement-based
+    finite elements").
+    """
+    zero = fill(0.0, work.stress, token)
+    for element in range(tables.stations - 1):
+        measure_element(tables, element, work, token)
+        place_stress(tables, samples, factors, element, work, token)
+        for i in range(SIZE):
+            row, there = SIZE * element + i, load(work.element, STRESS + i, token)
+            before = load(work.stress, row, token)
+            store(work.stress, row, where_greater(share, zero, fma(share, there - before, before), before))
 
 
 @kernel
@@ -106,7 +129,7 @@ def _found(tables, factors, work, moving, token):
 @kernel
 def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bound, schedule, token):
     """One iteration of the moving lanes; lanes with a small increment stop."""
-    zero, moving = fill(0.0, work.frame, token), load(work.moving, 0, token)
+    zero, one, moving = fill(0.0, work.frame, token), fill(1.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
     condense_increment(tables, samples, factors, work, EULER, True, token)
     if runs is not None and slips > 0:
@@ -119,7 +142,15 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
     store(work.unsolved, 0, where_greater(moving, zero, load(work.unsolved, 0, token), unsolved))
     _take_tensions(tables, work, moving, token)
     small = fill(bound * tables.total, work.frame, token)
-    left = _choose_way(tables, work, moving, token)
+    share, left = _choose_way(tables, factors, work, moving, token)
+    for row in range(SIZE * tables.held, SIZE * tables.stations):
+        increment = load(work.solution, row, token)
+        store(work.velocity, row, increment)
+        store(work.solution, row, share * increment)
+    store(factors.strain_rate, 0, one)
+    _follow_stress(tables, samples, factors, work, share * moving, token)
+    store(factors.strain_rate, 0, zero)
+    clear(work.velocity, SIZE * tables.held, SIZE * tables.stations, token)
     if runs is not None and slips > 0:
         sum_losses(tables, runs, samples, friction, p, token)
         keep_row(tables, factors, friction, p, work, slips, moving, token)
@@ -130,11 +161,13 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
 @kernel
 def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
     """Find the equilibrium from the present state in at most ``most`` iterations, to the increment ``bound`` relative
-    to the body's length.
+    to the body's length. A lane that missed an earlier equilibrium is not moved: its rollout counts as failed.
     """
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
-    store(work.moving, 0, one)
+    clear(work.stress, 0, SIZE * tables.stations, token)
+    _follow_stress(tables, samples, factors, work, one, token)
+    store(work.moving, 0, one - load(work.failed, 0, token))
     store(work.largest, 0, fill(UNBOUNDED, work.frame, token))
     if runs is not None and slips > 0:
         gather_cables(tables, work, one, False, token)

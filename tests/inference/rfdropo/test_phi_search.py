@@ -198,7 +198,7 @@ def test_a_simulator_that_always_fails_is_named():
             features, status = super().rollouts(values, horizon)
             return features, status + 2
 
-    with pytest.raises(InputError, match=r"no candidate.*status_2"):
+    with pytest.raises(InputError, match=r"every candidate failed.*status_2"):
         rfdropo.run(Dead(), RfdropoConfig(evaluations=20, rollouts_per_candidate=10), KEY)
 
 
