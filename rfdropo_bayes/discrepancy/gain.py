@@ -126,6 +126,12 @@ class Gain:
         }
 
     @property
+    def share(self) -> str:
+        """The explained share with its interval, in percent from 0 to 100, beyond which noise alone moves estimates."""
+        value, low, high = (100.0 * min(max(x, 0.0), 1.0) for x in (self.explained, *self.interval))
+        return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
+
+    @property
     def worse(self) -> bool:
         """Whether unseen trajectories are predicted worse: their error grows, or the discrepancy surely does."""
         return self.rmse_extended > self.rmse_base or self.interval[1] < 0.0

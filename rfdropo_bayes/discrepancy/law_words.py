@@ -101,13 +101,11 @@ def law_sentence(answer: Answer) -> str:
     gain, names = described.gain, channels_of(answer)
     rows = coefficients(described, answer.problem.seed)
     laws = " and ".join(_one(refit, row, names) for refit, row in zip(described.found.terms, rows, strict=True))
-    low, high = (100.0 * min(max(x, 0.0), 1.0) for x in gain.interval)
-    share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}]"
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
     unknown = "stands for no mechanism of the library" if answer.problem.candidates else "the model lacks"
     head = f"Something acts that {unknown}: {laws}{_when(described)}"
-    worth = f"it explains {share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
+    worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
     looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.found.terms))
     return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
 

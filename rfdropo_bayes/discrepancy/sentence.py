@@ -166,7 +166,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if gain is None:
         return f"{named}; how much it explains could not be measured."
     low, high = (100.0 * min(max(x, 0.0), 1.0) for x in gain.interval)
-    share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}] of the discrepancy"
+    share = f"{gain.share} of the discrepancy"
     if unclear(answer.problem.rules, gain):
         verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
         head = (
