@@ -27,8 +27,6 @@ class Code(StrEnum):
     """Replicates differ in the location of parameters."""
     MODES_UNSEEN = "modes_unseen"
     """A single replicate or optimisation cannot show that a mode of the posterior was lost."""
-    PASSES_DISAGREE = "passes_disagree"
-    """Two passes over the data differ in their log evidence."""
     ROLLOUTS_EXCLUDED = "rollouts_excluded"
     """Many rollouts got no weight."""
     CLIMB_UNFINISHED = "climb_unfinished"

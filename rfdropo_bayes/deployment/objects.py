@@ -78,7 +78,6 @@ def first_axis(index: int) -> tuple[int, int]:
 
 
 PDO_INVALID = 1 << 31
-PDO_NO_REMOTE = 1 << 30
 CSP_BIT = 1 << 7  # of 0x6502
 
 SETPOINT_MAP = ((Object.CONTROLWORD, 0, 16), (Object.TARGET_POSITION, 0, 32))

@@ -27,7 +27,6 @@ from rfdropo_bayes.bayes.problem import BatchedResiduals, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import positive_part
 
-FLATTEST = 1e-10  # curvature that a step takes a direction to have at least, as a share of the steepest
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order 1
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 
