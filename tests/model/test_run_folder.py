@@ -301,14 +301,14 @@ def test_a_file_is_replaced_whole_or_stays(tmp_path):
     assert [found.name for found in tmp_path.iterdir()] == ["file"]
 
 
-SHORT = ['data.fit=[{observations="demo/demo_1.nc", rows=[0, 40]}]', "data.test=[]", "inference.particles=50"]
+SHORT = ['data.fit=[{observations="demo/demo_1.nc", rows=[0, 40]}]', "data.test=[]", "inference.method=smc"]
 
 
 @pytest.mark.slow
 def test_an_interrupted_calibration_says_how_to_go_on_and_does(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     out = tmp_path / "run"
-    settings = [word for override in [*SHORT, "inference.rollouts=1500"] for word in ("--set", override)]
+    settings = [word for override in [*SHORT, "inference.particles=50", "inference.rollouts=1500"] for word in ("--set", override)]
     words = [sys.executable, "-m", "rfdropo_bayes", "calibrate", str(DEMO), "--out", str(out), *settings]
     running = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not (out / "log.jsonl").exists():
