@@ -308,7 +308,11 @@ SHORT = ['data.fit=[{observations="demo/demo_1.nc", rows=[0, 40]}]', "data.test=
 def test_an_interrupted_calibration_says_how_to_go_on_and_does(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     out = tmp_path / "run"
-    settings = [word for override in [*SHORT, "inference.particles=50", "inference.rollouts=1500"] for word in ("--set", override)]
+    settings = [
+        word
+        for override in [*SHORT, "inference.particles=50", "inference.rollouts=1500"]
+        for word in ("--set", override)
+    ]
     words = [sys.executable, "-m", "rfdropo_bayes", "calibrate", str(DEMO), "--out", str(out), *settings]
     running = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not (out / "log.jsonl").exists():

@@ -33,6 +33,7 @@ SHORT = [
     'data.fit=[{observations="demo/demo_1.nc", rows=[0, 20]}]',
     'data.test=["demo/demo_3.nc"]',
     "simulator.refine=1",
+    "inference.method=smc",
     "inference.particles=50",
     "inference.rollouts=400",
     "inference.blocks=3",
