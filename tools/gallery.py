@@ -41,7 +41,7 @@ def section(name: str, question: str, shown: str, printed: str) -> str:
     return f"""
 ## {question}
 
-![{question}](images/gallery/{name}.png)
+![Output of {name}](images/gallery/{name}.png)
 
 {shown}
 

@@ -67,7 +67,7 @@ def pages() -> dict[str, str]:
 def index_page() -> str:
     """What each page holds."""
     rows = [
-        ("[experiment.md](experiment.md)", "every key of the experiment file, priors, parameters of what is measured"),
+        ("[experiment.md](experiment.md)", "every key of the experiment file, priors, parameters of measurements"),
         ("[robot.md](robot.md)", "every key of a robot file, and the robots that come with the package"),
         (
             "[deployment.md](deployment.md)",
@@ -79,7 +79,7 @@ def index_page() -> str:
         ("[cautions.md](cautions.md)", "every caution of a result, by its code"),
         ("[mujoco.md](mujoco.md)", "every parameter of a MuJoCo model: address, unit, default prior"),
     ]
-    return page("Reference", ["These pages are written from the code.", table(("Page", "What is in it"), rows)])
+    return page("Reference", ["These pages are written from the code.", table(("Page", "Content"), rows)])
 
 
 def experiment_page() -> str:
@@ -91,7 +91,7 @@ def experiment_page() -> str:
         "`[model.priors]` has `parameter = { distribution = NAME, ... }`; every prior is confined to the parameter's "
         "hard bounds. `sigma` of a LogNormal is the standard deviation of the logarithm.",
         table(("Distribution", "Arguments", "Optional"), prior_rows()),
-        "## Parameters of what is measured",
+        "## Parameters of measurements",
         "They stand in `[model.priors]` or `[model.fixed]` like those of the robot and of mechanisms.",
         parameter_table([(spec, needs) for spec, needs in measured_parameters()], "With"),
         "## Formats of recordings",

@@ -9,7 +9,7 @@ import typer
 
 
 def view(
-    source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="what to draw")],
+    source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="experiment or recording to draw")],
     out: Annotated[
         Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
     ] = Path("runs/view.png"),

@@ -444,8 +444,8 @@ def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:
     """Expected rollouts of an optimisation of ``parameters`` parameters."""
-    forward = target.forward
-    return forward.count * USUAL * (7 + forward.lanes.slope_rollouts * parameters)
+    forward, (_, values) = target.forward, climb_cost(0, 0)
+    return forward.count * USUAL * (int(values) + forward.lanes.slope_rollouts * parameters)
 
 
 def best_between(

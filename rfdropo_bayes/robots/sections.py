@@ -63,7 +63,7 @@ def tapered(length: float, layers: int, outer: tuple[float, float], inner: tuple
 class Cylinder(RobotTable):
     """A solid round rod."""
 
-    shape: Literal["cylinder"] = Field(default="cylinder", description="what this section is")
+    shape: Literal["cylinder"] = Field(default="cylinder", description="form of the section")
     length_m: Positive = Field(description="length along z")
     layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
     radius_m: Positive = Field(description="radius")
@@ -76,7 +76,7 @@ class Cylinder(RobotTable):
 class Cone(RobotTable):
     """A solid round rod that tapers."""
 
-    shape: Literal["cone"] = Field(default="cone", description="what this section is")
+    shape: Literal["cone"] = Field(default="cone", description="form of the section")
     length_m: Positive = Field(description="length along z")
     layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
     radius_m: Radii = Field(description="radius at the end towards the base, and at that towards the tip")
@@ -89,7 +89,7 @@ class Cone(RobotTable):
 class Tube(RobotTable):
     """A hollow round rod, straight or tapering."""
 
-    shape: Literal["tube"] = Field(default="tube", description="what this section is")
+    shape: Literal["tube"] = Field(default="tube", description="form of the section")
     length_m: Positive = Field(description="length along z")
     layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
     radius_m: Positive | Radii = Field(description="outer radius, or its two values towards the base and the tip")
@@ -109,7 +109,7 @@ class Tube(RobotTable):
 class Disks(RobotTable):
     """Disks stacked on a backbone, the last disk at the end towards the tip; each layer is a disk or bare backbone."""
 
-    shape: Literal["disks"] = Field(default="disks", description="what this section is")
+    shape: Literal["disks"] = Field(default="disks", description="form of the section")
     length_m: Positive = Field(description="length along z")
     disks: int = Field(ge=1, description="number of disks, at equal distances")
     radius_m: Positive = Field(description="radius of the disks")

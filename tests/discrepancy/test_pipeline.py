@@ -22,7 +22,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy import base_fit
 from rfdropo_bayes.discrepancy import held_out as held_out_module
 from rfdropo_bayes.discrepancy.audit_record import _doubt, next_experiment, record
-from rfdropo_bayes.discrepancy.base_fit import base_model
+from rfdropo_bayes.discrepancy.base_fit import base_model, first_target
 from rfdropo_bayes.discrepancy.candidates import lead
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
@@ -406,6 +406,20 @@ def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
     assert list(status) == [0] * 4
     for name in shown:
         np.testing.assert_array_equal(shown[name], other[name])
+
+
+@pytest.mark.parametrize(("step", "rollouts"), [(1e-4, 1), (0.03, 2)])
+def test_differences_of_rollouts_are_the_derivatives(step, rollouts):
+    """To one side if the step is small, and at a bound to the side within; the motion is almost linear there."""
+    forward = first_target(problem(TRUTH, 1), Journal()).forward
+    by_step = forward.with_difference(step)
+    assert by_step.lanes.slope_rollouts == rollouts
+    points = np.repeat(forward.coordinates.encode(TRUTH)[None], 3, axis=0)
+    points[2, 0] = forward.coordinates.bounds[1][0]
+    directions = np.eye(points.shape[1])[[0, 1, 0]]
+    exact, found = (each.tangents(points, directions)["position"] for each in (forward, by_step))
+    assert np.abs(exact).max(axis=(1, 2, 3)).min() > 0.0
+    np.testing.assert_allclose(found, exact, atol=1e-4 * np.abs(exact).max())
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 NOISE_GRID = 13  # values of a noise coordinate tried at the start of an optimisation
 AXIS, LONGEST = 0.5, 0.05  # step along an axis of a posterior, in its deviations, and at most in any coordinate
 NOISE_STEP = 1e-2  # of a noise coordinate, along which residuals only change their scale
+DAMPINGS = 10.0 ** np.arange(-1.0, 5.0)  # over the damping before, tried in one batch
 ROUNDS = 3  # of differences along axes that get better
 SAME = 0.05  # nats between two normal distributions that are taken for one
 
@@ -134,7 +135,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
         gradient = np.where(held, 0.0, gradient)
         curvature = np.where(held[:, None] | held, np.diag(np.diag(curvature)), curvature)
     diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
-    dampings = state.damping * 10.0 ** np.arange(-1.0, 5.0)
+    dampings = state.damping * DAMPINGS
     moves = np.stack([_solved(curvature + damping * diagonal, gradient) for damping in dampings])
     # No coordinate moves further than 2: a logistic or a logarithm is beyond any quadratic model there.
     moves *= np.minimum(1.0, 2.0 / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-300))
@@ -192,9 +193,9 @@ def maximise(
 
 def climb_cost(d: int, noise: int) -> tuple[float, float]:
     """Rollouts for the start of an optimisation and for each of its steps, with ``d`` coordinates and ``noise`` noise
-    coordinates: the grid of the noise; a Jacobian by central differences, two more per noise, six dampings.
+    coordinates: the grid of the noise; the value, a Jacobian by central differences, two more per noise, all dampings.
     """
-    return float(NOISE_GRID * noise), 4.0 * d + 7.0
+    return float(NOISE_GRID * noise), 4.0 * d + 1.0 + len(DAMPINGS)
 
 
 def laplace(target: Climbable, state: LevenbergState) -> Laplace:
