@@ -317,7 +317,7 @@ def stage_body(
         added=added,
         gain=None if memory.branch is None else gain,
         branch=None if memory.branch is None else memory.branch.T,
-        blown=None if pressure is None else inflation(system.chambers, pressure),
+        blown=None if system.chambers is None or pressure is None else inflation(system.chambers, pressure),
     )
 
 

