@@ -73,14 +73,14 @@ def design(
     out: OutFolder = None,
     fit: Fit = None,
     adapt: Annotated[
-        bool, typer.Option("--adapt", help="propose the shortest recording of another day that rfdropo adapt needs")
+        bool, typer.Option("--adapt", help="propose the shortest recording of a new session that rfdropo adapt needs")
     ] = False,
     seconds: Annotated[float, typer.Option(help="with --adapt: longest proposal, in seconds")] = 10.0,
     group: Annotated[
         str | None,
         typer.Option(
             "--group",
-            help="with --adapt: the group of recordings with the drives of that day; by default the last group",
+            help="with --adapt: group whose limits of the drives hold in the new session; by default the last group",
         ),
     ] = None,
     seed: Seed = None,

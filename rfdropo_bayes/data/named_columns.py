@@ -90,7 +90,7 @@ class CsvColumns(BaseModel):
     sample_time: float | None = Field(
         default=None,
         gt=0,
-        description="time between rows [s], if no column has times or the times are of arrival",
+        description="time between rows [s], if no column has times, or only times of arrival",
     )
     commands: list[str] = Field(
         min_length=1,
@@ -119,8 +119,8 @@ class CsvColumns(BaseModel):
     )
     commands_with_poses: bool = Field(
         default=False,
-        description="the pose in a row is the pose under the command of the same row, as of poses at rest, or of "
-        "commands that were measured with the pose; by default a command acts from its row on",
+        description="whether a row has the pose under its own command, as if the robot is at rest, or if commands were "
+        "measured with the pose; by default a command acts from its row on",
     )
     command_time: str | None = Field(
         default=None,
@@ -137,7 +137,7 @@ class CsvColumns(BaseModel):
         min_length=1, description="columns of x, y and z of each marker, base to tip"
     )
     position_unit: Literal["m", "cm", "mm"] = Field(
-        description='unit of the positions; the header of a "motive-csv" file comes first'
+        description='unit of the positions; the header of a "motive-csv" file overrides it'
     )
     axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(
         ("x", "y", "z"),
@@ -153,7 +153,7 @@ class CsvColumns(BaseModel):
     base_marker: tuple[str, str, str] | None = Field(
         default=None,
         description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved: "
-        "positions are counted from it, and origin is the base's place beside it",
+        "positions and origin are relative to this marker",
     )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"

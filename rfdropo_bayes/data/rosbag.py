@@ -146,7 +146,7 @@ def clock_of(columns: CsvColumns) -> Clock:
     if columns.time in CLOCKS:
         return cast(Clock, columns.time)
     raise InputError(
-        f"time = {columns.time!r} is no clock of a bag",
+        f"time = {columns.time!r} is not a clock of a bag",
         where="[data.columns]",
         remedy='write "header", for header stamps if there are any, or "log", for the recorder\'s times',
     )

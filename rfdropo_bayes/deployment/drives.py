@@ -174,7 +174,7 @@ class Drive:
         kind = self.read(Object.PROFILE if own else Object.DEVICE_TYPE)
         if kind & 0xFFFF != 402:
             raise InputError(
-                f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
+                f"is not a CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
             )
         found = self._check_identity(identity, check_eds)
         if self.knows(Object.SUPPORTED_MODES):

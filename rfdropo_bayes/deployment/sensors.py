@@ -199,7 +199,7 @@ class NatNetMarkers:
         missing = [name for name in robot.marker_names if name not in table.rigid_bodies]
         if missing:
             raise InputError(
-                f"marker {missing[0]!r} has none", where="sensor.rigid_bodies", remedy="give its identifier"
+                f"marker {missing[0]!r} has no rigid body", where="sensor.rigid_bodies", remedy="give its identifier"
             )
         self._identifiers = {table.rigid_bodies[name]: place for place, name in enumerate(robot.marker_names)}
         if len(self._identifiers) < len(robot.marker_names):

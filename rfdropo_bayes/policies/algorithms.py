@@ -87,7 +87,7 @@ def algorithm_options(
         policy["log_std_init"] = -1.0
     own = given.get("policy_kwargs", {})
     if not isinstance(own, Mapping):
-        raise InputError("policy_kwargs is no table", where="[training.options]", remedy="give it keys and values")
+        raise InputError("policy_kwargs is not a table", where="[training.options]", remedy="give it keys and values")
     policy |= {**own, **{key: given[key] for key in short if key in given}}
     if "activation" in policy:
         policy["activation_fn"] = _activation(policy.pop("activation"))

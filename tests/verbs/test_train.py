@@ -186,7 +186,7 @@ def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
         (["training.ranges={young_modulus = [1.0, 2.0]}"], "outside its hard bounds"),
         (['training.algorithm="SACK"'], "did you mean 'SAC'"),
         (["training.options={learning_rat = 1e-3}"], "did you mean 'learning_rate'"),
-        (["training.period=0.013"], "no whole number of time steps"),
+        (["training.period=0.013"], "not a whole number of time steps"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None:

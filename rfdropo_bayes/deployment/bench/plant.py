@@ -95,7 +95,7 @@ def build_plant(name: str, robot: Robot, settings: Mapping[str, Any] | None = No
         return getattr(importlib.import_module(module), attribute)(robot, **(settings or {}))
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise InputError(
-            f"no plant {name!r} ({error})", where="plant", remedy="give springs, or MODULE:CALLABLE"
+            f"cannot load the plant {name!r} ({error})", where="plant", remedy="give springs, or MODULE:CALLABLE"
         ) from None
 
 

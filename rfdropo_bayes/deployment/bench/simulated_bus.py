@@ -169,7 +169,9 @@ def _marker_socket(address: str) -> socket.socket | None:
         return None
     host, _, port = address.rpartition(":")
     if not port.isdigit():
-        raise InputError(f"{address!r} is no HOST:PORT", where="markers", remedy="give one, 127.0.0.1:5100")
+        raise InputError(
+            f"{address!r} is not of the form HOST:PORT", where="markers", remedy="give one, 127.0.0.1:5100"
+        )
     connection = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     connection.connect((host or "127.0.0.1", int(port)))
     connection.setblocking(False)
