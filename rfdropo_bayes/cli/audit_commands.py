@@ -92,7 +92,7 @@ def design(
     """Propose commands that distinguish causes. Writes next_commands.csv and design.json."""
     see_calibration(fit, "--from")
     if adapt and fit is None:
-        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --from")
+        raise InputError("--adapt needs a calibration", where="--adapt", remedy="name its folder with --from")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.results.calibrated import Calibration

@@ -215,7 +215,7 @@ def init(
     _check_unit(unit, guess)
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
-    answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
+    answers["segments"] = ask.answer("segments", segments, "Segments with their own cables", 1)
     if segment_lengths is None and answers["segments"] > 1:
         ask.assumed.add("segment_lengths")
     if answers["segments"] > 1:

@@ -86,7 +86,7 @@ def drives(
     interface: Interface = "hub",
     channel: Channel = "127.0.0.1:29536",
     plant: Annotated[str, typer.Option(help="springs, or MODULE:CALLABLE")] = "springs",
-    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in a process of its own")] = False,
+    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in its own process")] = False,
     markers: Annotated[str, typer.Option(help="HOST:PORT to send markers to")] = "",
 ) -> None:
     """Simulate the drives of a robot and their bus. Runs until Ctrl-C."""

@@ -2,7 +2,7 @@
 
 Timing. The command in row k is in force from the time of row k until the time of row k + 1, as for a loop that measures
 and then commands; `first_command` finds the command before row 0. With `CsvColumns.commands_with_poses` it is in force
-from half-way after row k - 1 on, so that row k shows its pose. Commands may stand in a table of their own, with n or
+from half-way after row k - 1 on, so that row k shows its pose. Commands may stand in their own table, with n or
 n - 1 rows for n observations; or with their own times and any number of rows.
 """
 
@@ -75,7 +75,7 @@ class CsvColumns(BaseModel):
         default=None, description="names of all columns, in their order, of a CSV without a line of names"
     )
     command_names: list[str] | None = Field(
-        default=None, description="the same for a CSV of the commands, if they have a file of their own"
+        default=None, description="the same for a CSV of the commands, if they have their own file"
     )
     time: str | None = Field(
         default=None,
@@ -114,8 +114,8 @@ class CsvColumns(BaseModel):
     )
     units: dict[str, str] = Field(
         {},
-        description="unit of each column of commands or positions whose unit differs from command_unit or "
-        "position_unit, by the name of the column",
+        description="unit by name of the column, for columns of commands or positions whose unit differs from "
+        "command_unit or position_unit",
     )
     commands_with_poses: bool = Field(
         default=False,
@@ -417,7 +417,7 @@ def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray
 
 
 def command_clock(columns: CsvColumns) -> tuple[str | None, TimeUnit]:
-    """Column of times in a file of commands, and its unit; None if its rows have no times of their own."""
+    """Column of times in a file of commands, and its unit; None if its rows have no times."""
     shared = None if untimed(columns) else columns.time
     return columns.command_time or shared, columns.command_time_unit or columns.time_unit
 

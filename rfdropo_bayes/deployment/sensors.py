@@ -203,7 +203,7 @@ class NatNetMarkers:
             )
         self._identifiers = {table.rigid_bodies[name]: place for place, name in enumerate(robot.marker_names)}
         if len(self._identifiers) < len(robot.marker_names):
-            remedy = "give each marker the identifier of its own"
+            remedy = "give each marker its own identifier"
             raise InputError("two markers have the same rigid body", where="sensor.rigid_bodies", remedy=remedy)
         if table.object_body in self._identifiers:
             remedy = "give the identifier of the object's own"

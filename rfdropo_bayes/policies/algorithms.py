@@ -13,7 +13,7 @@ from rfdropo_bayes.tables import nearest
 ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN")
 CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
 ACTOR_CRITIC = ("PPO", "A2C")
-"""Whose actor and critic have networks of their own and one observation: the critic may see more."""
+"""Whose actor and critic have their own networks and one observation: the critic may see more."""
 OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
 """Arguments that the training sets itself."""
 OBJECTS = ("action_noise", "replay_buffer_class", "rollout_buffer_class")

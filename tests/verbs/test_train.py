@@ -311,7 +311,7 @@ def test_a_fixed_value_of_what_is_randomised_is_refused(given) -> None:
     ranges = {"ranges": {"young_modulus": [1e6, 3e6]}} if given == "uniform" else {}
     model = rb.Model("trunk_sofa", fixed={"young_modulus": 4e6})
     table, _, simulator = training_of(with_training(model, {"task": "TrunkReach-v0", "randomisation": given, **ranges}))
-    with pytest.raises(InputError, match=f"young_modulus has a fixed value, and randomisation = '{given}'"):
+    with pytest.raises(InputError, match=f"young_modulus is fixed, but randomisation = '{given}'"):
         randomisation_of(table, model.spec, simulator, fit if given == "posterior" else None)
 
 

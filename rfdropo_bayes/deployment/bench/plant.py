@@ -121,7 +121,7 @@ class PlantHere:
 
 
 class PlantProcess:
-    """A plant in a process of its own, which drives never wait for: they get the newest state that it has sent.
+    """A plant in its own process, which drives never wait for: they get the newest state that it has sent.
 
     A plant slower than real time lags behind; ``late`` is the delay.
 

@@ -48,8 +48,8 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
         levels: rollouts are simulated to one of this many horizons, the shortest sufficient horizon.
-        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion; mended,
-            the observation noise at the prior's medians is added as well.
+        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion. If
+            ``mended``, the observation noise at the prior's medians is also added.
         finalists: number of candidates scored again at the full horizon.
         parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
