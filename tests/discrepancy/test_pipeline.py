@@ -28,7 +28,7 @@ from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits, Rules
 from rfdropo_bayes.discrepancy.fit import climb
-from rfdropo_bayes.discrepancy.forward import Lanes, RoutedLanes
+from rfdropo_bayes.bayes.lanes import Lanes, RoutedLanes
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements

@@ -21,7 +21,7 @@ from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import Rules
-from rfdropo_bayes.discrepancy.forward import Lanes
+from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.simulators.commands import commands_on_grid
 from rfdropo_bayes.simulators.parameters import ParameterSpec
