@@ -214,10 +214,12 @@ def init(
         return
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
     if unit not in UNITS:
-        raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}")
+        raise InputError(
+            f"the unit {unit!r} is unknown", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}"
+        )
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
-    answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
+    answers["segments"] = ask.answer("segments", segments, "Segments with their own cables", 1)
     if segment_lengths is None and answers["segments"] > 1:
         ask.assumed.add("segment_lengths")
     if answers["segments"] > 1:
@@ -314,7 +316,7 @@ def _lengths(text: str | None) -> tuple[float, ...] | None:
         return tuple(MILLIMETRES * float(part) for part in text.split(","))
     except ValueError:
         where = "--segment-lengths-mm"
-        raise InputError(f"{text!r} is no list of lengths", where=where, remedy='e.g. "60,62.5,64"') from None
+        raise InputError(f"{text!r} is not a list of lengths", where=where, remedy='e.g. "60,62.5,64"') from None
 
 
 def _name(folder: Path) -> str:
@@ -332,7 +334,7 @@ def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: b
     number = cables if cables is not None else commands * (2 if paired else 1) // parts
     if parts * number != commands * (2 if paired else 1):
         raise InputError(
-            f"{commands} commands ({', '.join(guess.commands)}) for {parts} segments of {number} cables",
+            f"{commands} commands ({', '.join(guess.commands)}) do not fit {parts} segments of {number} cables",
             where="--recording",
             remedy="give --segments and --cables, and --pairs if opposite cables share a motor",
         )
@@ -355,7 +357,7 @@ def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> di
             raise InputError(f"{part!r} is not NAME=HEIGHT", where="--markers", remedy="e.g. low=66,middle=133,tip=200")
     if guess is not None and len(heights) != len(guess.positions):
         raise InputError(
-            f"{len(heights)} markers for {len(guess.positions)} in the recording ({', '.join(guess.markers)})",
+            f"{len(heights)} markers are named; the recording has {len(guess.positions)} ({', '.join(guess.markers)})",
             where="--markers",
             remedy="name one for each, in the order of the columns",
         )

@@ -137,7 +137,7 @@ def _table(frame: Any, name: str) -> pd.DataFrame:
     if isinstance(frame, pd.DataFrame):
         return frame
     raise InputError(
-        f"a {type(frame).__name__} is no table",
+        f"a {type(frame).__name__} is not a table",
         where=name,
         remedy=("give a DataFrame of pandas, or a table that has to_pandas(), as tables of Polars and PyArrow have"),
     )

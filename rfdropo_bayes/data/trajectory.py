@@ -135,7 +135,7 @@ class Trajectory:
     def from_xarray(cls, dataset: xr.Dataset, name: str = "recording", *, robot: str = "") -> Trajectory:
         """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
 
-        Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels
+        Dimensions may be in any order; ``command`` may have its own clock, ``command_time``. Markers and channels
         are named by their coordinates, units stand in the variables' attribute ``units`` ("m" if missing, and "s" of
         ``time``, which may hold dates). Further variables are ``initial_command``, ``tension`` [N], ``motor_angle``
         [rad] and ``object_pose``; their own units, and the unit of ``command_time``, count if stated.

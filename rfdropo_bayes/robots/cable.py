@@ -37,12 +37,12 @@ class Cable(RobotTable):
     )
     displacement_limit_m: Pair | None = Field(
         default=None,
-        description="least and greatest displacement, pull > 0; commands beyond are held at the limit; of a cable that "
-        "is driven by a displacement",
+        description="least and greatest displacement, pull > 0; commands beyond it stop at the limit; only "
+        "for cables driven by displacement",
     )
     tension_limit_n: Pair | None = Field(
         default=None,
-        description="least and greatest tension; commands beyond are held at the limit; of a cable that is driven by a "
+        description="least and greatest tension; commands beyond it stop at the limit; only for cables driven by "
         "tension",
     )
 

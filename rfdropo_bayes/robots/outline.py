@@ -94,13 +94,15 @@ class RobotOutline:
     def __post_init__(self) -> None:
         where = "robot outline"
         if self.gravity not in DIRECTIONS:
-            remedy = f"one of {', '.join(DIRECTIONS)}: the direction of gravity, with z away from the clamp"
-            raise InputError(f"gravity = {self.gravity!r} is no direction", where=where, remedy=remedy)
+            remedy = f"use one of {', '.join(DIRECTIONS)}: the direction of gravity, with z away from the clamp"
+            raise InputError(f"gravity = {self.gravity!r} is not a direction", where=where, remedy=remedy)
         if self.command_unit not in COMMANDS:
             remedy = '"m" of cable or "rad" of a motor; recordings in mm or deg are converted when they are read'
-            raise InputError(f"command_unit = {self.command_unit!r} is no unit of a robot", where=where, remedy=remedy)
+            raise InputError(
+                f"command_unit = {self.command_unit!r} is not a unit of a robot", where=where, remedy=remedy
+            )
         if self.shape not in SHAPES:
-            raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"one of {', '.join(SHAPES)}")
+            raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"use one of {', '.join(SHAPES)}")
         for key in ("length", "radius", "young_modulus", "spool_radius"):
             if not getattr(self, key) > 0.0:
                 raise InputError(f"{key} = {getattr(self, key):g} is not positive", where=where)

@@ -122,7 +122,7 @@ class PolicyLayout:
             chosen = np.asarray(action)
             if not np.issubdtype(chosen.dtype, np.integer) or chosen.min() < 0 or chosen.max() >= len(moves):
                 raise InputError(
-                    f"{_brief(chosen)} is no action",
+                    f"{_brief(chosen)} is not an action",
                     where=self.task,
                     remedy=f"use whole numbers from 0 to {len(moves) - 1}",
                 )

@@ -112,8 +112,8 @@ class Robot(RobotTable):
     time_step_s: Positive = Field(description="time step of the simulation")
     integrator: Literal["euler", "sdirk2"] = Field(
         default="sdirk2",
-        description='scheme of a time step: "sdirk2", of order 2 (1.6 with taut cables), takes two solves a step, and '
-        'its error is about a tenth of the error of "euler", which takes one, as SOFA does',
+        description='scheme of a time step: "sdirk2" has order 2 (1.6 with taut cables) and two solves a step; '
+        '"euler", the scheme of SOFA, has one solve and about ten times the error',
     )
     initial_state: Literal["rest", "equilibrium"] = Field(
         description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',

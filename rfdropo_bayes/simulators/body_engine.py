@@ -223,7 +223,7 @@ class Engine:
             InputError: a cube without a scene, or a scene without a cube; loads on another body than a rod alone.
         """
         if (cube is None) != (self.scene is None):
-            raise InputError("a cube without a scene, or a scene without a cube", where="engine")
+            raise InputError("a scene and a cube must be given together", where="engine")
         if loads is not None and not self.carries_loads:
             raise InputError(
                 "signals on the body act on a rod without a cube only",

@@ -147,10 +147,10 @@ def test_init_writes_files_that_read_the_recordings(tmp_path, monkeypatch, capsy
     ("words", "message"),
     [
         (("--recording", "none_*.csv"), "matches no file"),
-        (("--recording", "run.csv", "--segments", "3"), "4 commands (u1, u2, u3, u4) for 3 segments"),
-        (("--recording", "run.csv", "--markers", "a=1,b=2,c=3"), "3 markers for 2 in the recording (low, tip)"),
+        (("--recording", "run.csv", "--segments", "3"), "4 commands (u1, u2, u3, u4) do not fit 3 segments"),
+        (("--recording", "run.csv", "--markers", "a=1,b=2,c=3"), "3 markers are named; the recording has 2 (low, tip)"),
         (("--markers", "tip"), "'tip' is not NAME=HEIGHT"),
-        (("--command-unit", "turns"), "commands in 'turns'"),
+        (("--command-unit", "turns"), "the unit 'turns' is unknown"),
     ],
 )
 def test_what_does_not_fit_is_said_in_one_line(tmp_path, monkeypatch, capsys, words, message):

@@ -141,9 +141,11 @@ class NativeRod:
         integrator: Integrator = "euler",
     ) -> None:
         if precision not in _NUMERICS:
-            raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
+            raise InputError(f"unknown precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
         if threads is not None and threads < 1:
-            raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
+            raise InputError(
+                f"threads = {threads} is less than 1", remedy="use at least one, or None for all processors"
+            )
         self.system, self.time_step, self.integrator = system, float(time_step), integrator
         self.precision, self.dtype = precision, np.dtype(precision)
         self.threads = threads or available_processors()
@@ -153,7 +155,7 @@ class NativeRod:
         self._runs = runs_of(system.cables)
         self._steps: Integrator = "euler" if integrator == "quasi-static" else integrator
         if scene is not None and integrator == "quasi-static":
-            raise InputError("a body that touches a cube and is always at rest", remedy="use another integrator")
+            raise InputError("quasi-static motion does not allow a cube", remedy="use another integrator")
         self._scene = None if scene is None else rod_scene(scene, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
@@ -249,7 +251,7 @@ class NativeRod:
             batch = batch._replace(present=present, place=place, places=len(place))
         steps = drive.shape[-2] if steps is None else min(int(steps), drive.shape[-2])
         if (cube is None) != (self._scene is None):
-            raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
+            raise InputError("a scene and a cube must be given together", where="rollout")
         cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
         settling = 0 if start is None else ITERATIONS
         still, stages = self.integrator == "quasi-static", timed_stages(self._steps, self.time_step)

@@ -82,7 +82,7 @@ class RodSession:
 
     def __init__(self, engine: NativeRod, count: int) -> None:
         if count < 1:
-            raise InputError(f"{count} lanes", remedy="use at least one")
+            raise InputError(f"the number of lanes is {count}", remedy="use at least one")
         self.engine, self.count = engine, int(count)
         self.memory = np.zeros((0, 0, engine.lanes), engine.dtype)
         self._run: Run | None = None  # of the lane that was started first
@@ -153,7 +153,7 @@ class RodSession:
         """
         engine = self.engine
         if self._run is None:
-            raise InputError("a session that was not started", remedy="reset all lanes first")
+            raise InputError("the session was not started", remedy="reset all lanes first")
         if drive.ndim != 3 or drive.shape[::2] != (self.count, engine.tables.drives):
             expected = f"({self.count}, steps, {engine.tables.drives})"
             raise InputError(f"drive has shape {drive.shape}, expected {expected}", where="advance")
@@ -189,7 +189,7 @@ class RodSession:
         """
         if state.shape[1:] != self.memory.shape[1:2] or state.dtype != self.engine.dtype:
             raise InputError(
-                f"a state of {state.shape[1:]} values in {state.dtype}",
+                f"the state has {state.shape[1:]} values in {state.dtype}",
                 where="restore",
                 remedy=f"this session has {self.memory.shape[1]} in {self.engine.dtype}; start it before",
             )
@@ -205,7 +205,7 @@ class RodSession:
             self._run = _taken(run, [0])
         elif rubs != self._rubs or not np.array_equal(run.batch.present, self._run.batch.present):
             raise InputError(
-                "a lane whose body has other effects than the lanes before",
+                "a lane has other effects of the body than earlier lanes",
                 where="reset",
                 remedy="give every lane the same mechanisms; a null value switches one off",
             )
