@@ -89,7 +89,7 @@ def test_what_does_not_fit_is_refused():
         session.advance(displacement[:2])
     with pytest.raises(InputError, match="values in float32"):
         session.restore(np.arange(1), session.save()[:1].astype(np.float32))
-    with pytest.raises(InputError, match="0 lanes"):
+    with pytest.raises(InputError, match="the number of lanes is 0"):
         RodSession(engine(), 0)
 
 
