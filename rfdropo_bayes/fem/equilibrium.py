@@ -3,8 +3,8 @@
 Newton's method with the constraints of a step and its tangent, and with the forces that turn with the sections, in
 leading order. Stresses in the matrix are linear in the increments: in a thin rod the second order of a rotation is a
 large force along the axis (Magisano, Leonetti and Garcea 2017, "How to improve efficiency and robustness of the Newton
-method in geometrically non-linear structural problem discretized via displacement-based finite elements"). Mobilised
-friction of the cables continues from the
+method in geometrically non-linear structural problem discretized via displacement-based finite elements"). Increments
+that shrink slowly are prolonged by Aitken's rule. Mobilised friction of the cables continues from the
 previous state, so that it depends on the path. Derivatives are of the equations at the solution, with all terms.
 """
 
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -38,6 +39,12 @@ WIDEST_TURN = 0.5
 """No section turns further [rad] in an iteration."""
 SLOWER = 0.5
 """Share of the next way that a body goes whose increments do not shrink."""
+NEAR = 0.1
+"""Increments below this many body lengths follow Aitken's rule."""
+SHORTEST, FARTHEST = 0.3, 10.0
+"""Least and greatest share of an increment by that rule."""
+STEADY = 0.8
+"""Cosine between successive increments above which growing ones lead away from an unstable equilibrium."""
 TINY = 1e-300
 NO_TIME = Stage(0.0, 1.0, 0.0, True)
 """A stage whose "velocities" are the motion itself."""
@@ -79,6 +86,8 @@ class _Iterate(NamedTuple):
     impulse: Float[Array, " rows"]
     turning: Turning
     largest: Float[Array, ""]  # increment of the iteration before, over the body's length
+    increment: Float[Array, "6 stations"]  # and all of it, in body lengths and radians
+    pace: Float[Array, ""]  # share of it that was gone; 0 if the matrix has changed its kind since
     moving: Bool[Array, ""]
     solved: Float[Array, ""]
     iterations: Float[Array, ""]
@@ -115,13 +124,24 @@ def _bonds(system: System, task: Task, place: State, previous: Float[Array, " ca
     return bonds._replace(rows=rows, base=length - before, compliance=weight, slips=slips)
 
 
+def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Array, ""]:
+    """Share of an increment by Aitken's rule in the form of Irons and Tuck (1969, Int. J. Numer. Methods Eng. 1:275):
+    from the change that the last increment, and the share of it that was gone, made to the next."""
+    before = current.increment
+    square, along, own = (jnp.sum(a * b) for a, b in ((before, before), (before, increment), (increment, increment)))
+    share = current.pace * (square - along) / jnp.maximum(square - 2.0 * along + own, TINY)
+    away = (along > square) & (along**2 > STEADY**2 * square * own)
+    return jnp.where(away, FARTHEST, jnp.clip(share, SHORTEST, FARTHEST))
+
+
 def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
-    """Newton's method. Increments are limited in length, and halved if they do not shrink. A matrix without a solution
+    """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`. A
+    matrix without a solution
     is tried again without the forces that turn, which near a loss of stability leave it indefinite; they are back after
     a whole increment. The increments to come are no more than a geometric series that goes on as the last two did.
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
-    length, none = system.body.length, jnp.zeros((6, len(task.start.position)))
+    none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
 
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
@@ -129,28 +149,30 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
         found, softness = solved_stage(way, body._replace(turning=current.turning), bonds)
         count = current.iterations + 1.0
         again = ~jnp.isfinite(jnp.sum(found.change**2)) & (current.turning.share > 0.0)
-        far, wide = jnp.max(jnp.abs(found.change[:3])) / length, jnp.max(jnp.abs(found.change[3:]))
+        increment = found.change / scales
+        far, wide = jnp.max(jnp.abs(increment[:3])), jnp.max(jnp.abs(increment[3:]))
         size = jnp.maximum(far, wide)
         grown = size > current.largest
-        share = jnp.minimum(
-            1.0, jnp.minimum(LONGEST_STEP / jnp.maximum(far, TINY), WIDEST_TURN / jnp.maximum(wide, TINY))
-        )
-        share = jnp.where(grown, SLOWER * share, share)
+        limit = jnp.minimum(LONGEST_STEP / jnp.maximum(far, TINY), WIDEST_TURN / jnp.maximum(wide, TINY))
+        paced = (current.pace > 0.0) & (size < NEAR)
+        plain = jnp.where(grown, SLOWER, 1.0) * jnp.minimum(limit, 1.0)
+        share = jnp.where(paced, jnp.minimum(limit, _pace(current, increment)), plain)
         left = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
-        before = current.turning.resultant
-        turning = Turning(
-            before + share * (stresses(body, found.change) - before), jnp.where(share < 1.0, current.turning.share, 1.0)
-        )
+        left = jnp.where(share > 1.0, share * size, left)
+        before, kind = current.turning
+        turning = Turning(before + share * (stresses(body, found.change) - before), jnp.where(share < 1.0, kind, 1.0))
+        pace = jnp.where(turning.share == kind, share, 0.0)
         place = displaced(current.place, share * found.change.T)
-        taken = _Iterate(place, found.impulse, turning, size, left > bound, found.converged, count, softness)
-        waiting = current._replace(turning=Turning(before, jnp.zeros(())), iterations=count)
+        rest = left > bound, found.converged, count, softness
+        taken = _Iterate(place, found.impulse, turning, size, increment, pace, *rest)
+        waiting = current._replace(turning=Turning(before, none[0, 0]), pace=none[0, 0], iterations=count)
         return jax.tree.map(lambda old, new: jnp.where(again, old, new), waiting, taken)
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
     turning = Turning(stresses(_body(system, task, task.start), none), jnp.ones(()))
-    rest = jnp.array(jnp.inf), task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
-    first = _Iterate(task.start, impulse, turning, *rest)
+    rest = task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
+    first = _Iterate(task.start, impulse, turning, jnp.array(jnp.inf), none, jnp.zeros(()), *rest)
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
     return Found(
         last.place.position,
