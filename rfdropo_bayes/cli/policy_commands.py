@@ -14,7 +14,6 @@ from rfdropo_bayes.cli.options import (
     OutFolder,
     Overrides,
     Overwrite,
-    Quiet,
     Resume,
     folder_for,
     see_calibration,
@@ -37,7 +36,6 @@ def train(
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -62,7 +60,7 @@ def train(
     done = f"after {found['steps']} steps in {found['seconds']:.0f} s: {learnt(found)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
-    say(found, *lines, quiet=quiet, as_json=as_json)
+    say(found, *lines, as_json=as_json)
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
@@ -94,7 +92,6 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="number of episodes of each policy, the same for all")] = 200,
     seed: Annotated[int, typer.Option(help="seed of the parameters and goals of the episodes")] = 0,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -106,7 +103,7 @@ def evaluate(
 
     model = Model.read(experiment, overrides)
     found = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
-    say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
+    say(found, evaluation_table(found), f"table: {folder / TABLE}", as_json=as_json)
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}
