@@ -68,14 +68,14 @@ def design(
     out: OutFolder = None,
     fit: Fit = None,
     adapt: Annotated[
-        bool, typer.Option("--adapt", help="propose the shortest recording of another day that rfdropo adapt needs")
+        bool, typer.Option("--adapt", help="propose the shortest recording of a new session that rfdropo adapt needs")
     ] = False,
     seconds: Annotated[float, typer.Option(help="with --adapt: longest proposal, in seconds")] = 10.0,
     group: Annotated[
         str | None,
         typer.Option(
             "--group",
-            help="with --adapt: the group of recordings with the drives of that day; by default the last group",
+            help="with --adapt: group whose limits of the drives hold in the new session; by default the last group",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -85,7 +85,7 @@ def design(
     """Propose commands that distinguish causes. Writes next_commands.csv and design.json."""
     see_calibration(fit, "--from")
     if adapt and fit is None:
-        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --from")
+        raise InputError("--adapt needs a calibration", where="--adapt", remedy="name its folder with --from")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.results.calibrated import Calibration

@@ -31,10 +31,14 @@ def deploy(
     out: Annotated[Path | None, typer.Option("--out", help="folder of the session; by default runs/NAME-TIME")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="session folder or trajectory to replay")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="no live view")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print no live view")] = False,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="key or table.key of the deployment file; may be repeated"),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="value of an entry of the deployment file, KEY=VALUE or TABLE.KEY=VALUE; may be repeated",
+        ),
     ] = None,
 ) -> None:
     """Run a policy on drives, or try it. Writes report.html, session.nc, the CAN frames, log.jsonl and summary.json."""

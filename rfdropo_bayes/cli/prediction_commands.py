@@ -14,11 +14,12 @@ from rfdropo_bayes.model.experiment_file import look_through
 from rfdropo_bayes.model.run_folder import check_folder
 
 Group = Annotated[
-    str | None, typer.Option("--group", help="the day or robot it belongs to; as [model.groups] has it by default")
+    str | None,
+    typer.Option("--group", help="group of the commands (a session or robot); by default from [model.groups]"),
 ]
 PredictedGroup = Annotated[
     str | None,
-    typer.Option("--group", help="the day or robot; by default from adapt, or else from [model.groups]"),
+    typer.Option("--group", help="group (a session or robot); by default from adapt, or else from [model.groups]"),
 ]
 
 Episode = Annotated[int | None, typer.Option("--episode", help="number of the episode, of a LeRobotDataset")]
@@ -76,9 +77,7 @@ def adapt(
         str | None, typer.Option("--commands", help="file of its commands, if the format has a separate file")
     ] = None,
     episode: Episode = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="length of the beginning that is used, in seconds; all by default")
-    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="seconds from the start that are used; all by default")] = None,
     group: Group = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,

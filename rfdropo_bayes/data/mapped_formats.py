@@ -111,7 +111,7 @@ def read_mapped(
 
     Args:
         format: one of `MAPPED`.
-        path: file or folder with the observations, and the commands unless they have a file of their own.
+        path: file or folder with the observations, and the commands unless they have their own file.
         columns: mapping of the columns.
         commands: a CSV of the commands.
         episode: number of the episode in a LeRobotDataset.
@@ -132,7 +132,7 @@ def read_mapped(
         raise InputError(
             "has no commands: Motive records none",
             where=str(path),
-            remedy="give {observations = ..., commands = ...}, the latter a CSV with times of its own (command_time)",
+            remedy="give {observations = ..., commands = ...}, the latter a CSV with its own times (command_time)",
         )
     for ending in (".csv", ".mat", ".npz", *rosbag.STORAGE):
         name = name.removesuffix(ending)

@@ -46,7 +46,7 @@ def read_arrays(path: Path) -> pd.DataFrame:
         arrays = _of_npz(path) if path.suffix != ".mat" else _of_mat(path)
     except (OSError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"is no file of arrays that can be read ({type(error).__name__}: {error})".replace("\n", " "),
+            f"is not a readable file of arrays ({type(error).__name__}: {error})".replace("\n", " "),
             where=str(path),
             remedy="save it again, from MATLAB with arrays in place of tables and timetables",
         ) from None

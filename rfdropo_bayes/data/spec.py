@@ -100,7 +100,7 @@ class DataSpec(BaseModel):
     def piece(self, whole: Trajectory, rows: tuple[int, int] | None, every: int = 1) -> Trajectory:
         """Each ``every``-th row, first to last, with the commands of `lead_in`; all rows without ``rows``.
 
-        Commands with a clock of their own may begin long before the recording does.
+        Commands with their own clock may begin long before the recording does.
         """
         if every > 1:
             timed = self.columns is None or self.columns.time != ROWS

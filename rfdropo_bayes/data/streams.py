@@ -1,4 +1,4 @@
-"""Readings that each come at times of their own, such as the topics of a bag, brought to one table.
+"""Readings with their own times, such as the topics of a bag, brought to one table.
 
 Observations get the times of the first marker's stream. Readings of the other streams are interpolated linearly between
 two that are no further apart than one and a half rows; a lone reading goes to the row nearest to it; other cells are

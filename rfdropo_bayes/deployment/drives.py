@@ -174,7 +174,7 @@ class Drive:
         kind = self.read(Object.PROFILE if own else Object.DEVICE_TYPE)
         if kind & 0xFFFF != 402:
             raise InputError(
-                f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
+                f"is not a CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
             )
         found = self._check_identity(identity, check_eds)
         if self.knows(Object.SUPPORTED_MODES):
@@ -566,7 +566,7 @@ class Drives:
     def quick_stop(self, patience: float = 0.02) -> list[str]:
         """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
 
-        The controlword goes out in a PDO of its own that needs no SYNC. If a frame cannot be sent, the others still
+        The controlword goes out in its own PDO that needs no SYNC. If a frame cannot be sent, the others still
         are, and the drive's own guard stops it.
 
         Returns:
@@ -622,4 +622,4 @@ _SET: dict[Object, tuple[int, ...]] = {
 }
 """Objects that `Drive.configure` writes, with their subindexes."""
 
-_MODE_TIME = 0.2  # [s]: a drive may take some cycles of its own to change its mode
+_MODE_TIME = 0.2  # [s]: a drive may take some cycles to change its mode

@@ -76,11 +76,11 @@ def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
         raise InputError(f"cannot be read ({error})", where=where, remedy=again) from None
     result = parse_table(HomingResult, table, where=where)
     if result.robot != robot.name or tuple(home.channel for home in result.homes) != robot.channel_names:
-        raise InputError(f"is of robot {result.robot!r} with other channels", where=where, remedy=again)
+        raise InputError(f"belongs to robot {result.robot!r}, whose name or channels differ", where=where, remedy=again)
     age = datetime.datetime.now(datetime.UTC) - result.date
     if age > datetime.timedelta(hours=valid_h):
         raise InputError(
-            f"is {age.total_seconds() / 3600:.1f} h old, valid for {valid_h:g} h", where=where, remedy=again
+            f"is {age.total_seconds() / 3600:.1f} h old; the limit is {valid_h:g} h", where=where, remedy=again
         )
     return result
 

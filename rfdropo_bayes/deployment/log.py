@@ -196,7 +196,7 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
         header = json.loads(content[8:size])
     except (OSError, ValueError) as error:
         raise InputError(
-            f"is no journal of a session ({error})", where=str(path), remedy="give a session's folder"
+            f"is not a journal of a session ({error})", where=str(path), remedy="give a session's folder"
         ) from None
     if header["schema_version"] != SCHEMA_VERSION:
         raise InputError(

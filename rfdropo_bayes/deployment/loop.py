@@ -1,4 +1,4 @@
-"""The control loop: set-points out and status in at every beat, and every phase of a session from enabling to rest."""
+"""The control loop: set-points out and status in at every cycle, and every phase of a session from enabling to rest."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Snapshot(NamedTuple):
 
 
 class ControlLoop:
-    """One session on configured drives. Runs in a thread of its own; `run` returns why it ended.
+    """One session on configured drives. Runs in its own thread; `run` returns why it ended.
 
     Args:
         robot: robot to drive.

@@ -292,10 +292,10 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
     for part in layout.observation:
         if part.name not in sizes:
             known = ", ".join(sizes)
-            raise InputError(f"wants {part.name!r}, which nothing here measures", where=where, remedy=f"known: {known}")
+            raise InputError(f"needs {part.name!r}, which no sensor measures", where=where, remedy=f"known: {known}")
         if part.size != sizes[part.name]:
             raise InputError(
-                f"wants {part.size} numbers of {part.name!r}; here there are {sizes[part.name]}",
+                f"needs {part.size} numbers of {part.name!r}; there are {sizes[part.name]}",
                 where=where,
                 remedy="name the markers that it sees: [policy] markers"
                 if part.name in ("markers", "moved", EARLIER_MOVED)
@@ -327,7 +327,9 @@ def _open(content: bytes, where: str) -> tuple[Any, PolicyLayout]:
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise InputError(f"is no ONNX model ({type(error).__name__})", where=where, remedy="export it again") from None
+        raise InputError(
+            f"is not an ONNX model ({type(error).__name__})", where=where, remedy="export it again"
+        ) from None
     text = session.get_modelmeta().custom_metadata_map.get(METADATA)
     if text is None:
         raise InputError("has no layout in its metadata", where=where, remedy="export it with `rfdropo train`")

@@ -273,7 +273,7 @@ class _Session:
             self.drives.configure(self.period, lambda text: self.log.event("note", text))
 
     def run(self, hooks: tuple[Hook, ...], show: bool, keyboard: bool) -> Outcome:
-        """Run the phases of the mode in a thread of their own, with the emergency stop beside it."""
+        """Run the phases of the mode in their own thread, with the emergency stop beside it."""
         if self.mode is Mode.CHECK:
             return self._outcome(Stop(Cause.FINISHED, "nothing was written"), None)
         safety = self.settings.safety

@@ -157,7 +157,7 @@ class SimulationSettings(_Table):
     Attributes:
         plant: "springs", or MODULE:CALLABLE.
         settings: settings of the plant, or a .toml file of settings.
-        own_process: whether the plant runs in a process of its own.
+        own_process: whether the plant runs in its own process.
     """
 
     plant: str = "springs"

@@ -34,7 +34,7 @@ def data_sheet(eds: str, node: int, axes: int = 1) -> canopen.ObjectDictionary:
             text += "".join(_further_axis(text, axis) for axis in range(2, axes + 1))
         return import_eds(io.StringIO(text), node)
     except Exception as error:  # configparser and canopen raise many types on damaged data sheets
-        raise InputError(f"is no readable data sheet ({error})", where=eds, remedy=EDS_REMEDY) from None
+        raise InputError(f"is not a readable data sheet ({error})", where=eds, remedy=EDS_REMEDY) from None
 
 
 def _further_axis(text: str, axis: int) -> str:

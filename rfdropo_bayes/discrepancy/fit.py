@@ -151,8 +151,7 @@ class FitTarget:
     def evaluate(
         self, points: Float[np.ndarray, "n d"], rows: int | None = None
     ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, " n"], np.ndarray]:
-        """Whitened residuals, the logarithms of the sizes that errors are relative to, and the mask of successful
-        rollouts.
+        """Whitened residuals, the log standard deviations that whiten them, and the mask of successful rollouts.
 
         Only the first ``rows`` rows of every recording, all by default, are simulated; later rows are meaningless. Half
         the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.

@@ -107,7 +107,11 @@ class Episodes:
         self.simulator, self.robot = simulator, simulator.robot
         limit = settings.tension_limit
         if limit is not None and not 0.0 < limit < np.inf:
-            raise InputError(f"tension_limit = {limit:g}", where=task.name, remedy="give a positive number [N]")
+            raise InputError(
+                f"tension_limit = {limit:g} is not positive and finite",
+                where=task.name,
+                remedy="give a positive number [N]",
+            )
         if limit is not None and not simulator.cable_names:
             raise _without_tensions(self.robot.name, "name its cables, see docs/your_simulator.md, or leave it out")
         asked = (settings.actions, settings.observed, settings.period, settings.step, settings.history)
@@ -250,7 +254,8 @@ class Episodes:
         least, limit = np.min(self._largest_tension(found, good)[good], initial=np.inf), self.settings.tension_limit
         if limit is not None and limit < least < np.inf:
             raise InputError(
-                f"cables of {self.robot.name} pull {least:.3g} N and more without an action; {limit:g} N ends it",
+                f"cables of {self.robot.name} pull at least {least:.3g} N before any action, "
+                f"above the limit of {limit:g} N",
                 where="tension_limit",
                 remedy="raise it, or leave it out",
             )
@@ -338,7 +343,7 @@ def _check_options(option: Mapping[str, Any]) -> None:
         raise InputError(f"unknown option {sorted(unknown)[0]!r}", where="reset", remedy="use parameters and goal")
     goal = option.get("goal")
     if goal is not None and (np.shape(goal) != (3,) or not np.all(np.isfinite(np.asarray(goal, dtype=float)))):
-        raise InputError(f"goal = {goal!r}", where="reset", remedy="give three finite numbers in metres")
+        raise InputError(f"goal = {goal!r} is not a point", where="reset", remedy="give three finite numbers in metres")
 
 
 def _brief(values: Mapping[str, float]) -> str:

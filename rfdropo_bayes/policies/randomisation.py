@@ -82,7 +82,11 @@ class Uniform:
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges.items():
             if not low <= high:
-                raise InputError(f"{name} from {low:g} to {high:g}", where="ranges", remedy="give the lower end first")
+                raise InputError(
+                    f"the range of {name} begins at {low:g} and ends at {high:g}",
+                    where="ranges",
+                    remedy="give the lower end first",
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -265,7 +269,7 @@ def spread_out(randomisation: Randomisation, width: float, specs: Sequence[Param
         normals = {name: {**normal, "std": width * normal["std"]} for name, normal in randomisation.normals.items()}
         return replace(randomisation, normals=normals)
     raise InputError(
-        f"width = {width:g} beside a randomisation that is no posterior",
+        f"width = {width:g} applies only to a posterior and to phi",
         where="[training]",
         remedy='leave width out, or set randomisation = "posterior" or "phi"',
     )

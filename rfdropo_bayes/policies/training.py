@@ -137,7 +137,7 @@ def _plain(table: TrainingTable) -> dict[str, Any]:
         return table.model_dump(mode="json")
     except PydanticSerializationError as error:
         raise InputError(
-            f"a value that no file can hold: {error}",
+            f"a value cannot be stored in a file: {error}",
             where="[training.options]",
             remedy='use numbers, words, lists and tables, such as activation = "relu"',
         ) from None

@@ -119,7 +119,7 @@ class TrunkVecEnv(VecEnv):
         return [found for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Lanes have no wrappers of their own."""
+        """Lanes have no wrappers."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:

@@ -46,7 +46,7 @@ def energy_score(draws: Float[np.ndarray, "n d"], outcome: Float[np.ndarray, " d
         InputError: fewer than two draws.
     """
     if len(draws) < 2:
-        raise InputError("one draw is no distribution", where="energy score", remedy="give two or more")
+        raise InputError("a single draw is not a distribution", where="energy score", remedy="give two or more")
     return float(np.mean(cdist(draws, outcome[None])) - 0.5 * np.mean(pdist(draws)))
 
 

@@ -348,7 +348,8 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
     for name in names:
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
         body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
-        why = obstacle(mechanism, body, engine, spec.simulator.motion)
+        cables = not isinstance(spec.robot, Robot) or bool(spec.robot.cables)
+        why = obstacle(mechanism, body, engine, spec.simulator.motion, cables)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:

@@ -59,7 +59,9 @@ def address_of(channel: str) -> tuple[int, Any]:
         return socket.AF_UNIX, channel
     host, _, port = channel.rpartition(":")
     if not host or not port.isdigit():
-        raise InputError(f"{channel!r} is no channel of a hub", where="bus.channel", remedy="give HOST:PORT or a path")
+        raise InputError(
+            f"{channel!r} is not a channel of a hub", where="bus.channel", remedy="give HOST:PORT or a path"
+        )
     return socket.AF_INET, (host, int(port))
 
 
