@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from rfdropo_bayes.verbs.column_names import Guess
 
 ANGLES = ("deg", "rad", "counts")
+PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
-UNITS = ("mm", "cm", "m", *ANGLES, *FORCES)
+UNITS = ("mm", "cm", "m", *ANGLES, *PASCALS, *FORCES)
 FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")
@@ -212,7 +213,10 @@ def init(
         _init_model(folder, files, sent, guess)
         return
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
-    _check_unit(unit, guess)
+    if unit not in UNITS:
+        raise InputError(
+            f"the unit {unit!r} is unknown", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}"
+        )
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
     answers["segments"] = ask.answer("segments", segments, "Segments with their own cables", 1)
@@ -257,20 +261,6 @@ def _listed(names: str | None) -> list[str] | None:
     return None if names is None else [name.strip() for name in names.split(",")]
 
 
-def _check_unit(unit: str, guess: Guess | None) -> None:
-    """Raise an InputError if commands are neither lengths of cable nor angles of motors."""
-    if unit in UNITS:
-        return
-    remedy = f"use one of {', '.join(UNITS)}"
-    if guess is None or unit != guess.command_unit:
-        raise InputError(f"the unit {unit!r} is unknown", where="--command-unit", remedy=remedy)
-    raise InputError(
-        f"commands are in {unit!r} ({', '.join(guess.commands)}), which no drive of a cable takes",
-        where="--recording",
-        remedy=f"give --command-unit, one of {', '.join(UNITS)}; counts of the spool need --counts-per-turn",
-    )
-
-
 def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
     """Write an experiment for a model of another simulator."""
     from rfdropo_bayes.verbs.init_model import write_model_experiment
@@ -312,7 +302,8 @@ def _outline(name: str, disks: int | None, unit: str, answers: dict[str, Any], a
         if key in given:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
-    kind: Any = "rad" if unit in ANGLES else unit if unit in ("N", "N m") else "-" if unit in FORCES else "m"
+    kinds = {**dict.fromkeys(ANGLES, "rad"), **dict.fromkeys(PASCALS, "Pa"), **dict.fromkeys(FORCES, "-")}
+    kind: Any = (kinds | {"N": "N", "N m": "N m"}).get(unit, "m")
     assumed |= {"disks"} if given["shape"] == "disks" and disks is None else set()
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
 

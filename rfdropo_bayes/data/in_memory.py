@@ -52,7 +52,8 @@ def from_arrays(
             default.
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
-        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
+        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m",
+            "Pa", "kPa", "MPa", "mbar", "bar", "psi", or "-".
         largest_command: largest plausible command, in ``command_unit``, for drives that travel more than 20 rad or 5 m.
         tension: cable tensions [N]; NaN if missing.
         motor_angle: motor angles [rad]; NaN if missing.

@@ -30,16 +30,20 @@ from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+PASCALS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "mbar": 1e2, "bar": 1e5, "psi": 6894.757293168}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
     "deg": ("rad", np.pi / 180.0),
     "N": ("N", 1.0),
     "N m": ("N m", 1.0),
+    **{name: ("Pa", factor) for name, factor in PASCALS.items()},
     **dict.fromkeys(("-", "V", "A", "%"), ("-", 1.0)),
 }
 COUNTS = "counts"
 """Encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "V", "A", "%", "-"]
+CommandUnit = Literal[
+    "m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "MPa", "mbar", "bar", "psi", "V", "A", "%", "-"
+]
 
 
 ROWS = "rows"
@@ -97,8 +101,8 @@ class CsvColumns(BaseModel):
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
     )
     command_unit: CommandUnit = Field(
-        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force or torque; "
-        '"-" for commands of your own simulator'
+        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force, torque or "
+        'pressure; "-" for commands of your own simulator'
     )
     counts_per_turn: float | None = Field(
         default=None,

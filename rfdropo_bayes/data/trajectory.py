@@ -88,13 +88,13 @@ class Trajectory:
             given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
                 marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
                 away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
-                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in force
-                until the next; ``markers`` and ``channels``, their names. These five are required. ``command_time``:
-                start time of each command, on the clock of ``time``; ``largest_command``: largest plausible command of
-                drives of many turns. ``tension`` (time, channel) [N], ``motor_angle`` (time, channel) [rad],
-                ``object_pose`` (time, 7): centre and unit quaternion x, y, z, w. ``orientation`` (time, section, 4),
-                unit quaternions x, y, z, w, and ``sections``, their names. ``name`` of the recording; ``robot``: name
-                of the recorded robot.
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in
+                force until the next; ``markers`` and ``channels``, their names. These five are required.
+                ``command_time``: start time of each command, on the clock of ``time``; ``largest_command``: largest
+                plausible command of drives of many turns. ``tension`` (time, channel) [N], ``motor_angle`` (time,
+                channel) [rad], ``object_pose`` (time, 7): centre and unit quaternion x, y, z, w. ``orientation`` (time,
+                section, 4), unit quaternions x, y, z, w, and ``sections``, their names. ``name`` of the recording;
+                ``robot``: name of the recorded robot.
 
         Raises:
             InputError: an unknown or missing keyword, an unknown unit, values that are not numbers, shapes that do not
@@ -190,7 +190,7 @@ class Trajectory:
 
     @property
     def command_unit(self) -> str:
-        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"`` or ``"-"``."""
+        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"``, ``"Pa"`` or ``"-"``."""
         return str(self.dataset["command"].attrs["unit"])
 
     @property

@@ -21,12 +21,13 @@ from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.lanes import Fields
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
-from rfdropo_bayes.discrepancy.forward import Fields, Forward
+from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at

@@ -86,7 +86,7 @@ class Run(NamedTuple):
         """Whether all commands are finite: a cable with a displacement of NaN would count as slack."""
         batch, schedule = self.batch, self.schedule
         known = np.ones(batch.count, dtype=bool)
-        moved = batch.displacement[: batch.count, : schedule.steps * batch.start.shape[1]]
+        moved = batch.drive[: batch.count, : schedule.steps * batch.start.shape[1]]
         for part in (moved,) if schedule.resumed else (moved, batch.start):
             known &= np.isfinite(part.sum(axis=1))
         return known
@@ -163,10 +163,10 @@ class NativeRod:
     def rollout(
         self,
         material: Material,
-        displacement: Float[np.ndarray, "*batch steps cables"],
+        drive: Float[np.ndarray, "*batch steps drives"],
         *,
-        start: Float[np.ndarray, "*batch cables"] | None = None,
-        before: Float[np.ndarray, "*batch cables"] | None = None,
+        start: Float[np.ndarray, "*batch drives"] | None = None,
+        before: Float[np.ndarray, "*batch drives"] | None = None,
         steps: int | None = None,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
@@ -176,10 +176,11 @@ class NativeRod:
 
         Args:
             material: fields with a leading batch axis; a field without this axis serves the whole batch.
-            displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
-            start: cable displacements [m] whose static equilibrium is the initial state, as in
+            drive: displacements of cables [m] and pressures of chambers [Pa] at the end of every step, one sequence for
+                all or one per rollout.
+            start: drives whose static equilibrium is the initial state, as in
                 ``fem.static_equilibrium``; None starts undeformed.
-            before: cable displacements [m] before the first step of a body that starts undeformed; zero by default.
+            before: drives before the first step of a body that starts undeformed; zero by default.
                 Stages within the step interpolate to its end.
             steps: number of steps to compute; all by default.
             stride: number of steps between recorded states.
@@ -190,7 +191,7 @@ class NativeRod:
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
-        run = self.run_of(material, displacement, start, before, steps, stride, cube, loads)
+        run = self.run_of(material, drive, start, before, steps, stride, cube, loads)
         rubs = material.effects.rubs
         in_blocks(
             lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
@@ -223,7 +224,7 @@ class NativeRod:
     def run_of(
         self,
         material: Material,
-        displacement: np.ndarray,
+        drive: np.ndarray,
         start: np.ndarray | None,
         before: np.ndarray | None,
         steps: int | None,
@@ -232,23 +233,23 @@ class NativeRod:
         loads: SectionLoads | None = None,
     ) -> Run:
         """Inputs and outputs of the kernels; arguments as `rollout`."""
-        displacement = np.asarray(displacement, dtype=float)
-        cables = self.tables.cables
-        if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
-            raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
+        drive = np.asarray(drive, dtype=float)
+        drives = self.tables.drives
+        if drive.ndim not in (2, 3) or drive.shape[-1] != drives:
+            raise InputError(f"drive has shape {drive.shape} for {drives} drives", where="rollout")
         given = before if start is None else start
-        begin = np.zeros(cables) if given is None else np.asarray(given, dtype=float)
-        if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
-            raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
-        moves = displacement[None] if displacement.ndim == 2 else displacement
-        moves = moves.reshape(len(moves), moves.shape[1] * cables)
+        begin = np.zeros(drives) if given is None else np.asarray(given, dtype=float)
+        if begin.ndim not in (1, 2) or begin.shape[-1] != drives:
+            raise InputError(f"start has shape {begin.shape} for {drives} drives", where="rollout")
+        moves = drive[None] if drive.ndim == 2 else drive
+        moves = moves.reshape(len(moves), moves.shape[1] * drives)
         pushed, place = load_rows(loads)
-        batch = self._batch(material, {"start": np.atleast_2d(begin), "displacement": moves, "loads": pushed})
+        batch = self._batch(material, {"start": np.atleast_2d(begin), "drive": moves, "loads": pushed})
         if loads is not None:
             present = batch.present.copy()
             present[LOADED] = 1
             batch = batch._replace(present=present, place=place, places=len(place))
-        steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
+        steps = drive.shape[-2] if steps is None else min(int(steps), drive.shape[-2])
         if (cube is None) != (self._scene is None):
             raise InputError("a scene and a cube must be given together", where="rollout")
         cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
