@@ -46,7 +46,7 @@ def audit(
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.audit import audit as ask
 
-    found = ask(
+    result = ask(
         Model.read(experiment, overrides),
         out=folder,
         fit=fit,
@@ -55,11 +55,11 @@ def audit(
         overwrite=overwrite,
         show=True,
     )
-    show_audit(found.content, folder, as_json=as_json)
-    if found.content["stopped"] == INTERRUPT:
+    show_audit(result.content, folder, as_json=as_json)
+    if result.content["stopped"] == INTERRUPT:
         raise Interrupted(str(folder), "--resume")
-    if found.content["stopped"] and not as_json:
-        minutes = 2.0 * found.content["minutes"]
+    if result.content["stopped"] and not as_json:
+        minutes = 2.0 * result.content["minutes"]
         typer.echo(f"to go on: {same_command('rfdropo', '--resume', '--set', f'audit.minutes={minutes:g}')}")
 
 
@@ -96,9 +96,9 @@ def design(
     model = Model.read(experiment, overrides)
     options: dict[str, Any] = {"out": folder, "overwrite": overwrite, "show": True}
     if adapt and fit is not None:
-        found = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
+        result = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
     else:
-        found = propose(model, fit=fit, **options)
+        result = propose(model, fit=fit, **options)
     commands = folder / COMMANDS
-    content = {**found.content, "commands": str(commands)}
-    say(content, found.sentence, f"commands: {commands}", as_json=as_json)
+    content = {**result.content, "commands": str(commands)}
+    say(content, result.sentence, f"commands: {commands}", as_json=as_json)

@@ -82,8 +82,8 @@ def calibrate(
     from rfdropo_bayes.verbs.calibrate import calibrate as run_fit
 
     model = Model.read(experiment, overrides)
-    found = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite)
-    show_calibration(found, experiment, as_json=as_json)
+    result = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite)
+    show_calibration(result, experiment, as_json=as_json)
 
 
 def simulate(
@@ -100,8 +100,8 @@ def simulate(
     from rfdropo_bayes.verbs.simulate import simulate_all
 
     say_step(f"simulating the recordings of {experiment}", show=False if as_json else None)
-    found = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
-    show_simulation(found, as_json=as_json)
+    content = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
+    show_simulation(content, as_json=as_json)
 
 
 # In the order in which they are used, which --help shows.

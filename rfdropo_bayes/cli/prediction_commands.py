@@ -56,7 +56,7 @@ def predict(
     from rfdropo_bayes.verbs.predict import predict as predict_motion
 
     say_step(f"predicting {commands} with draws of {fit}", show=False if as_json else None)
-    found = predict_motion(
+    prediction = predict_motion(
         Calibration.of_posterior(fit, Model.read(experiment, overrides)),
         _from_here(commands),
         out=out,
@@ -66,7 +66,7 @@ def predict(
         overwrite=overwrite,
     )
     files = [str(out / f"prediction.{ending}") for ending in ("nc", "csv")]
-    show_prediction({**found.content, "files": files}, as_json=as_json)
+    show_prediction({**prediction.content, "files": files}, as_json=as_json)
 
 
 def adapt(
@@ -98,7 +98,7 @@ def adapt(
         commands=None if commands is None else _from_here(commands),
         episodes=None if episode is None else [episode],
     )
-    found = adapt_fit(
+    result = adapt_fit(
         Calibration.of_posterior(run, fitted_model(run, overrides)),
         entry,
         out=out,
@@ -106,7 +106,7 @@ def adapt(
         group=group,
         overwrite=overwrite,
     )
-    show_calibration(found, as_json=as_json)
+    show_calibration(result, as_json=as_json)
 
 
 def _from_here(name: str) -> str:

@@ -374,10 +374,10 @@ class ControlLoop:
             except can.CanError:
                 self._say("the bus is lost: the drives' heartbeat guards stop them")
         self.pulse = None
-        if not after.found:
+        if not after.events:
             return stop
         cause = Cause.DRIVE_STATE if stop.cause is Cause.FINISHED else stop.cause
-        return Stop(cause, "; ".join(filter(None, [stop.detail, *after.found])))
+        return Stop(cause, "; ".join(filter(None, [stop.detail, *after.events])))
 
     def _hold_where_it_is(self) -> bool:
         """Set the command to the drives' positions once they no longer follow it; returns whether it changed."""
