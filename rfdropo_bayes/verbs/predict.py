@@ -117,7 +117,7 @@ def predict(
         jax.random.key(model.settings.seed if seed is None else seed),
         chunk=simulator.lanes,
         fitted=fitted,
-        left=recorded_model_error(record),
+        model_error=recorded_model_error(record),
         groups=groups,
         slow=slow,
     )

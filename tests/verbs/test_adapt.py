@@ -318,7 +318,7 @@ def test_a_run_without_days_left_out_has_the_prior_of_their_error(known, zeros):
     """Of a new day, and says so; a fitted day has none."""
     new, old = (recorded([name], zeros[1:2], 51)[0] for name in ("b", "day_0_b"))
     found = rb.predict(known, new)
-    assert found.unseen.startswith("No recording of this day was seen. This run left no session out of its fit")
+    assert found.unseen.startswith("No recording of this session was seen. This run left no session out of its fit")
     assert rb.predict(known, old).unseen == ""
 
 
