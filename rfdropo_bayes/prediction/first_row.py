@@ -1,6 +1,6 @@
 """Conditioning of parameters on the first row of a recording.
 
-`match_first_row` fits the parameters of a recording or a new group to the row. `weighed_by_first_row` resamples draws
+`match_first_row` fits the parameters of a recording or a new group to the row. `resampled_by_first_row` resamples draws
 for recordings of a fitted group: nothing is free, but some draws fit the row better.
 """
 
@@ -80,7 +80,7 @@ def match_first_row(
     return (_with_offsets(problem, values, shifted, model_error) if shifted else values), lost
 
 
-def weighed_by_first_row(
+def resampled_by_first_row(
     recordings: RecordingSet,
     position: Float[np.ndarray, "n recording marker 3"],
     names: Sequence[str],
@@ -113,7 +113,7 @@ def weighed_by_first_row(
     return index
 
 
-def far_first_rows(predictions: Sequence[RecordingPrediction], model_error: ModelError | None) -> dict[str, float]:
+def first_row_distances(predictions: Sequence[RecordingPrediction], model_error: ModelError | None) -> dict[str, float]:
     """Distance of measured from predicted first rows in units of the model error, if it exceeds chance.
 
     Errors of a row are assumed normal, with the sizes and the number of independent coordinates of the residuals

@@ -35,7 +35,7 @@ from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.day_error import DayError
 from rfdropo_bayes.prediction.day_spread import draw_deviation
-from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
@@ -137,7 +137,7 @@ def predict_new(
     anew for every draw. A parameter of a group takes, for a new group, values from the spread between groups. The
     offset of the measuring frame and the deviations of a new group are then conditioned on the first row
     (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
-    (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
+    (`resampled_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
     A parameter that only some fitted recordings had free, such as a payload, applies to them alone. A parameter that
     only some groups have also applies to their new recordings; an unseen group lacks it. A cube starts at its measured
@@ -185,7 +185,7 @@ def predict_new(
     patterns = groups or {}
     known = {*gather_groups(fitted, patterns), *(p.scope.owner for p in model.scopes.parameters if p.scope.group)}
     without = without_cautions(model.scopes, list(gather_groups(names, patterns)), known)
-    return NewPredictions(predictions, unmatched, far_first_rows(predictions, model_error), without)
+    return NewPredictions(predictions, unmatched, first_row_distances(predictions, model_error), without)
 
 
 def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKeyArray) -> RecordingPrediction:
@@ -259,7 +259,7 @@ def _predictions(
     key, choice, again_key = jax.random.split(key, 3)
     if pose is not None:
         pose = measured_objects(problem, pose, fine, jax.random.fold_in(key, 1))
-    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, model_error, choice)
+    chosen = resampled_by_first_row(recordings, position[:, :, 0], unseen, model_error, choice)
     noisy = position + problem.draw_noise(key, fine)
     before = None
     if prior is not None:

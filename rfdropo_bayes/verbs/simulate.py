@@ -175,7 +175,7 @@ def _generated(table: CommandsTable, name: str, simulator: AnySimulator, rng: np
             command=command,
             command_unit=simulator.command_unit,
             cable_names=simulator.channel_names,
-        ).believed(),
+        ).trusted(),
         Measured(time=time, position=np.tile(places, (len(time), 1, 1)), marker_names=markers),
     )
 
@@ -218,7 +218,7 @@ def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], 
             command_unit=source.command_unit,
             cable_names=source.cable_names,
             initial_command=source.initial_command,
-        ).believed(),
+        ).trusted(),
         Measured(time=source.time, position=position, marker_names=found.markers, object_pose=found.pose),
     )
 
