@@ -34,7 +34,7 @@ MOST_ROWS = 20
 
 
 def say(content: Mapping[str, Any], *lines: str, as_json: bool) -> None:
-    """Print a result as JSON, or lines of words about it, or nothing."""
+    """Print a result as JSON, or lines of words about it."""
     if as_json:
         typer.echo(json.dumps(content, indent=2))
     else:
