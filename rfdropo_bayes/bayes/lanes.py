@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -71,11 +72,6 @@ class Lanes:
         if backend is not None and backend.name == "numba":
             self.difference = STEP if backend.precision == "float64" else COARSE
         self.physical = tuple(spec.name for spec in simulator.parameters) if physical is None else tuple(physical)
-
-    def serve(self, simulator: Simulator, marker_index: np.ndarray, physical: Sequence[str]) -> bool:
-        """Whether these are the rollouts of a simulator, given some of its parameters."""
-        own = self.simulator is simulator and self.physical == tuple(physical)
-        return own and np.array_equal(self.marker_index, marker_index)
 
     def _observe(
         self, theta: jax.Array, start: jax.Array, commands: Commands, steps: jax.Array
@@ -157,11 +153,12 @@ class Lanes:
         steps, rows = (most - own for most, own in zip(self._size, given, strict=True))
         if commands.signals is not None or min(steps, rows) < 0 or steps == rows == 0:
             return commands
-        return commands._replace(
-            step=np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
-            sample_step=np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
-            sample_fraction=np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
-        )
+        longer: dict[str, Any] = {
+            "step": np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
+            "sample_step": np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
+            "sample_fraction": np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
+        }
+        return commands._replace(**longer)
 
     def differentiate(
         self,
@@ -174,6 +171,19 @@ class Lanes:
         """Derivatives along tangents of the parts of an observation that are data."""
         lanes = (theta, tangent, start, commands)
         return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
+
+
+def lanes_of(simulator: Simulator, marker_index: np.ndarray, physical: tuple[str, ...]) -> Lanes:
+    """Lanes of a simulator, given some of its parameters: all models that use them at a time share one program."""
+    key = (id(simulator), marker_index.tobytes(), physical)
+    found = _IN_USE.get(key)
+    if found is None:
+        found = _IN_USE[key] = Lanes(simulator, marker_index, physical=physical)
+    return found
+
+
+_IN_USE: WeakValueDictionary[tuple[int, bytes, tuple[str, ...]], Lanes] = WeakValueDictionary()
+"""Lanes by the identity of their simulator, which lives as long as they do."""
 
 
 class RoutedLanes(Lanes):

@@ -245,9 +245,9 @@ def init(
 
 def _found_lines(robot: Path, experiment: Path) -> list[str]:
     """Frame, order and azimuths that were found from a recording, each with its evidence."""
-    found = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
-    found += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
-    return [line for line in found if "ASSUMED" in line]
+    lines = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
+    lines += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
+    return [line for line in lines if "ASSUMED" in line]
 
 
 def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:

@@ -54,8 +54,8 @@ def deploy(
     if not quiet and (simulated or mode == Mode.DRY_RUN):
         typer.echo("starting the simulated drives; the first start of a trunk compiles, for minutes", err=True)
     outcome = run_session(settings, mode, folder, simulated=simulated, commands=recording, show=show, keyboard=True)
-    for channel, found in outcome.drives.items() if mode == "check" else ():
-        typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in found.items()))
+    for channel, identity in outcome.drives.items() if mode == "check" else ():
+        typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in identity.items()))
     for channel, lacking in outcome.without.items() if mode == "check" else ():
         for line in lacking:
             typer.echo(f"{channel} is without {line}")
@@ -86,7 +86,6 @@ def drives(
     interface: Interface = "hub",
     channel: Channel = "127.0.0.1:29536",
     plant: Annotated[str, typer.Option(help="springs, or MODULE:CALLABLE")] = "springs",
-    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in its own process")] = False,
     markers: Annotated[str, typer.Option(help="HOST:PORT to send markers to")] = "",
 ) -> None:
     """Simulate the drives of a robot and their bus. Runs until Ctrl-C."""
@@ -95,7 +94,7 @@ def drives(
 
     table = BusTable(interface=interface, channel=channel)
     typer.echo(f"drives of {robot} on {interface} {channel}; interrupt to end", err=True)
-    serve(SimulationTable(robot, table, plant, own_process=own_process, markers=markers))
+    serve(SimulationTable(robot, table, plant, markers=markers))
 
 
 def doctor(
@@ -110,7 +109,7 @@ def doctor(
 
     settings = None if deployment is None else load_deployment(deployment)
     rate = 100.0 if settings is None else settings.rate_hz
-    found = examine(None if settings is None else settings.bus, rate, seconds)
-    typer.echo(json.dumps(found, indent=2))
-    if found["problems"]:
+    report = examine(None if settings is None else settings.bus, rate, seconds)
+    typer.echo(json.dumps(report, indent=2))
+    if report["problems"]:
         raise typer.Exit(FAILED)

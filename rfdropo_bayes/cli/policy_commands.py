@@ -14,7 +14,6 @@ from rfdropo_bayes.cli.options import (
     OutFolder,
     Overrides,
     Overwrite,
-    Quiet,
     Resume,
     folder_for,
     see_calibration,
@@ -38,7 +37,6 @@ def train(
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -59,20 +57,20 @@ def train(
     model = Model.read(experiment, overrides)
     if fit is not None:
         model = with_training(model, {"randomisation": "posterior"})
-    found = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
-    done = f"after {found['steps']} steps in {found['seconds']:.0f} s: {learnt(found)}"
+    summary = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
+    done = f"after {summary['steps']} steps in {summary['seconds']:.0f} s: {learnt(summary)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
-    say(found, *lines, quiet=quiet, as_json=as_json)
+    say(summary, *lines, as_json=as_json)
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
     """Overrides of an experiment file by the options --task and --goal."""
-    found = []
+    overrides = []
     if task is not None:
         if task not in TASKS:
             raise InputError(f"unknown task {task!r}", where="--task", remedy=f"use {' or '.join(TASKS)}")
-        found.append(f'training.task="{TASKS[task]}"')
+        overrides.append(f'training.task="{TASKS[task]}"')
     if goal is not None:
         parts = goal.split(",")
         try:
@@ -81,8 +79,8 @@ def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
             place = []
         if len(place) != 3:
             raise InputError(f"{goal!r} is not X,Y,Z", where="--goal", remedy="e.g. --goal 0.02,-0.03,0.13, in metres")
-        found.append(f"training.goals={[place, place]}")
-    return found
+        overrides.append(f"training.goals={[place, place]}")
+    return overrides
 
 
 def evaluate(
@@ -95,7 +93,6 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="number of episodes of each policy, the same for all")] = 200,
     seed: Annotated[int, typer.Option(help="seed of the parameters and goals of the episodes")] = 0,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -106,8 +103,8 @@ def evaluate(
     from rfdropo_bayes.verbs.evaluate import evaluate as play
 
     model = Model.read(experiment, overrides)
-    found = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
-    say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
+    evaluation = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
+    say(evaluation, evaluation_table(evaluation), f"table: {folder / TABLE}", as_json=as_json)
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}

@@ -160,7 +160,7 @@ class CsvTable:
             low_memory=False,
             index_col=False,
         )
-        self.frame.columns = _told_apart(header)
+        self.frame.columns = _numbered_names(header)
 
     @classmethod
     def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
@@ -290,7 +290,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
 
 
-def _told_apart(header: Sequence[str]) -> list[str]:
+def _numbered_names(header: Sequence[str]) -> list[str]:
     """Names of columns, with a number for each empty name."""
     return [name or f"Unnamed: {column}" for column, name in enumerate(header)]
 
@@ -299,14 +299,14 @@ def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: 
     for row, line in enumerate(rows):
         if separator != " " and '"' not in line and line.count(separator) == fields - 1:
             continue
-        found = len(cells_of(line, separator))
-        if found != fields:
+        count = len(cells_of(line, separator))
+        if count != fields:
             last = row == len(rows) - 1
             raise InputError(
-                f"has {found} values, but the header names {fields}" + (": the file is cut short" if last else ""),
+                f"has {count} values, but the header names {fields}" + (": the file is cut short" if last else ""),
                 where=f"{path}, row {row}",
                 remedy="separate values by semicolons if decimals follow a comma"
-                if found == 2 * fields
+                if count == 2 * fields
                 else ("fetch the file again or drop the row" if last else "repair the row"),
             )
 

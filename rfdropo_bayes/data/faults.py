@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.data.identities import Change, changed_names
-from rfdropo_bayes.data.sample_times import check_times, clock_notes, evened
+from rfdropo_bayes.data.sample_times import check_times, clock_notes, evenly_spaced
 from rfdropo_bayes.errors import InputError
 
 NOTES = "notes"  # key of a recording's settings: valid but suspicious facts
@@ -94,7 +94,7 @@ def find_faults(
     missing = nan | zero
     held = find_held(np.where(missing[..., None], 0.0, position)) & ~missing
     jumping = np.zeros_like(missing)
-    breaks, clock = [], evened(time)
+    breaks, clock = [], evenly_spaced(time)
     for marker in range(position.shape[1]):
         rows = np.flatnonzero(~(missing | held)[:, marker])
         wrong, level_changes = _off_path(clock[rows], position[rows, marker], tolerance, max_acceleration, longest_run)
@@ -153,28 +153,28 @@ def find_zeros(
 
 def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) -> list[str]:
     """Markers at exactly 0, 0, 0, with the first row of each."""
-    said = []
+    notes = []
     for kind, words in (
         (zero, "taken for lost and left out; leave such cells empty to avoid this note"),
         (doubtful, "taken as it stands; if it was lost, leave the cells empty, or omit the marker"),
     ):
         for marker in np.flatnonzero(kind.any(axis=0)).tolist():
             rows = np.flatnonzero(kind[:, marker])
-            said.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
-    return said
+            notes.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
+    return notes
 
 
 def _mostly_masked(seen: np.ndarray, counts: dict[str, list[int]], names: Sequence[str]) -> list[str]:
     """Notes on markers with more masked than kept positions: the detected pattern is then hardly a fault."""
-    said, rows = [], len(seen)
+    notes, rows = [], len(seen)
     for marker in np.flatnonzero(2 * seen.sum(axis=0) < rows).tolist():
-        found = {kind: each[marker] for kind, each in counts.items() if kind not in ("breaks", "renamed")}
-        kinds = ", ".join(f"{count} {kind}" for kind, count in found.items() if count)
-        said.append(
+        marker_counts = {kind: each[marker] for kind, each in counts.items() if kind not in ("breaks", "renamed")}
+        kinds = ", ".join(f"{count} {kind}" for kind, count in marker_counts.items() if count)
+        notes.append(
             f"{int((~seen[:, marker]).sum())} of {rows} positions of {names[marker]} are masked ({kinds}): if most of "
             "them were measured, look at the unit of times, at the unit of positions and at the marker's columns"
         )
-    return said
+    return notes
 
 
 def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[str]) -> list[str]:

@@ -25,11 +25,11 @@ def given_recordings(given: Any, where: str) -> list[Trajectory]:
         return [given]
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise InputError(f"{_words(given)} is not a list of recordings", where=where, remedy=READ)
-    found = list(given)
-    for each in found:
+    recordings = list(given)
+    for each in recordings:
         if not isinstance(each, Trajectory):
             raise InputError(f"{_words(each)} is not a recording", where=where, remedy=READ)
-    return found
+    return recordings
 
 
 def given_recording(given: Any, where: str) -> Trajectory:

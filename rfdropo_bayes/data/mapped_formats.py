@@ -72,9 +72,11 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
     Raises:
         InputError: a file of another format, a damaged one, or a column that is not there.
     """
-    found = recognised_format(path)
-    if found != format:
-        raise InputError(f"is of the format {found!r}, not {format!r}", where=str(path), remedy=f'use "{found}"')
+    recognised = recognised_format(path)
+    if recognised != format:
+        raise InputError(
+            f"is of the format {recognised!r}, not {format!r}", where=str(path), remedy=f'use "{recognised}"'
+        )
     places = coordinates(columns)
     if format == rosbag.FORMAT:
         return Observed(rosbag.read_observations(path, columns), _in_seconds(columns, path))

@@ -460,8 +460,8 @@ def _angles(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cab
 def _counter_notes(table: CsvTable, source: CsvTable, columns: CsvColumns, motion: Motion) -> list[str]:
     """Jumps of counters, of commands and of motor angles, that no marker follows."""
     sent = (columns.commands, columns.command_unit, source.numbers(columns.commands), motion)
-    names, found = columns.motor_angles or [], motion._replace(sent=motion.time)
-    read = (names, columns.motor_angle_unit, table.numbers(names, allow_missing=True) if names else None, found)
+    names, angle_motion = columns.motor_angles or [], motion._replace(sent=motion.time)
+    read = (names, columns.motor_angle_unit, table.numbers(names, allow_missing=True) if names else None, angle_motion)
     notes = []
     for names, unit, values, seen in (sent, read):
         if values is not None:

@@ -76,8 +76,8 @@ class SentCommands:
         between = 0.5 * (time[:-1] + time[1:])
         return replace(self, command_time=between, command=command[1:], initial_command=command[0])
 
-    def believed(self) -> SentCommands:
-        """The same, of which the largest is to be believed: commands of a simulator or of a controller's own log."""
+    def trusted(self) -> SentCommands:
+        """The same commands of a simulator or a controller's own log, whose largest command is plausible."""
         size = np.abs(np.asarray(self.command, dtype=float))
         return replace(self, largest=float(size.max())) if size.size and np.isfinite(size).all() else self
 
@@ -203,8 +203,8 @@ def _missing(
         "poses of the object": 0 if pose is None else int((~np.isfinite(pose).all(axis=-1)).sum()),
         "orientations": 0 if orientation is None else int((~np.isfinite(orientation).all(axis=-1)).sum()),
     }
-    found = {kind: count for kind, count in counts.items() if count}
-    return {MISSING: found} if found else {}
+    missing = {kind: count for kind, count in counts.items() if count}
+    return {MISSING: missing} if missing else {}
 
 
 def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:

@@ -68,8 +68,8 @@ def command_openings(trajectory: Trajectory) -> dict[str, str]:
 
 
 def same_opening(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
-    """Whether two recordings have the same commands at the same speed, as far as both can be compared
-    (`command_openings`); keys without a speed are compared without it.
+    """Whether two recordings have the same commands at the same speed, over their shared rows; see
+    `command_openings`. If one speed is unknown, only commands are compared.
     """
     shared = set(one) & set(other)
     if not shared:
@@ -107,8 +107,8 @@ def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
     """
     total: dict[str, float] = {}
     freedom: dict[str, int] = {}
-    for found in group_repeats(trajectories):
-        for group in _in_rows_alike([trajectories[index] for index in found]):
+    for repeated in group_repeats(trajectories):
+        for group in _in_rows_alike([trajectories[index] for index in repeated]):
             for marker, variance in (_variances(group) if len(group) > 1 else {}).items():
                 total[marker] = total.get(marker, 0.0) + (len(group) - 1) * variance
                 freedom[marker] = freedom.get(marker, 0) + len(group) - 1

@@ -177,7 +177,7 @@ def _streams(reader: AnyReader, path: Path, topics: Collection[str] | None, cloc
         for name, header, values in _readings(reader.deserialize(raw, connection.msgtype), connection.topic):
             frame = "" if header is None else str(header.frame_id)
             readings[name].append((_stamp(header), NANOSECOND * logged, frame, values))
-    return [_stream(name, found, clock) for name, found in readings.items()]
+    return [_stream(name, entries, clock) for name, entries in readings.items()]
 
 
 def _stream(name: str, readings: list[tuple[float, float, str, dict[str, float]]], clock: str) -> Stream:

@@ -129,16 +129,16 @@ class Jitter(NamedTuple):
 
 def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:
     """Run an idle loop, in its own thread so that the calling thread keeps its priority."""
-    found: list[Jitter] = []
+    jitters: list[Jitter] = []
 
     def loop() -> None:
         with real_time() if fifo else contextlib.nullcontext(False) as granted:
             clock = CycleClock(period)
             ticks = [clock.wait() for _ in range(max(2, round(seconds / period)))]
-        found.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))
+        jitters.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))
 
     with steady_interpreter():
         thread = threading.Thread(target=loop, name="idle loop")
         thread.start()
         thread.join()
-    return found[0]
+    return jitters[0]

@@ -20,6 +20,7 @@ from rfdropo_bayes.tables import parse_table
 
 _SLACK = 0.7  # of the homing tension: a cable is let out to here before it is pulled, so that all approach from below
 _MEDIAN = 5  # cycles: a torque is noisy, and one reading must not decide
+TORQUE_FACTOR = 2.0  # the torque limit as a multiple of the homing tension
 
 
 class Home(BaseModel):
@@ -89,7 +90,7 @@ def homing_motors(motors: Sequence[Motor], table: HomingTable) -> list[Motor]:
     caps = {"length_limit_m": (-table.travel_m, table.travel_m)}
     return [
         motor.model_copy(
-            update=caps | {"tension_limit_n": (0.0, table.torque_factor * motor.homing_tension_n), "offset_counts": 0}
+            update=caps | {"tension_limit_n": (0.0, TORQUE_FACTOR * motor.homing_tension_n), "offset_counts": 0}
         )
         for motor in motors
     ]
@@ -129,24 +130,24 @@ class Homing:
         goal = loop.set_points.length.copy()
         while True:
             recent = [*recent, drive.tension][-_MEDIAN:]
-            found = float(np.median(recent))
-            if len(recent) == _MEDIAN and (found < tension if below else found >= tension):
+            carried = float(np.median(recent))
+            if len(recent) == _MEDIAN and (carried < tension if below else carried >= tension):
                 break
             if below and goal[index] <= motor.length_limit_m[0] + 1e-9:
                 break  # slack enough: it may hang loose further than the cap lets it out
             if time.monotonic() > end:
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {self._table.time_s:g} s")
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {self._table.time_s:g} s")
             goal[index] += step
             if goal[index] > motor.length_limit_m[1]:
                 way = 1e3 * self._table.travel_m
                 asked = "is its cable off, or has it the opposite sign in the robot file?"
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {way:.0f} mm: {asked}")
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {way:.0f} mm: {asked}")
             loop.set_points.towards(loop.set_points.clamp(goal))
             loop.command = loop.set_points.length.copy()
             loop.cycle(Phase.HOMING, acted=True)
         assert drive.reading is not None
         position = drive.reading.position
-        return Home(channel=motor.channel, offset_counts=position, tension_n=found, travel_m=drive.length)
+        return Home(channel=motor.channel, offset_counts=position, tension_n=carried, travel_m=drive.length)
 
 
 def homing_result(robot: Robot, homing: Homing) -> HomingResult:

@@ -223,8 +223,8 @@ def _seen_when(
     position[place], seen[place] = rows["position"][heard], rows["seen"][heard]
     if not rows["object_seen"].any():
         return position, seen, None
-    pose, found = np.full(rows["object_pose"].shape, np.nan), rows["object_seen"][heard]
-    pose[place[found]] = rows["object_pose"][heard[found]]
+    pose, sighted = np.full(rows["object_pose"].shape, np.nan), rows["object_seen"][heard]
+    pose[place[sighted]] = rows["object_pose"][heard[sighted]]
     return position, seen, pose
 
 
@@ -272,7 +272,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
             command_unit=robot.command_unit,
             cable_names=robot.channel_names,
             initial_command=before,
-        ).believed(),
+        ).trusted(),
         Measured(
             time=rows["time"],
             position=position,

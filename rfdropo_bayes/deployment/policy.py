@@ -391,10 +391,10 @@ class RecordedCommands:
         times = np.append(recording.command_time, max(recording.time[-1], recording.command_time[-1] + 1.0 / rate_hz))
         periods = (times - min(0.0, times[0])) * rate_hz  # since the recording or its first command began
         apart, place = np.diff(periods), np.floor(periods + 0.5 + _INSTANT)
-        held = np.maximum(1, np.round(apart)) if _evenly(apart[:-1]) else np.diff(place)
+        cycles = np.maximum(1, np.round(apart)) if _evenly(apart[:-1]) else np.diff(place)
         commands = np.concatenate([recording.initial_command[None], recording.command])
-        self._commands = np.repeat(commands, np.append(place[0], held).astype(int), axis=0)
-        self.last_s = float(len(self._commands) - held[-1]) / rate_hz
+        self._commands = np.repeat(commands, np.append(place[0], cycles).astype(int), axis=0)
+        self.last_s = float(len(self._commands) - cycles[-1]) / rate_hz
         """After how long the last command is sent [s]."""
         self._next = 0
 

@@ -49,7 +49,7 @@ _TOLD_TURNS = {
 _TOLD_COUNTS = {(0xB5, 0x03), (0xB5, 0x57)}
 
 
-def told_counts(word: int, counts_per_turn: float) -> float | None:
+def reported_counts(word: int, counts_per_turn: float) -> float | None:
     """Counts in one unit of an object 0x60A9 or 0x60AA; None for an unknown unit.
 
     The word is, from its highest byte: a power of ten, numerator, denominator, 0 (CiA 402-2; codes of CiA 303-2, as
@@ -77,8 +77,8 @@ def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, wh
     rpm = counts_of("rpm", counts_per_turn)
     if stated is not None:
         return counts_of(stated, counts_per_turn)
-    told = told_counts(word, counts_per_turn) if word else rpm
-    if told is None or not math.isclose(told, rpm):
+    reported = reported_counts(word, counts_per_turn) if word else rpm
+    if reported is None or not math.isclose(reported, rpm):
         raise InputError(
             f"its velocities are not in rpm (0x60A9 is 0x{word:08X}), and its greatest speed 0x6080 need not be",
             where=where,
@@ -99,55 +99,55 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
     Raises:
         InputError: if the drive has another unit than the stated unit, or an unknown unit without a stated unit.
     """
-    told = told_counts(word, counts_per_turn) if word else None
+    reported = reported_counts(word, counts_per_turn) if word else None
     if stated is None and not word:
         return counts_of("counts/s2", counts_per_turn)
     if stated is None:
-        if told is None:
+        if reported is None:
             raise InputError(
                 f"has an unknown unit of accelerations (0x60AA is 0x{word:08X})",
                 where=where,
                 remedy='look into its manual, and state [drives] acceleration_unit, "counts/s2" or "rpm/s"',
             )
-        return told
-    found = counts_of(stated, counts_per_turn)
-    if told is not None and not math.isclose(told, found):
+        return reported
+    counts = counts_of(stated, counts_per_turn)
+    if reported is not None and not math.isclose(reported, counts):
         raise InputError(
             f"has another unit of accelerations (0x60AA is 0x{word:08X}) than {stated}",
             where=where,
             remedy="leave [drives] acceleration_unit out, or correct it",
         )
-    return found
+    return counts
 
 
-def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: str) -> None:
+def check_rated_torque(reported: int, torque_n_m: float, unit: TorqueUnit, where: str) -> None:
     """Compare a drive's rated torque with the rated torque of the robot file; a wrong unit is distinguished from a
     wrong motor.
 
     Args:
-        found: content of 0x6076.
+        reported: content of 0x6076.
         torque_n_m: rated torque in the robot file [N m].
-        unit: unit of ``found``.
+        unit: unit of ``reported``.
         where: location for messages.
 
     Raises:
         InputError: if they differ by more than two per cent; names the unit that would make them agree.
     """
     expected = torque_n_m / _TORQUE[unit]
-    if _agree(found, expected):
+    if _agree(reported, expected):
         return
-    what = f"its rated torque is {found} {unit}, but {expected:.9g} {unit} in the robot file"
-    if found == 0:
+    what = f"its rated torque is {reported} {unit}, but {expected:.9g} {unit} in the robot file"
+    if reported == 0:
         raise InputError(what, where=where, remedy="set the motor of the drive with the vendor's own program")
-    power = 3 * round(math.log10(found / expected) / 3.0)
-    if power == 0 or not _agree(found, expected * 10.0**power):
+    power = 3 * round(math.log10(reported / expected) / 3.0)
+    if power == 0 or not _agree(reported, expected * 10.0**power):
         raise InputError(
             what,
             where=where,
             remedy="this is another motor, or rated_torque_n_m is wrong: tensions are computed from it",
         )
     times = f"{10 ** abs(power):,} times {'too large' if power > 0 else 'too small'}"
-    fitting = [name for name, size in _TORQUE.items() if _agree(found, torque_n_m / size)]
+    fitting = [name for name, size in _TORQUE.items() if _agree(reported, torque_n_m / size)]
     remedy = (
         f'state [drives] torque_unit = "{fitting[0]}" if rated_torque_n_m = {torque_n_m:.9g} N m is right for the motor'
         if fitting
@@ -156,8 +156,8 @@ def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: s
     raise InputError(f"{what}: {times}, which is another unit, not another motor", where=where, remedy=remedy)
 
 
-def _agree(found: float, expected: float) -> bool:
-    return abs(found - expected) <= 0.02 * expected + 1.0  # drives round to whole units
+def _agree(value: float, expected: float) -> bool:
+    return abs(value - expected) <= 0.02 * expected + 1.0  # drives round to whole units
 
 
 POSITION_REVERSED = 1 << 7

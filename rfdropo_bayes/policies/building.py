@@ -45,8 +45,8 @@ def trunk_simulator(
     backend = Backend("numba", precision, threads)
     settled = robot.initial_state == "equilibrium"
     engine = Engine(assembly, discretisation.time_step, backend, settled, integrator=integrator or robot.integrator)
-    found = mechanisms_named(list(mechanisms), robot, folder=folder)
-    trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
+    effects = mechanisms_named(list(mechanisms), robot, folder=folder)
+    trunk = TrunkSimulator(robot, engine, assembly, discretisation, effects)
     return trunk.pushing() if push else trunk
 
 

@@ -115,8 +115,8 @@ class TrunkVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of all lanes."""
-        found = getattr(self, method_name)(*method_args, **method_kwargs)
-        return [found for _ in self._get_indices(indices)]
+        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Lanes have no wrappers."""

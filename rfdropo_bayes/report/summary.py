@@ -16,12 +16,12 @@ from pydantic import BaseModel, ConfigDict
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, central_interval, piled_at, summarise
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, central_interval, cut_off_at, summarise
 from rfdropo_bayes.report.coverage import Coverage, coverage
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.headline import headline
 from rfdropo_bayes.report.identifiability import identify
-from rfdropo_bayes.report.randomisation_safety import judge
+from rfdropo_bayes.report.randomisation_safety import rate_safety
 from rfdropo_bayes.report.residuals import error_correlations
 from rfdropo_bayes.report.scores import MILLIMETRES, ErrorFigures, MeasuredPath, score
 from rfdropo_bayes.tables import parse_table
@@ -112,17 +112,17 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
     """The end of its prior, "low" or "high", that a posterior is piled up at; None if it is not.
 
-    If the prior is logarithmic, the comparison is in logarithms; see `piled_at`.
+    If the prior is logarithmic, the comparison is in logarithms; see `cut_off_at`.
     """
-    return piled_at(draws, *info.ends, logarithmic=info.logarithmic)
+    return cut_off_at(draws, *info.ends, logarithmic=info.logarithmic)
 
 
 def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"], *, log: bool) -> float | None:
     """Ratio of standard deviations, of the values or of their logarithms."""
     if log and np.all(draws > 0) and np.all(prior > 0):
         draws, prior = np.log(draws), np.log(prior)
-    spread = float(np.std(prior))
-    return float(np.std(draws)) / spread if spread > 0 else None
+    prior_deviation = float(np.std(prior))
+    return float(np.std(draws)) / prior_deviation if prior_deviation > 0 else None
 
 
 class _Open(BaseModel):
@@ -234,7 +234,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         missing["log_evidence"] = f"{facts.method} computes no evidence"
     plain = _plain(summary, "", missing)
     plain["not_available"] = missing
-    plain["randomisation"] = judge(record, plain).as_dict()
+    plain["randomisation"] = rate_safety(record, plain).as_dict()
     plain["headline"] = [*headline(plain), plain["randomisation"]["sentence"]]
     check_summary(plain, where="summary.json")
     return plain

@@ -95,9 +95,9 @@ class HubBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         end = None if timeout is None else time.monotonic() + timeout
         while len(self._received) < FRAME.size:
-            left = None if end is None else max(0.0, end - time.monotonic())
+            remaining = None if end is None else max(0.0, end - time.monotonic())
             try:
-                if not select.select([self._socket], [], [], left)[0]:
+                if not select.select([self._socket], [], [], remaining)[0]:
                     return None, False
                 data = self._socket.recv(65536)
             except (OSError, ValueError) as error:  # ValueError: closed by another thread
