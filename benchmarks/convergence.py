@@ -178,10 +178,12 @@ def rows_of(robot: str, damping: float | None, motions: int, seconds: float) -> 
     return rows
 
 
-def element_row(robot: str, integrator: Any, motions: int, seconds: float) -> ElementRow:
-    """A robot with more and more elements."""
+def element_row(robot: str, integrator: Any, motions: int, seconds: float) -> ElementRow | None:
+    """A robot with more and more elements; None if in every motion an equilibrium was not found."""
     found = {n: tip(robot, integrator, ELEMENTS_MS, None, motions, seconds, n) for n in REFINED}
     solved = np.all([np.isfinite(place).all(axis=(1, 2)) for place, _ in found.values()], axis=0)
+    if not solved.any():
+        return None
     path = {n: place[solved] for n, (place, _) in found.items()}
     limit = path[8] + (path[8] - path[4]) / 3.0
     way = error(limit, limit.mean(axis=1, keepdims=True))
@@ -207,6 +209,9 @@ def print_elements(robots: list[str], motions: int, seconds: float) -> list[Elem
     rows = []
     for robot, integrator in itertools.product(robots, ("sdirk2", AT_REST)):
         row = element_row(robot, integrator, motions, seconds)
+        if row is None:
+            print(f"| {robot} | {integrator} | 0 of {motions} |", flush=True)
+            continue
         rows.append(row)
         cells = [
             f"{row.error_mm[n]:.3f}, {100.0 * row.share[n]:.2f}, {1e3 * row.cpu_s[n]:.1f}" for n in map(str, REFINED)

@@ -298,7 +298,7 @@ def _arms(layout: CableLayout, course: Courses) -> Iterator[Vector]:
     offset = sum((course.lever[:, :, :, side] for side in range(1, course.lever.shape[3])), course.lever[:, :, :, 0])
     before = jnp.concatenate([offset[:, :, :1], offset[:, :, :-1]], axis=2)
     for piece in range(layout.share.shape[2]):
-        along = layout.along[:, :, piece].reshape(*layout.along.shape[:2], *[1] * (offset.ndim - 3))
+        along = jnp.asarray(layout.along[:, :, piece]).reshape(*layout.along.shape[:2], *[1] * (offset.ndim - 3))
         yield along * offset + (1.0 - along) * before
 
 
