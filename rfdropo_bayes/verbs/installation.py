@@ -69,7 +69,7 @@ def installed_priors(
         if pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
     turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.left_over, frame.shift)
-    found = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.0f} % of the motion there"
+    found = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.3g} % of the motion there"
     for axis, place in zip("xyz", shift, strict=True):
         words = f"origin of the measuring frame: {ORIGIN:g} of the body's length"
         normal(f"offset_{axis}", ORIGIN * robot.length, words, place)
@@ -79,8 +79,7 @@ def installed_priors(
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
     if "length" in assumed:
-        scale = 0.0 if frame is None else frame.scale - 1.0
-        normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1", scale)
+        normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1")
     lines.append("axial_stiffness = {}  # in tension, over that which the profile has for its bending")
     return lines
 
