@@ -75,7 +75,7 @@ def refuse_lost_threads() -> None:
 def configure_jax() -> None:
     """Make float64 the default of JAX, and let it finish one operation before the next.
 
-    Stiff finite-element solves lose their answer in float32. Operations that run ahead of a callback into the compiled
+    Stiff finite-element solves are wrong in float32. Operations that run ahead of a callback into the compiled
     engines can take the threads that the callback waits for: on two processors a rollout outside ``jax.jit`` then
     hangs forever.
     """

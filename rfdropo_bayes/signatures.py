@@ -50,7 +50,7 @@ def with_keys_of(schema: type[BaseModel], *, without: Container[str] = ()) -> Ca
 
     Args:
         schema: the table that the keywords are handed on to.
-        without: keys that the function does not take, or takes under a name of its own.
+        without: keys that the function does not take, or takes under its own name.
     """
 
     def decorate(function: Called) -> Called:

@@ -117,7 +117,7 @@ def robot_page() -> str:
         keys(SectionedBody),
         *shapes,
         "## Robots that come with the package",
-        table(("Robot", "Cables", "Commands", "Markers", "What"), [tuple(row.values()) for row in robot_rows()]),
+        table(("Robot", "Drives", "Commands", "Markers", "What"), [tuple(row.values()) for row in robot_rows()]),
     ]
     return page("The robot file", parts)
 

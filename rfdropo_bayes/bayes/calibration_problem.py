@@ -208,7 +208,8 @@ class CalibrationProblem:
         Returns:
             rows, minus infinity throughout after a failed rollout, and the `Result` code of each set.
         """
-        rows, status = self._chunked(self.model.programs.rows, values, horizon, self.measured, self.shares)
+        density = self.model.programs.rows
+        rows, status = self._chunked(values, horizon, lambda *given: density(*given, self.measured, self.shares))
         rows = rows[:, :horizon]
         finite = np.isfinite(rows).all(axis=1)
         status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
@@ -227,7 +228,7 @@ class CalibrationProblem:
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
         """Simulated features [m] of all recordings side by side, without observation noise; see `FeatureChannel`."""
-        features, status = self._chunked(self.model.programs.features, values, horizon)
+        features, status = self._chunked(values, horizon, self.model.programs.features)
         return self._side_by_side(features)[:, :horizon], status
 
     def noisy_rollouts(
@@ -277,15 +278,16 @@ class CalibrationProblem:
 
     def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
         """`residuals` of many sets of values at once, in compiled chunks."""
-        white = self._chunked(self.model.programs.white, values, horizon, self.measured, self.shares)
-        return np.asarray(self._flat(white, horizon))
+        return np.asarray(self._flat(self._white(values, horizon, self.shares), horizon))
+
+    def _white(self, values: Batch, horizon: int, shares: Mapping[str, float]) -> dict[str, np.ndarray]:
+        white = self.model.programs.white
+        return self._chunked(values, horizon, lambda *given: white(*given, self.measured, shares))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
         """Whitened residuals of the markers at one set of values, NaN if masked."""
         single = {name: np.array([values[name]]) for name in self.names}
-        white = self._chunked(
-            self.model.programs.white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0)
-        )
+        white = self._white(single, self.n_rows, dict.fromkeys(self.shares, 1.0))
         positions = white[self.model.markers.name][0]
         valid = self.model.recordings.line.valid[..., None]
         return np.where(valid, positions.reshape(*valid.shape[:3], 3), np.nan)
@@ -323,13 +325,19 @@ class CalibrationProblem:
     def predict_scene(self, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Int[np.ndarray, " n"]]:
         """As `predict`, with the poses of the object (n, recording, time, 7) in the robot's frame: position [m] and
         unit quaternion (x, y, z, w); None if the scene has none."""
-        return self._chunked(self.model.programs.positions, values, self.n_rows)
+        seen = self.observe(values)
+        return (
+            np.asarray(seen.position),
+            None if seen.object_pose is None else np.asarray(seen.object_pose),
+            seen.status,
+        )
 
     def observe(self, values: Batch) -> Observation:
         """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),
         status (n,).
         """
-        return Observation(*self._chunked(self.model.programs.observations, values, self.n_rows))
+        found = self._chunked(values, self.n_rows, lambda observation, _: observation)
+        return found._replace(status=found.status.max(axis=1))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
@@ -347,15 +355,24 @@ class CalibrationProblem:
         count = len(next(iter(inferred.values())))
         return np.asarray(jax.vmap(of_all)(jax.random.split(key, count), inferred))
 
-    def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> Any:
-        """Evaluate a batch chunk by chunk, see `in_chunks`."""
-        steps = jnp.asarray(self.steps_for(horizon))
+    def _chunked(self, values: Batch, horizon: int, evaluate: Callable[[Observation, Batch], Any]) -> Any:
+        """Roll a batch out to a horizon chunk by chunk, see `in_chunks`, and evaluate the observations of each."""
+        lanes, recordings = self.model.lanes, self.model.recordings
+        steps, every = self.steps_for(horizon), np.arange(self.n_recordings)
         columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
+
+        def seen(own: Batch) -> Any:
+            theta = np.asarray(self.model.programs.theta(own))
+            flat, commands = theta.reshape(-1, theta.shape[-1]), recordings.commands.of(np.tile(every, len(theta)))
+            found, status = lanes.roll(flat, None, commands, steps=steps, width=len(flat))
+            parts = {**dict.fromkeys(Observation._fields), **found, "status": status}
+            shaped = jax.tree.map(lambda part: part.reshape(*theta.shape[:2], *part.shape[1:]), parts)
+            return evaluate(Observation(**shaped), own)
 
         def after(count: int) -> None:
             self.told(count * horizon / self.n_rows)
 
-        return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=after)
+        return in_chunks(seen, columns, chunk_sizes(self.chunk), after=after)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
         """Residuals by rollout, cut to the horizon if they have a time axis, and flattened.

@@ -188,5 +188,7 @@ def _spread_name(family: str) -> str:
 def _check_spread(spec: ParameterSpec, spread: float) -> None:
     if not spread > 0.0:
         raise InputError(
-            f"the spread between groups is {spread}", where=f"[model.per_group] {spec.name}", remedy="a positive number"
+            f"the spread between groups is {spread}",
+            where=f"[model.per_group] {spec.name}",
+            remedy="give a positive number",
         )

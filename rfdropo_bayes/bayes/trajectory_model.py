@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Markers, ObjectPose, Seen
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.channels.object_pose import Placing, offset_of
+from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.scopes import Scopes
@@ -38,12 +39,23 @@ class TrajectoryModel:
         scopes: inferred and fixed parameters, including the channels'.
         recordings: commands and times of observation.
         channels: measurement channels, `Markers` first.
+        lanes: the simulator's compiled rollouts, as a function of the parameters that this model gives it. Made here;
+            a copy under other priors, or of other recordings, keeps them.
     """
 
     simulator: Simulator
     scopes: Scopes
     recordings: RecordingSet
     channels: tuple[Channel, ...]
+    lanes: Lanes = field(default=cast(Lanes, None), repr=False)
+
+    def __post_init__(self) -> None:
+        zeros, first = dict.fromkeys(self.scopes.names, 0.0), self.recordings.names[0]
+        given = jax.eval_shape(lambda: self.rollout_values(zeros, first))
+        physical = [spec.name for spec in self.simulator.parameters if spec.name in given]
+        if self.lanes is None or not self.lanes.serve(self.simulator, self.recordings.marker_index, physical):
+            own = Lanes(self.simulator, self.recordings.marker_index, physical=physical)
+            object.__setattr__(self, "lanes", own)
 
     @classmethod
     def of_positions(
@@ -154,8 +166,13 @@ class TrajectoryModel:
 
         ``measured`` replaces the model's own data; ``shares`` are the weights of channels.
         """
+        return self.row_density(self.seen(self.simulate(values, steps), values), measured, shares)
+
+    def row_density(
+        self, seen: Seen, measured: Measured | None = None, shares: Mapping[str, Any] | None = None
+    ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
+        """See `row_log_likelihood`, of an observation."""
         data = self.measured if measured is None else measured
-        seen = self.seen(self.simulate(values, steps), values)
         rows = jnp.zeros(self.recordings.time.shape[1])
         for channel in self.channels:
             density = channel.row_log_density(seen, data[channel.name])
@@ -171,8 +188,13 @@ class TrajectoryModel:
         shares: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, "..."]]:
         """Whitened residuals by channel, zero if masked; see `Channel.residuals` and `row_log_likelihood`."""
+        return self.white(self.seen(self.simulate(values, steps), values), measured, shares)
+
+    def white(
+        self, seen: Seen, measured: Measured | None = None, shares: Mapping[str, Any] | None = None
+    ) -> dict[str, Float[Array, "..."]]:
+        """See `residuals`, of an observation."""
         data = self.measured if measured is None else measured
-        seen = self.seen(self.simulate(values, steps), values)
         white = {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}
         return white if shares is None else {name: jnp.sqrt(shares[name]) * part for name, part in white.items()}
 
@@ -194,31 +216,33 @@ class TrajectoryModel:
 
 
 class Programs:
-    """The functions of a model that are compiled, for batches of parameter sets; each when it is first called."""
+    """Functions of a model that are compiled beside its rollouts, for batches; each when it is first called."""
 
     def __init__(self, model: TrajectoryModel) -> None:
-        def positions(values: Values, steps: Int[Array, ""]) -> tuple[Array, Array | None, Array]:
-            observation = model.simulate(values, steps)
-            return observation.position, observation.object_pose, jnp.max(observation.status)
+        physical, scopes = model.lanes.physical, model.scopes
 
-        def features(values: Values, steps: Int[Array, ""]) -> tuple[Array, Array]:
-            seen = model.seen(model.simulate(values, steps), values)
+        def theta(values: Values) -> Float[Array, "recording physical"]:
+            rows = [model.rollout_values(values, name) for name in model.recordings.names]
+            return jnp.stack([jnp.stack([jnp.asarray(row[name], float) for name in physical]) for row in rows])
+
+        def features(seen: Seen) -> tuple[Array, Array]:
             found = [c.features(c.expected(seen)) for c in model.compared]
             return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
 
-        def observations(values: Values, steps: Int[Array, ""]) -> Observation:
-            observation = model.simulate(values, steps)
-            return observation._replace(status=jnp.max(observation.status))
+        def of_seen(function: Callable, *axes: None) -> Callable:
+            """A function of what is seen, compiled for batches of observations and of the values behind them."""
 
-        scopes = model.scopes
+            def one(observation: Observation, values: Values, *rest: Any) -> Any:
+                return function(model.seen(observation, values), *rest)
+
+            return jax.jit(jax.vmap(one, in_axes=(0, 0, *axes)))
+
+        self.theta = jax.jit(jax.vmap(theta))
         self.unconstrained = jax.jit(scopes.to_unconstrained)
         self.constrained = jax.jit(scopes.from_unconstrained)
         self.log_prior = jax.jit(scopes.log_prior_unconstrained)
-        self.rows = jax.jit(jax.vmap(model.row_log_likelihood, in_axes=(0, None, None, None)))
-        self.white = jax.jit(jax.vmap(model.residuals, in_axes=(0, None, None, None)))
-        self.positions, self.features, self.observations = (
-            jax.jit(jax.vmap(function, in_axes=(0, None))) for function in (positions, features, observations)
-        )
+        self.rows, self.white = of_seen(model.row_density, None, None), of_seen(model.white, None, None)
+        self.features = of_seen(features)
         gradient = jax.jit(jax.vmap(jax.grad(lambda u: scopes.log_prior_unconstrained(u[None])[0])))
 
         def hessian(u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:

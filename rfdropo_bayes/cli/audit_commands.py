@@ -50,7 +50,7 @@ def audit(
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.audit import audit as ask
 
-    found = ask(
+    result = ask(
         Model.read(experiment, overrides),
         out=folder,
         fit=fit,
@@ -60,11 +60,11 @@ def audit(
         overwrite=overwrite,
         show=not quiet,
     )
-    show_audit(found.content, folder, quiet=quiet, as_json=as_json)
-    if found.content["stopped"] == INTERRUPT:
+    show_audit(result.content, folder, quiet=quiet, as_json=as_json)
+    if result.content["stopped"] == INTERRUPT:
         raise Interrupted(str(folder), "--resume")
-    if found.content["stopped"] and not (quiet or as_json):
-        minutes = 2.0 * found.content["minutes"]
+    if result.content["stopped"] and not (quiet or as_json):
+        minutes = 2.0 * result.content["minutes"]
         typer.echo(f"to go on: {same_command('rfdropo', '--resume', '--set', f'audit.minutes={minutes:g}')}")
 
 
@@ -73,14 +73,14 @@ def design(
     out: OutFolder = None,
     fit: Fit = None,
     adapt: Annotated[
-        bool, typer.Option("--adapt", help="propose the shortest recording of another day that rfdropo adapt needs")
+        bool, typer.Option("--adapt", help="propose the shortest recording of a new session that rfdropo adapt needs")
     ] = False,
     seconds: Annotated[float, typer.Option(help="with --adapt: longest proposal, in seconds")] = 10.0,
     group: Annotated[
         str | None,
         typer.Option(
             "--group",
-            help="with --adapt: the group of recordings with the drives of that day; by default the last group",
+            help="with --adapt: group whose limits of the drives hold in the new session; by default the last group",
         ),
     ] = None,
     seed: Seed = None,
@@ -92,7 +92,7 @@ def design(
     """Propose commands that distinguish causes. Writes next_commands.csv and design.json."""
     see_calibration(fit, "--from")
     if adapt and fit is None:
-        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --from")
+        raise InputError("--adapt needs a calibration", where="--adapt", remedy="name its folder with --from")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.results.calibrated import Calibration
@@ -103,9 +103,9 @@ def design(
     model = Model.read(experiment, overrides)
     options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "show": not quiet}
     if adapt and fit is not None:
-        found = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
+        result = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
     else:
-        found = propose(model, fit=fit, **options)
+        result = propose(model, fit=fit, **options)
     commands = folder / COMMANDS
-    content = {**found.content, "commands": str(commands)}
-    say(content, found.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)
+    content = {**result.content, "commands": str(commands)}
+    say(content, result.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)

@@ -32,30 +32,30 @@ def check(
     from rfdropo_bayes.verbs.check import run_check
 
     folder = out or Path("runs") / f"{experiment_name(experiment)}-check"
-    found = run_check(experiment, folder, overrides or [], ahead=not quick)
-    width = max(len(label) for label, _ in found.lines)
-    for label, text in found.lines:
+    result = run_check(experiment, folder, overrides or [], ahead=not quick)
+    width = max(len(label) for label, _ in result.lines)
+    for label, text in result.lines:
         typer.echo(f"{label:<{width}}  {text}")
-    for note in found.notes:
+    for note in result.notes:
         typer.echo(f"\nnote: {note}")
-    for doubt in found.doubts:
+    for doubt in result.doubts:
         typer.echo(f"\nDOUBTFUL: {doubt}")
-    if found.files:
-        count = len(found.files)
-        typer.echo(f"\npictures: {found.files[0]}" + (f" and {count - 1} more beside it" if count > 1 else ""))
-    for problem in found.problems:
+    if result.files:
+        count = len(result.files)
+        typer.echo(f"\npictures: {result.files[0]}" + (f" and {count - 1} more beside it" if count > 1 else ""))
+    for problem in result.problems:
         typer.echo(f"\nPROBLEM: {problem}")
-    if found.problems:
+    if result.problems:
         raise typer.Exit(PROBLEMS)
-    typer.echo(f"\n{ending(found)}")
-    if not found.doubts:
+    typer.echo(f"\n{ending(result)}")
+    if not result.doubts:
         typer.echo(f"next: {shlex.join(['rfdropo', 'calibrate', str(experiment), '--out', 'OUT'])}")
 
 
-def ending(found: Check) -> str:
+def ending(result: Check) -> str:
     """The last line of a check without problems."""
-    if not found.doubts:
+    if not result.doubts:
         return "nothing keeps this experiment from running"
-    count = len(found.doubts)
+    count = len(result.doubts)
     lines = "the line above that is" if count == 1 else f"the {count} lines above that are"
     return f"this experiment would run, but something was probably misread: look first at {lines} marked DOUBTFUL"

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from rfdropo_bayes.verbs.column_names import Guess
 
 ANGLES = ("deg", "rad", "counts")
+PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
-UNITS = ("mm", "cm", "m", *ANGLES, *FORCES)
+UNITS = ("mm", "cm", "m", *ANGLES, *PASCALS, *FORCES)
 FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")
@@ -212,10 +213,13 @@ def init(
         _init_model(folder, files, sent, guess)
         return
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
-    _check_unit(unit, guess)
+    if unit not in UNITS:
+        raise InputError(
+            f"the unit {unit!r} is unknown", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}"
+        )
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
     answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
-    answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
+    answers["segments"] = ask.answer("segments", segments, "Segments with their own cables", 1)
     if segment_lengths is None and answers["segments"] > 1:
         ask.assumed.add("segment_lengths")
     if answers["segments"] > 1:
@@ -241,9 +245,9 @@ def init(
 
 def _found_lines(robot: Path, experiment: Path) -> list[str]:
     """Frame, order and azimuths that were found from a recording, each with its evidence."""
-    found = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
-    found += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
-    return [line for line in found if "ASSUMED" in line]
+    lines = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
+    lines += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
+    return [line for line in lines if "ASSUMED" in line]
 
 
 def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:
@@ -255,20 +259,6 @@ def _columns(file: Path, sent: list[Path], names: list[str] | None, command_name
 
 def _listed(names: str | None) -> list[str] | None:
     return None if names is None else [name.strip() for name in names.split(",")]
-
-
-def _check_unit(unit: str, guess: Guess | None) -> None:
-    """Raise an InputError if commands are neither lengths of cable nor angles of motors."""
-    if unit in UNITS:
-        return
-    remedy = f"use one of {', '.join(UNITS)}"
-    if guess is None or unit != guess.command_unit:
-        raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=remedy)
-    raise InputError(
-        f"commands are in {unit!r} ({', '.join(guess.commands)}), which no drive of a cable takes",
-        where="--recording",
-        remedy=f"give --command-unit, one of {', '.join(UNITS)}; counts of the spool need --counts-per-turn",
-    )
 
 
 def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
@@ -312,7 +302,8 @@ def _outline(name: str, disks: int | None, unit: str, answers: dict[str, Any], a
         if key in given:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
-    kind: Any = "rad" if unit in ANGLES else unit if unit in ("N", "N m") else "-" if unit in FORCES else "m"
+    kinds = {**dict.fromkeys(ANGLES, "rad"), **dict.fromkeys(PASCALS, "Pa"), **dict.fromkeys(FORCES, "-")}
+    kind: Any = (kinds | {"N": "N", "N m": "N m"}).get(unit, "m")
     assumed |= {"disks"} if given["shape"] == "disks" and disks is None else set()
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
 
@@ -325,7 +316,7 @@ def _lengths(text: str | None) -> tuple[float, ...] | None:
         return tuple(MILLIMETRES * float(part) for part in text.split(","))
     except ValueError:
         where = "--segment-lengths-mm"
-        raise InputError(f"{text!r} is no list of lengths", where=where, remedy='e.g. "60,62.5,64"') from None
+        raise InputError(f"{text!r} is not a list of lengths", where=where, remedy='e.g. "60,62.5,64"') from None
 
 
 def _name(folder: Path) -> str:
@@ -343,7 +334,7 @@ def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: b
     number = cables if cables is not None else commands * (2 if paired else 1) // parts
     if parts * number != commands * (2 if paired else 1):
         raise InputError(
-            f"{commands} commands ({', '.join(guess.commands)}) for {parts} segments of {number} cables",
+            f"{commands} commands ({', '.join(guess.commands)}) do not fit {parts} segments of {number} cables",
             where="--recording",
             remedy="give --segments and --cables, and --pairs if opposite cables share a motor",
         )
@@ -366,7 +357,7 @@ def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> di
             raise InputError(f"{part!r} is not NAME=HEIGHT", where="--markers", remedy="e.g. low=66,middle=133,tip=200")
     if guess is not None and len(heights) != len(guess.positions):
         raise InputError(
-            f"{len(heights)} markers for {len(guess.positions)} in the recording ({', '.join(guess.markers)})",
+            f"{len(heights)} markers are named; the recording has {len(guess.positions)} ({', '.join(guess.markers)})",
             where="--markers",
             remedy="name one for each, in the order of the columns",
         )

@@ -25,7 +25,7 @@ def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=RO
 
 def mechanisms(
     name: Annotated[str | None, typer.Argument(metavar="[MECHANISM]", help="describe this mechanism")] = None,
-    robot: Annotated[str, typer.Option(help="robot to list parameters per cable for")] = "smooth_arm",
+    robot: Annotated[str, typer.Option(help="robot whose cables are listed with their parameters")] = "smooth_arm",
 ) -> None:
     """List the mechanisms, or describe a mechanism. Its cause, remedy, parameters and priors."""
     from rfdropo_bayes.model.mechanism_listings import mechanism_facts, mechanism_rows

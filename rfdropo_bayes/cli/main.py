@@ -87,8 +87,8 @@ def calibrate(
 
     shown = False if quiet else None
     model = Model.read(experiment, overrides)
-    found = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite, show=shown)
-    show_calibration(found, experiment, quiet=quiet, as_json=as_json)
+    result = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite, show=shown)
+    show_calibration(result, experiment, quiet=quiet, as_json=as_json)
 
 
 def simulate(
@@ -106,8 +106,8 @@ def simulate(
     from rfdropo_bayes.verbs.simulate import simulate_all
 
     say_step(f"simulating the recordings of {experiment}", show=False if quiet or as_json else None)
-    found = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
-    show_simulation(found, quiet=quiet, as_json=as_json)
+    content = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
+    show_simulation(content, quiet=quiet, as_json=as_json)
 
 
 # In the order in which they are used, which --help shows.

@@ -31,10 +31,14 @@ def deploy(
     out: Annotated[Path | None, typer.Option("--out", help="folder of the session; by default runs/NAME-TIME")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="session folder or trajectory to replay")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="no live view")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print no live view")] = False,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="key or table.key of the deployment file; may be repeated"),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="value of an entry of the deployment file, KEY=VALUE or TABLE.KEY=VALUE; may be repeated",
+        ),
     ] = None,
 ) -> None:
     """Run a policy on drives, or try it. Writes report.html, session.nc, the CAN frames, log.jsonl and summary.json."""
@@ -50,8 +54,8 @@ def deploy(
     if not quiet and (simulated or mode == Mode.DRY_RUN):
         typer.echo("starting the simulated drives; the first start of a trunk compiles, for minutes", err=True)
     outcome = run_session(settings, mode, folder, simulated=simulated, commands=recording, show=show, keyboard=True)
-    for channel, found in outcome.drives.items() if mode == "check" else ():
-        typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in found.items()))
+    for channel, identity in outcome.drives.items() if mode == "check" else ():
+        typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in identity.items()))
     for channel, lacking in outcome.without.items() if mode == "check" else ():
         for line in lacking:
             typer.echo(f"{channel} is without {line}")
@@ -82,7 +86,7 @@ def drives(
     interface: Interface = "hub",
     channel: Channel = "127.0.0.1:29536",
     plant: Annotated[str, typer.Option(help="springs, or MODULE:CALLABLE")] = "springs",
-    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in a process of its own")] = False,
+    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in its own process")] = False,
     markers: Annotated[str, typer.Option(help="HOST:PORT to send markers to")] = "",
 ) -> None:
     """Simulate the drives of a robot and their bus. Runs until Ctrl-C."""
@@ -106,7 +110,7 @@ def doctor(
 
     settings = None if deployment is None else load_deployment(deployment)
     rate = 100.0 if settings is None else settings.rate_hz
-    found = examine(None if settings is None else settings.bus, rate, seconds)
-    typer.echo(json.dumps(found, indent=2))
-    if found["problems"]:
+    report = examine(None if settings is None else settings.bus, rate, seconds)
+    typer.echo(json.dumps(report, indent=2))
+    if report["problems"]:
         raise typer.Exit(FAILED)

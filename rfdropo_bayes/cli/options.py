@@ -19,8 +19,8 @@ OutFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="folder to write to  [default: runs/EXPERIMENT_COMMAND; of calibrate runs/EXPERIMENT; "
-        "of DIR/experiment.toml the name of DIR]",
+        help="folder to write to  [default: runs/NAME_COMMAND, for calibrate runs/NAME; NAME is the file's name, "
+        "or its folder's if the file is experiment.toml]",
     ),
 ]
 Overrides = Annotated[

@@ -14,11 +14,14 @@ def view(
         Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
     ] = Path("runs/view.png"),
     recording: Annotated[
-        str | None, typer.Option(help="which recording of an experiment; the first by default")
+        str | None, typer.Option(help="recording of the experiment to draw; the first by default")
     ] = None,
     robot: Annotated[Path | None, typer.Option(help="file of the robot, if a NetCDF file has none beside it")] = None,
     overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="as in simulate; for an experiment")
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="value of a parameter or of an entry of the experiment, as in simulate"
+        ),
     ] = None,
 ) -> None:
     """Draw a motion. Simulates an experiment, or reads a NetCDF file of simulate or predict."""

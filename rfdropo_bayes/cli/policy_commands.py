@@ -25,10 +25,11 @@ from rfdropo_bayes.errors import InputError
 
 def train(
     experiment: Annotated[
-        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; not beside --from")
+        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; leave it out with --from")
     ] = None,
     fit: Annotated[
-        Path | None, typer.Option("--from", help="folder of a calibration: its model, under draws of its posterior")
+        Path | None,
+        typer.Option("--from", help="folder of a calibration: train on its model, under draws of its posterior"),
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="reach or push; by default from the experiment")] = None,
     goal: Annotated[
@@ -58,20 +59,20 @@ def train(
     model = Model.read(experiment, overrides)
     if fit is not None:
         model = with_training(model, {"randomisation": "posterior"})
-    found = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
-    done = f"after {found['steps']} steps in {found['seconds']:.0f} s: {learnt(found)}"
+    summary = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
+    done = f"after {summary['steps']} steps in {summary['seconds']:.0f} s: {learnt(summary)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
-    say(found, *lines, quiet=quiet, as_json=as_json)
+    say(summary, *lines, quiet=quiet, as_json=as_json)
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
     """Overrides of an experiment file by the options --task and --goal."""
-    found = []
+    overrides = []
     if task is not None:
         if task not in TASKS:
             raise InputError(f"unknown task {task!r}", where="--task", remedy=f"use {' or '.join(TASKS)}")
-        found.append(f'training.task="{TASKS[task]}"')
+        overrides.append(f'training.task="{TASKS[task]}"')
     if goal is not None:
         parts = goal.split(",")
         try:
@@ -80,8 +81,8 @@ def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
             place = []
         if len(place) != 3:
             raise InputError(f"{goal!r} is not X,Y,Z", where="--goal", remedy="e.g. --goal 0.02,-0.03,0.13, in metres")
-        found.append(f"training.goals={[place, place]}")
-    return found
+        overrides.append(f"training.goals={[place, place]}")
+    return overrides
 
 
 def evaluate(
@@ -105,8 +106,8 @@ def evaluate(
     from rfdropo_bayes.verbs.evaluate import evaluate as play
 
     model = Model.read(experiment, overrides)
-    found = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
-    say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
+    evaluation = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
+    say(evaluation, evaluation_table(evaluation), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}

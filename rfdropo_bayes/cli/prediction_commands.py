@@ -14,11 +14,12 @@ from rfdropo_bayes.model.experiment_file import look_through
 from rfdropo_bayes.model.run_folder import check_folder
 
 Group = Annotated[
-    str | None, typer.Option("--group", help="the day or robot it belongs to; as [model.groups] has it by default")
+    str | None,
+    typer.Option("--group", help="group of the commands (a session or robot); by default from [model.groups]"),
 ]
 PredictedGroup = Annotated[
     str | None,
-    typer.Option("--group", help="the day or robot; by default from adapt, or else from [model.groups]"),
+    typer.Option("--group", help="group (a session or robot); by default from adapt, or else from [model.groups]"),
 ]
 
 Episode = Annotated[int | None, typer.Option("--episode", help="number of the episode, of a LeRobotDataset")]
@@ -57,7 +58,7 @@ def predict(
     from rfdropo_bayes.verbs.predict import predict as predict_motion
 
     say_step(f"predicting {commands} with draws of {fit}", show=False if quiet or as_json else None)
-    found = predict_motion(
+    prediction = predict_motion(
         Calibration.of_posterior(fit, Model.read(experiment, overrides)),
         _from_here(commands),
         out=out,
@@ -68,7 +69,7 @@ def predict(
         overwrite=overwrite,
     )
     files = [str(out / f"prediction.{ending}") for ending in ("nc", "csv")]
-    show_prediction({**found.content, "files": files}, quiet=quiet, as_json=as_json)
+    show_prediction({**prediction.content, "files": files}, quiet=quiet, as_json=as_json)
 
 
 def adapt(
@@ -79,9 +80,7 @@ def adapt(
         str | None, typer.Option("--commands", help="file of its commands, if the format has a separate file")
     ] = None,
     episode: Episode = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="length of the beginning that is used, in seconds; all by default")
-    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="seconds from the start that are used; all by default")] = None,
     group: Group = None,
     seed: Annotated[int | None, typer.Option(help="seed; by default from the experiment")] = None,
     overwrite: Overwrite = False,
@@ -104,7 +103,7 @@ def adapt(
         commands=None if commands is None else _from_here(commands),
         episodes=None if episode is None else [episode],
     )
-    found = adapt_fit(
+    result = adapt_fit(
         Calibration.of_posterior(run, fitted_model(run, overrides)),
         entry,
         out=out,
@@ -114,7 +113,7 @@ def adapt(
         overwrite=overwrite,
         show=False if quiet else None,
     )
-    show_calibration(found, quiet=quiet, as_json=as_json)
+    show_calibration(result, quiet=quiet, as_json=as_json)
 
 
 def _from_here(name: str) -> str:

@@ -57,8 +57,8 @@ def _say_results(folder: Path) -> list[str]:
             where=str(folder),
             remedy=f"run it again: {again}" if (folder / CONFIG).is_file() else "run it again",
         )
-    found = [str(folder / name) for name in kind.results if (folder / name).is_file()]
-    lines = [f"{command} writes no page; its results:", *(f"  {file}" for file in found)]
+    files = [str(folder / name) for name in kind.results if (folder / name).is_file()]
+    lines = [f"{command} writes no page; its results:", *(f"  {file}" for file in files)]
     if command in TO_VIEW:
         lines.append(f"to see it: {shlex.join(['rfdropo', 'view', str(folder / TO_VIEW[command])])}")
     return lines

@@ -33,20 +33,20 @@ AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment", "cautio
 MOST_ROWS = 20
 
 
-def say(found: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> None:
+def say(content: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> None:
     """Print a result as JSON, or lines of words about it, or nothing."""
     if as_json:
-        typer.echo(json.dumps(found, indent=2))
+        typer.echo(json.dumps(content, indent=2))
     elif not quiet:
         for line in lines:
             typer.echo(line)
 
 
-def show_calibration(found: Calibration, experiment: Path | None = None, *, quiet: bool, as_json: bool) -> None:
+def show_calibration(calibration: Calibration, experiment: Path | None = None, *, quiet: bool, as_json: bool) -> None:
     """Print the result of a finished calibration: headline, table of parameters, cautions, next command, and path of
     the report. The next command is an audit of ``experiment`` if there are cautions.
     """
-    summary, folder = found.content, found.folder or Path()
+    summary, folder = calibration.content, calibration.folder or Path()
     report = folder / "report.html"
     if as_json or quiet:
         chosen = {key: summary[key] for key in CALIBRATED if key in summary}
@@ -54,7 +54,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
         return
     console = _console()
     for sentence in summary["headline"]:
-        style = COLOURS[found.verdict] if sentence == found.sentence else ""
+        style = COLOURS[calibration.verdict] if sentence == calibration.sentence else ""
         console.print(Text(sentence, style=style), soft_wrap=True)
     moved = summary["details"].get("moved", [])  # by an adaptation: its main result
     rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
@@ -62,7 +62,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
     console.print(_parameters(rows[:MOST_ROWS]))
     if len(rows) > MOST_ROWS:
         console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
-    for caution in found.cautions:
+    for caution in calibration.cautions:
         console.print(Text(f"caution: {caution.sentence}", style=BAD if caution.grave else FAIR), soft_wrap=True)
     if summary["method"] == "adapt":
         seen = next(run for run in summary["recordings"] if run["split"] == "fit")
@@ -70,7 +70,7 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
             console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
         for sentence in summary["details"].get("compared", ()):
             console.print(sentence, soft_wrap=True)
-    ready = experiment is None or found.verdict == "safe"
+    ready = experiment is None or calibration.verdict == "safe"
     words = (
         ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--from", str(folder)]
     )
@@ -78,43 +78,43 @@ def show_calibration(found: Calibration, experiment: Path | None = None, *, quie
     console.print(f"report: {report}", soft_wrap=True)
 
 
-def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: bool) -> None:
-    """Print the result of an audit; ``found`` is the content of audit.json."""
+def show_audit(content: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of an audit; ``content`` is of audit.json."""
     files = {"folder": str(folder), "report": str(folder / "report.html"), "extended": str(folder / "extended.toml")}
     if as_json or quiet:
-        say({**{key: found[key] for key in AUDITED if key in found}, **files}, quiet=quiet, as_json=as_json)
+        say({**{key: content[key] for key in AUDITED if key in content}, **files}, quiet=quiet, as_json=as_json)
         return
     from rfdropo_bayes.report.sentences import sentences
 
     console = _console()
-    verdict = Text(found["verdict"], style=f"bold {COLOURS.get(found['verdict'], '')}")
-    first, *further = sentences(found["sentence"])
+    verdict = Text(content["verdict"], style=f"bold {COLOURS.get(content['verdict'], '')}")
+    first, *further = sentences(content["sentence"])
     console.print(verdict + Text(f": {first}", style="not bold"), soft_wrap=True)
     for sentence in further:
         console.print(Text(sentence), soft_wrap=True)
-    for caution in found["cautions"]:
+    for caution in content["cautions"]:
         console.print(Text(f"caution: {caution['sentence']}", style=FAIR), soft_wrap=True)
     rows = [
         (name, row, finding["mechanism"].replace("_", " "))
-        for finding in found["findings"]
+        for finding in content["findings"]
         for name, row in finding["parameters"].items()
     ]
     if rows:
         console.print(_parameters(rows[:MOST_ROWS]))
-    console.print(f"next: {found['next_experiment']['sentence']}", soft_wrap=True)
-    if found["adopted"]:
+    console.print(f"next: {content['next_experiment']['sentence']}", soft_wrap=True)
+    if content["adopted"]:
         again = shlex.join(["rfdropo", "calibrate", files["extended"], "--out", "OUT"])
         console.print(f"then: {again}", soft_wrap=True)
     console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
 
 
-def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
-    """Print the distance of a simulation from its recordings; ``found`` is the content of simulation.json."""
-    runs = found["recordings"].items()
+def show_simulation(content: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print the distance of a simulation from its recordings; ``content`` is of simulation.json."""
+    runs = content["recordings"].items()
     lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
-    if found["error_mm"] is not None and len(lines) > 1:
-        lines.append(f"all of them{_off(found['error_mm'])}")
-    say(found, *lines, quiet=quiet, as_json=as_json)
+    if content["error_mm"] is not None and len(lines) > 1:
+        lines.append(f"all of them{_off(content['error_mm'])}")
+    say(content, *lines, quiet=quiet, as_json=as_json)
 
 
 def _off(error: Mapping[str, float] | None) -> str:

@@ -41,17 +41,17 @@ def actions_towards(target: Float[np.ndarray, "n 8"], initial: Float[np.ndarray,
     No cable passes its target. Once all cables are within an action of their targets, the next targets apply; the
     actions end after the last targets.
     """
-    level, row, found = np.array(initial, dtype=float), 0, list[int]()
-    while row < len(target) and len(found) < len(target):
+    level, row, actions = np.array(initial, dtype=float), 0, list[int]()
+    while row < len(target) and len(actions) < len(target):
         off = target[row] - level
         cable = int(np.argmax(np.abs(off)))
         if abs(off[cable]) < DISPLACEMENT * (1.0 - 1e-6):
             row += 1
             continue
-        found.append(cable if off[cable] > 0.0 else cable + CABLES)
+        actions.append(cable if off[cable] > 0.0 else cable + CABLES)
         level[cable] += np.copysign(DISPLACEMENT, off[cable])
-        row = max(row, len(found))
-    return np.array(found, dtype=int)
+        row = max(row, len(actions))
+    return np.array(actions, dtype=int)
 
 
 def read_actions(column: Float[np.ndarray, " rows"], where: str) -> Int[np.ndarray, " n"]:

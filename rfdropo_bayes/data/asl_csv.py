@@ -151,9 +151,9 @@ def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | 
     if np.any(np.diff(recording.identity) < 0):
         raise InputError("its rows are not in the order of their ID", where=where, remedy="sort them")
     if commands is None or len(numbers) != len(command) or not np.array_equal(numbers, np.arange(len(command))):
-        found = "no" if commands is None else str(len(command))
+        count = "no" if commands is None else str(len(command))
         raise InputError(
-            f"poses with ID {numbers[0]} to {numbers[-1]} ({len(numbers)}) do not fit {found} commands",
+            f"poses with ID {numbers[0]} to {numbers[-1]} ({len(numbers)}) do not fit {count} commands",
             where=where,
             remedy="pair the files that were recorded together",
         )

@@ -67,9 +67,9 @@ class Motion(NamedTuple):
 
 def unwrapped(values: Float[np.ndarray, " rows"], turn: float) -> Float[np.ndarray, " rows"]:
     """Unwrapped values of a counter that restarts at every ``turn``; missing values stay missing."""
-    found, known = np.array(values, dtype=float), np.isfinite(values)
-    found[known] = np.unwrap(found[known], period=turn)
-    return found
+    continued, known = np.array(values, dtype=float), np.isfinite(values)
+    continued[known] = np.unwrap(continued[known], period=turn)
+    return continued
 
 
 def read_on(
@@ -125,8 +125,8 @@ def _towards(step: np.ndarray, k: int, short: np.ndarray) -> float:
 
 def wraps_of(columns: Sequence[Column], motion: Motion) -> dict[str, Wraps]:
     """The columns that jump by turns which the markers do not follow."""
-    found = {column.name: find_wraps(column.values, column.turns) for column in columns}
-    wraps = {name: each for name, each in found.items() if each is not None}
+    by_name = {column.name: find_wraps(column.values, column.turns) for column in columns}
+    wraps = {name: each for name, each in by_name.items() if each is not None}
     together = len(wraps) > 1 and len({row for each in wraps.values() for row in each.rows}) == 1
     if not wraps or together:  # counters that jump together, and once, were started anew
         return {}
@@ -223,10 +223,11 @@ def counter_notes(columns: Sequence[Column], motion: Motion, unit: str) -> list[
     restart = find_restart(columns, motion)
     if restart is None:
         return []
-    said = ", ".join(f"{old:.6g} to {new:.6g}" for old, new in restart.jumps.values())
+    jumps = ", ".join(f"{old:.6g} to {new:.6g}" for old, new in restart.jumps.values())
     return [
-        f"{', '.join(restart.jumps)} jump in row {restart.row} ({said} {unit}) and the markers do not follow, as after "
-        "a restart that sets a counter anew; read the rows on one side with rows = [first, last]; or correct columns"
+        f"{', '.join(restart.jumps)} jump in row {restart.row} ({jumps} {unit}) and the markers do not follow, as "
+        "after a restart that sets a counter anew; read the rows on one side with rows = [first, last]; or correct "
+        "columns"
     ]
 
 

@@ -299,14 +299,14 @@ def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: 
     for row, line in enumerate(rows):
         if separator != " " and '"' not in line and line.count(separator) == fields - 1:
             continue
-        found = len(cells_of(line, separator))
-        if found != fields:
+        count = len(cells_of(line, separator))
+        if count != fields:
             last = row == len(rows) - 1
             raise InputError(
-                f"has {found} values, but the header names {fields}" + (": the file is cut short" if last else ""),
+                f"has {count} values, but the header names {fields}" + (": the file is cut short" if last else ""),
                 where=f"{path}, row {row}",
                 remedy="separate values by semicolons if decimals follow a comma"
-                if found == 2 * fields
+                if count == 2 * fields
                 else ("fetch the file again or drop the row" if last else "repair the row"),
             )
 

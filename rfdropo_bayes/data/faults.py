@@ -153,28 +153,28 @@ def find_zeros(
 
 def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) -> list[str]:
     """Markers at exactly 0, 0, 0, with the first row of each."""
-    said = []
+    notes = []
     for kind, words in (
         (zero, "taken for lost and left out; leave such cells empty to avoid this note"),
         (doubtful, "taken as it stands; if it was lost, leave the cells empty, or omit the marker"),
     ):
         for marker in np.flatnonzero(kind.any(axis=0)).tolist():
             rows = np.flatnonzero(kind[:, marker])
-            said.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
-    return said
+            notes.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
+    return notes
 
 
 def _mostly_masked(seen: np.ndarray, counts: dict[str, list[int]], names: Sequence[str]) -> list[str]:
     """Notes on markers with more masked than kept positions: the detected pattern is then hardly a fault."""
-    said, rows = [], len(seen)
+    notes, rows = [], len(seen)
     for marker in np.flatnonzero(2 * seen.sum(axis=0) < rows).tolist():
-        found = {kind: each[marker] for kind, each in counts.items() if kind not in ("breaks", "renamed")}
-        kinds = ", ".join(f"{count} {kind}" for kind, count in found.items() if count)
-        said.append(
+        marker_counts = {kind: each[marker] for kind, each in counts.items() if kind not in ("breaks", "renamed")}
+        kinds = ", ".join(f"{count} {kind}" for kind, count in marker_counts.items() if count)
+        notes.append(
             f"{int((~seen[:, marker]).sum())} of {rows} positions of {names[marker]} are masked ({kinds}): if most of "
             "them were measured, look at the unit of times, at the unit of positions and at the marker's columns"
         )
-    return said
+    return notes
 
 
 def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[str]) -> list[str]:

@@ -110,14 +110,14 @@ def recognised(trajectory: Trajectory) -> Beginning:
     if errors is None:
         return Beginning("first", "assumed: the first rows do not decide")
     first, zero = 1e3 * errors["first"], 1e3 * errors["zero"]
-    said = (
+    evidence = (
         f"the first rows differ by {first:.2g} mm from a start at the first command, by {zero:.2g} mm from one at zero"
     )
     if zero < CLEARLY * first:
-        return Beginning("zero", f"recognised: {said}")
+        return Beginning("zero", f"recognised: {evidence}")
     if first < CLEARLY * zero:
-        return Beginning("first", f"recognised: {said}")
-    return Beginning("first", f"assumed: {said}, which does not decide")
+        return Beginning("first", f"recognised: {evidence}")
+    return Beginning("first", f"assumed: {evidence}, which does not decide")
 
 
 def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
@@ -142,14 +142,14 @@ def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
     for lag in LAGS:
         state = _states(trajectory, lag)
         for dead_time in DEAD_TIMES:
-            followed, left = _followed(trajectory, time - dead_time, lag, state)
-            for rule, drive in (("first", followed), ("zero", followed - left[:, None] * trajectory.command[0])):
+            followed, remaining = _followed(trajectory, time - dead_time, lag, state)
+            for rule, drive in (("first", followed), ("zero", followed - remaining[:, None] * trajectory.command[0])):
                 design = np.column_stack([np.ones(len(time)), drive / scale])
                 weights = np.linalg.pinv(design.T @ design, RANK, hermitian=True) @ (design.T @ position)
                 square = ((position - design @ weights) ** 2).sum(axis=1)
                 if rule not in best or square.sum() < best[rule][0]:
                     best[rule] = (float(square.sum()), dead_time + 3.0 * lag, square)
-    end = max(max(found[1] for found in best.values()), time[FEWEST_ROWS - 1])
+    end = max(*(settled for _, settled, _ in best.values()), time[FEWEST_ROWS - 1])
     early = time <= end
     points = position.shape[1] / 3.0
     return {rule: float(np.sqrt(square[early].mean() / points)) for rule, (_, _, square) in best.items()}

@@ -24,12 +24,12 @@ def given_recordings(given: Any, where: str) -> list[Trajectory]:
     if isinstance(given, Trajectory):
         return [given]
     if isinstance(given, str) or not isinstance(given, Iterable):
-        raise InputError(f"{_words(given)} is no list of recordings", where=where, remedy=READ)
-    found = list(given)
-    for each in found:
+        raise InputError(f"{_words(given)} is not a list of recordings", where=where, remedy=READ)
+    recordings = list(given)
+    for each in recordings:
         if not isinstance(each, Trajectory):
-            raise InputError(f"{_words(each)} is no recording", where=where, remedy=READ)
-    return found
+            raise InputError(f"{_words(each)} is not a recording", where=where, remedy=READ)
+    return recordings
 
 
 def given_recording(given: Any, where: str) -> Trajectory:
@@ -41,8 +41,10 @@ def given_recording(given: Any, where: str) -> Trajectory:
     if isinstance(given, Trajectory):
         return given
     if isinstance(given, list | tuple) and given and all(isinstance(each, Trajectory) for each in given):
-        raise InputError(f"a list of {len(given)} is no recording", where=where, remedy="give one of them, as runs[-1]")
-    raise InputError(f"{_words(given)} is no recording", where=where, remedy=READ)
+        raise InputError(
+            f"a list of {len(given)} is not a recording", where=where, remedy="give one of them, as runs[-1]"
+        )
+    raise InputError(f"{_words(given)} is not a recording", where=where, remedy=READ)
 
 
 def _words(given: Any) -> str:

@@ -68,19 +68,19 @@ def _expected(
     return np.stack([still, still + step]), known
 
 
-def _distance(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _distance(expected: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """The smaller of the distances from the two expectations."""
-    return np.min(np.linalg.norm(found - expected, axis=-1), axis=0)
+    return np.min(np.linalg.norm(measured - expected, axis=-1), axis=0)
 
 
 def _assigned(
     expected: Float[np.ndarray, "2 marker 3"],
-    found: Float[np.ndarray, "marker 3"],
+    measured: Float[np.ndarray, "marker 3"],
     seen: np.ndarray,
     own: Float[np.ndarray, " marker"],
 ) -> dict[int, int]:
     """Markers at the expected positions of others, by column; empty if uncertain."""
-    cost = _distance(expected[:, seen, None], found[None, None, seen])
+    cost = _distance(expected[:, seen, None], measured[None, None, seen])
     markers, columns = linear_sum_assignment(cost)
     moved = markers != columns
     certain = (cost[markers, columns] < NEARER * own[seen[markers]]) & (own[seen[markers]] > APART)

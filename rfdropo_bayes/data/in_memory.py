@@ -52,7 +52,8 @@ def from_arrays(
             default.
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
-        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
+        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m",
+            "Pa", "kPa", "MPa", "mbar", "bar", "psi", or "-".
         largest_command: largest plausible command, in ``command_unit``, for drives that travel more than 20 rad or 5 m.
         tension: cable tensions [N]; NaN if missing.
         motor_angle: motor angles [rad]; NaN if missing.
@@ -136,7 +137,7 @@ def _table(frame: Any, name: str) -> pd.DataFrame:
     if isinstance(frame, pd.DataFrame):
         return frame
     raise InputError(
-        f"a {type(frame).__name__} is no table",
+        f"a {type(frame).__name__} is not a table",
         where=name,
         remedy=("give a DataFrame of pandas, or a table that has to_pandas(), as tables of Polars and PyArrow have"),
     )
@@ -230,19 +231,19 @@ def _known(unit: str, known: Mapping[str, Any], where: str) -> str:
 def _numbers(values: Any, what: str, sizes: Mapping[str, int | None], where: str) -> np.ndarray:
     """Values as floats, NaN if missing, with one axis per entry of ``sizes``; a size of None allows any."""
     try:
-        found = np.ma.filled(np.ma.asarray(values).astype(float), np.nan)
+        array = np.ma.filled(np.ma.asarray(values).astype(float), np.nan)
     except (TypeError, ValueError):  # None and pd.NA among others, or text
         cells = np.asarray(values, dtype=object)
         try:
             flat = pd.to_numeric(pd.Series(cells.ravel()))
         except (TypeError, ValueError) as error:
             raise InputError(f"{what} are not all numbers ({error})", where=where, remedy="convert them") from None
-        found = flat.to_numpy(dtype=float, na_value=np.nan).reshape(cells.shape)
-    wanted = tuple(length if size is None else size for size, length in zip(sizes.values(), found.shape, strict=False))
-    if found.ndim != len(sizes) or found.shape != wanted:
+        array = flat.to_numpy(dtype=float, na_value=np.nan).reshape(cells.shape)
+    wanted = tuple(length if size is None else size for size, length in zip(sizes.values(), array.shape, strict=False))
+    if array.ndim != len(sizes) or array.shape != wanted:
         words = ", ".join(f"{'' if size is None else size} {name}".strip() for name, size in sizes.items())
-        raise InputError(f"{what} have the shape {found.shape}, and not ({words})", where=where)
-    return found
+        raise InputError(f"{what} have the shape {array.shape}, and not ({words})", where=where)
+    return array
 
 
 def _as_lists(columns: Mapping[str, Any]) -> dict[str, Any]:

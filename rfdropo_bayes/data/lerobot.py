@@ -55,7 +55,7 @@ def read_episode(folder: Path, number: int) -> pd.DataFrame:
             damaged or cut short.
     """
     info = _info(folder)
-    episode = next((found for found in _episodes(folder, info) if found.number == number), None)
+    episode = next((each for each in _episodes(folder, info) if each.number == number), None)
     if episode is None:
         raise InputError(
             f"has no episode {number}", where=str(folder), remedy="see meta/episodes for the existing numbers"
@@ -133,15 +133,15 @@ def _episodes(folder: Path, info: dict[str, Any]) -> list[_Episode]:
             remedy = "fetch the dataset again"
             raise InputError(f"lists no episodes ({error!r})", where=str(listing), remedy=remedy) from None
     keys = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    found: list[_Episode] = []
+    episodes: list[_Episode] = []
     for file in sorted((folder / "meta" / "episodes").glob("*/*.parquet")):
         rows = _parquet(file, keys)
         for number, length, chunk, index in zip(*(rows[key] for key in keys), strict=True):
             path = info["data_path"].format(chunk_index=chunk, file_index=index)
-            found.append(_Episode(int(number), int(length), folder / path))
-    if not found:
+            episodes.append(_Episode(int(number), int(length), folder / path))
+    if not episodes:
         raise InputError("lists no episodes in meta/episodes", where=str(folder), remedy="fetch the dataset again")
-    return found
+    return episodes
 
 
 def _path(info: dict[str, Any], number: int, chunk: int) -> str:
@@ -168,5 +168,7 @@ def _parquet(
     except KeyError as error:
         raise InputError(f"lacks the column {error.args[0]}", where=str(path), remedy="fetch it again") from None
     except (OSError, pyarrow.ArrowException) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"is not a readable Parquet file ({said})", where=str(path), remedy="fetch it again") from None
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"is not a readable Parquet file ({reason})", where=str(path), remedy="fetch it again"
+        ) from None

@@ -72,9 +72,11 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
     Raises:
         InputError: a file of another format, a damaged one, or a column that is not there.
     """
-    found = recognised_format(path)
-    if found != format:
-        raise InputError(f"is of the format {found!r}, not {format!r}", where=str(path), remedy=f'use "{found}"')
+    recognised = recognised_format(path)
+    if recognised != format:
+        raise InputError(
+            f"is of the format {recognised!r}, not {format!r}", where=str(path), remedy=f'use "{recognised}"'
+        )
     places = coordinates(columns)
     if format == rosbag.FORMAT:
         return Observed(rosbag.read_observations(path, columns), _in_seconds(columns, path))
@@ -111,7 +113,7 @@ def read_mapped(
 
     Args:
         format: one of `MAPPED`.
-        path: file or folder with the observations, and the commands unless they have a file of their own.
+        path: file or folder with the observations, and the commands unless they have their own file.
         columns: mapping of the columns.
         commands: a CSV of the commands.
         episode: number of the episode in a LeRobotDataset.
@@ -132,7 +134,7 @@ def read_mapped(
         raise InputError(
             "has no commands: Motive records none",
             where=str(path),
-            remedy="give {observations = ..., commands = ...}, the latter a CSV with times of its own (command_time)",
+            remedy="give {observations = ..., commands = ...}, the latter a CSV with its own times (command_time)",
         )
     for ending in (".csv", ".mat", ".npz", *rosbag.STORAGE):
         name = name.removesuffix(ending)

@@ -26,15 +26,15 @@ def shared_markers(trajectories: Sequence[Trajectory], markers: Sequence[str]) -
                 else "use the robot that was recorded, or use the same marker names in its file",
             )
     shared = set.intersection(*(set(trajectory.marker_names) for trajectory in trajectories))
-    found = tuple(name for name in markers if name in shared)
-    if not found:
+    common = tuple(name for name in markers if name in shared)
+    if not common:
         each = "; ".join(f"{trajectory.name} has {', '.join(trajectory.marker_names)}" for trajectory in trajectories)
         raise InputError(
             f"no marker of the robot ({', '.join(markers)}) is in all recordings: {each}",
             where="[data]",
             remedy="fit recordings of the same markers together",
         )
-    return found
+    return common
 
 
 def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -> None:

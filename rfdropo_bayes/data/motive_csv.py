@@ -48,7 +48,7 @@ def read_motive(path: Path) -> MotiveFile:
     lines = read_text(path).replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not lines[0].startswith(MOTIVE):
         raise InputError(
-            f"is no export of Motive's: its first line does not begin with {MOTIVE!r}",
+            f"is not an export of Motive: its first line does not begin with {MOTIVE!r}",
             where=str(path),
             remedy="export it with header information, or use format = 'csv'",
         )

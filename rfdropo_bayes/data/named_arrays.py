@@ -46,7 +46,7 @@ def read_arrays(path: Path) -> pd.DataFrame:
         arrays = _of_npz(path) if path.suffix != ".mat" else _of_mat(path)
     except (OSError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"is no file of arrays that can be read ({type(error).__name__}: {error})".replace("\n", " "),
+            f"is not a readable file of arrays ({type(error).__name__}: {error})".replace("\n", " "),
             where=str(path),
             remedy="save it again, from MATLAB with arrays in place of tables and timetables",
         ) from None
@@ -71,12 +71,12 @@ def _columns(name: str, array: np.ndarray, rows: int) -> list[tuple[str, np.ndar
 
 
 def _of_npz(path: Path) -> dict[str, np.ndarray]:
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         for name in file.files:
             with suppress(ValueError):  # an array of Python objects
-                found[name] = file[name]
-    return found
+                arrays[name] = file[name]
+    return arrays
 
 
 def _of_mat(path: Path) -> dict[str, np.ndarray]:
@@ -89,7 +89,7 @@ def _of_older(path: Path) -> dict[str, np.ndarray]:
     """MATLAB's files before 7.3."""
     from scipy.io import loadmat
 
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
 
     def gather(name: str, value: Any) -> None:
         if isinstance(value, np.ndarray) and value.dtype.names:
@@ -97,24 +97,24 @@ def _of_older(path: Path) -> dict[str, np.ndarray]:
                 for field in value.dtype.names:
                     gather(f"{name}.{field}", value[field].item())
         elif isinstance(value, np.ndarray):
-            found[name] = value
+            arrays[name] = value
 
     for name, value in loadmat(path).items():
         if not name.startswith("__"):
             gather(name, value)
-    return found
+    return arrays
 
 
 def _of_hdf5(path: Path) -> dict[str, np.ndarray]:
     """MATLAB's files from 7.3 on, which hold arrays with their axes the other way round."""
     import h5py
 
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
 
     def gather(name: str, value: Any) -> None:
         if isinstance(value, h5py.Dataset) and not name.startswith("#"):
-            found[name.replace("/", ".")] = np.asarray(value).T
+            arrays[name.replace("/", ".")] = np.asarray(value).T
 
     with h5py.File(path) as file:
         file.visititems(gather)
-    return found
+    return arrays

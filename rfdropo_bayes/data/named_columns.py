@@ -2,7 +2,7 @@
 
 Timing. The command in row k is in force from the time of row k until the time of row k + 1, as for a loop that measures
 and then commands; `first_command` finds the command before row 0. With `CsvColumns.commands_with_poses` it is in force
-from half-way after row k - 1 on, so that row k shows its pose. Commands may stand in a table of their own, with n or
+from half-way after row k - 1 on, so that row k shows its pose. Commands may stand in their own table, with n or
 n - 1 rows for n observations; or with their own times and any number of rows.
 """
 
@@ -30,16 +30,20 @@ from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+PASCALS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "mbar": 1e2, "bar": 1e5, "psi": 6894.757293168}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
     "deg": ("rad", np.pi / 180.0),
     "N": ("N", 1.0),
     "N m": ("N m", 1.0),
+    **{name: ("Pa", factor) for name, factor in PASCALS.items()},
     **dict.fromkeys(("-", "V", "A", "%"), ("-", 1.0)),
 }
 COUNTS = "counts"
 """Encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
-CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "V", "A", "%", "-"]
+CommandUnit = Literal[
+    "m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "MPa", "mbar", "bar", "psi", "V", "A", "%", "-"
+]
 
 
 ROWS = "rows"
@@ -75,7 +79,7 @@ class CsvColumns(BaseModel):
         default=None, description="names of all columns, in their order, of a CSV without a line of names"
     )
     command_names: list[str] | None = Field(
-        default=None, description="the same for a CSV of the commands, if they have a file of their own"
+        default=None, description="the same for a CSV of the commands, if they have their own file"
     )
     time: str | None = Field(
         default=None,
@@ -90,15 +94,15 @@ class CsvColumns(BaseModel):
     sample_time: float | None = Field(
         default=None,
         gt=0,
-        description="time between rows [s], if no column has times or the times are of arrival",
+        description="time between rows [s], if no column has times, or only times of arrival",
     )
     commands: list[str] = Field(
         min_length=1,
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
     )
     command_unit: CommandUnit = Field(
-        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force or torque; "
-        '"-" for commands of your own simulator'
+        description="unit of the commands: a length of cable, an angle of a motor or its counts, a force, torque or "
+        'pressure; "-" for commands of your own simulator'
     )
     counts_per_turn: float | None = Field(
         default=None,
@@ -114,13 +118,13 @@ class CsvColumns(BaseModel):
     )
     units: dict[str, str] = Field(
         {},
-        description="unit of each column of commands or positions whose unit differs from command_unit or "
-        "position_unit, by the name of the column",
+        description="unit by name of the column, for columns of commands or positions whose unit differs from "
+        "command_unit or position_unit",
     )
     commands_with_poses: bool = Field(
         default=False,
-        description="the pose in a row is the pose under the command of the same row, as of poses at rest, or of "
-        "commands that were measured with the pose; by default a command acts from its row on",
+        description="whether a row has the pose under its own command, as if the robot is at rest, or if commands were "
+        "measured with the pose; by default a command acts from its row on",
     )
     command_time: str | None = Field(
         default=None,
@@ -137,7 +141,7 @@ class CsvColumns(BaseModel):
         min_length=1, description="columns of x, y and z of each marker, base to tip"
     )
     position_unit: Literal["m", "cm", "mm"] = Field(
-        description='unit of the positions; the header of a "motive-csv" file comes first'
+        description='unit of the positions; the header of a "motive-csv" file overrides it'
     )
     axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(
         ("x", "y", "z"),
@@ -153,7 +157,7 @@ class CsvColumns(BaseModel):
     base_marker: tuple[str, str, str] | None = Field(
         default=None,
         description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved: "
-        "positions are counted from it, and origin is the base's place beside it",
+        "positions and origin are relative to this marker",
     )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
@@ -417,7 +421,7 @@ def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray
 
 
 def command_clock(columns: CsvColumns) -> tuple[str | None, TimeUnit]:
-    """Column of times in a file of commands, and its unit; None if its rows have no times of their own."""
+    """Column of times in a file of commands, and its unit; None if its rows have no times."""
     shared = None if untimed(columns) else columns.time
     return columns.command_time or shared, columns.command_time_unit or columns.time_unit
 
@@ -456,8 +460,8 @@ def _angles(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cab
 def _counter_notes(table: CsvTable, source: CsvTable, columns: CsvColumns, motion: Motion) -> list[str]:
     """Jumps of counters, of commands and of motor angles, that no marker follows."""
     sent = (columns.commands, columns.command_unit, source.numbers(columns.commands), motion)
-    names, found = columns.motor_angles or [], motion._replace(sent=motion.time)
-    read = (names, columns.motor_angle_unit, table.numbers(names, allow_missing=True) if names else None, found)
+    names, angle_motion = columns.motor_angles or [], motion._replace(sent=motion.time)
+    read = (names, columns.motor_angle_unit, table.numbers(names, allow_missing=True) if names else None, angle_motion)
     notes = []
     for names, unit, values, seen in (sent, read):
         if values is not None:

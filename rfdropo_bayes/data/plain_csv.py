@@ -29,7 +29,7 @@ def read_plain_csv(
     """One recording.
 
     Args:
-        path: file with the observations, and the commands unless they have a file of their own.
+        path: file with the observations, and the commands unless they have their own file.
         columns: mapping of the columns.
         commands: file of the commands, if it is another.
         mask_missing: mask lost marker positions instead of rejecting the file.
@@ -48,7 +48,7 @@ def csv_table(path: Path, columns: CsvColumns) -> CsvTable:
 
 
 def command_table(path: Path | None, columns: CsvColumns) -> CsvTable | None:
-    """The file of the commands, if they have a file of their own."""
+    """The file of the commands, if they have their own file."""
     if path is None:
         return None
     return CsvTable(path, columns.commands, names=columns.command_names, machine_written=False)

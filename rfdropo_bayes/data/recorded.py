@@ -203,8 +203,8 @@ def _missing(
         "poses of the object": 0 if pose is None else int((~np.isfinite(pose).all(axis=-1)).sum()),
         "orientations": 0 if orientation is None else int((~np.isfinite(orientation).all(axis=-1)).sum()),
     }
-    found = {kind: count for kind, count in counts.items() if count}
-    return {MISSING: found} if found else {}
+    missing = {kind: count for kind, count in counts.items() if count}
+    return {MISSING: missing} if missing else {}
 
 
 def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:

@@ -107,8 +107,8 @@ def noise_floor(trajectories: Sequence[Trajectory]) -> dict[str, float] | None:
     """
     total: dict[str, float] = {}
     freedom: dict[str, int] = {}
-    for found in group_repeats(trajectories):
-        for group in _in_rows_alike([trajectories[index] for index in found]):
+    for repeated in group_repeats(trajectories):
+        for group in _in_rows_alike([trajectories[index] for index in repeated]):
             for marker, variance in (_variances(group) if len(group) > 1 else {}).items():
                 total[marker] = total.get(marker, 0.0) + (len(group) - 1) * variance
                 freedom[marker] = freedom.get(marker, 0) + len(group) - 1

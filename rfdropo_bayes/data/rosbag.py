@@ -7,7 +7,7 @@ has no names: ``/joint_states.position[motor1]``, ``/tf.transforms[tip].transfor
 type.
 
 The clock "header" takes header stamps, and times of arrival for topics without stamps. The clock "log" takes times of
-arrival for all topics. Elements with a header of their own, as transforms, have its stamps.
+arrival for all topics. Elements with their own header, as transforms, have its stamps.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LARGEST_LIST = 256
 
 
 class _Reading(NamedTuple):
-    """Numbers of one message, or of one element with a header of its own."""
+    """Numbers of one message, or of one element with its own header."""
 
     name: str
     header: Any
@@ -98,7 +98,7 @@ def read_streams(path: Path, topics: Collection[str] | None = None, clock: Clock
             return _streams(reader, path, topics, clock)
     except InputError:
         raise
-    except Exception as error:  # each storage, codec and message definition raises types of its own on damaged files
+    except Exception as error:  # each storage, codec and message definition raises its own types on damaged files
         raise InputError(
             f"is not a bag that rosbags can read ({type(error).__name__}: {error})".replace("\n", " "),
             where=str(path),
@@ -146,7 +146,7 @@ def clock_of(columns: CsvColumns) -> Clock:
     if columns.time in CLOCKS:
         return cast(Clock, columns.time)
     raise InputError(
-        f"time = {columns.time!r} is no clock of a bag",
+        f"time = {columns.time!r} is not a clock of a bag",
         where="[data.columns]",
         remedy='write "header", for header stamps if there are any, or "log", for the recorder\'s times',
     )
@@ -177,7 +177,7 @@ def _streams(reader: AnyReader, path: Path, topics: Collection[str] | None, cloc
         for name, header, values in _readings(reader.deserialize(raw, connection.msgtype), connection.topic):
             frame = "" if header is None else str(header.frame_id)
             readings[name].append((_stamp(header), NANOSECOND * logged, frame, values))
-    return [_stream(name, found, clock) for name, found in readings.items()]
+    return [_stream(name, entries, clock) for name, entries in readings.items()]
 
 
 def _stream(name: str, readings: list[tuple[float, float, str, dict[str, float]]], clock: str) -> Stream:
@@ -207,7 +207,7 @@ def _readings(message: Any, topic: str) -> Iterator[_Reading]:
 
 
 def _gather(message: Any, prefix: str, values: dict[str, float], apart: list[tuple[str, Any]]) -> None:
-    """Put a message's numbers into ``values``, by their paths, and elements with a header of their own ``apart``."""
+    """Put a message's numbers into ``values``, by their paths, and elements with their own header ``apart``."""
     fields = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
     names: list[str] = next((fields[key] for key in LISTS_OF_NAMES if isinstance(fields.get(key), list)), [])
     for key, value in fields.items():

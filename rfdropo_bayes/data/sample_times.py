@@ -122,13 +122,13 @@ def _of_text(cells: pd.Series, unit: str, where: str, column: str) -> Stamps:
     durations = pd.to_timedelta(written.map(lambda cell: str(cell) if ":" in str(cell) else None), errors="coerce")
     if durations.notna().all():
         return _in_nanoseconds(durations)
-    found = max((numbers, dates, durations), key=lambda each: each.notna().sum())
-    row = int(found.isna().argmax())
+    best = max((numbers, dates, durations), key=lambda each: each.notna().sum())
+    row = int(best.isna().argmax())
     raise InputError(
         f"{str(cells.iat[row])!r} is not a number, nor a date as ISO 8601 has it",
         where=f"{where}, row {row}, column {column!r}",
         remedy="correct the cell"
-        if found.notna().any()
+        if best.notna().any()
         else "write all times as numbers or like 2024-05-01T12:00:00.25, or give sample_time in place of time",
     )
 

@@ -100,7 +100,7 @@ class DataSpec(BaseModel):
     def piece(self, whole: Trajectory, rows: tuple[int, int] | None, every: int = 1) -> Trajectory:
         """Each ``every``-th row, first to last, with the commands of `lead_in`; all rows without ``rows``.
 
-        Commands with a clock of their own may begin long before the recording does.
+        Commands with their own clock may begin long before the recording does.
         """
         if every > 1:
             timed = self.columns is None or self.columns.time != ROWS
@@ -187,15 +187,15 @@ def find_data_file(name: str | Path, base: Path, *, folders: bool = False) -> Pa
     Raises:
         InputError: no such file, or a pattern that several match.
     """
-    found = find_files(str(name), base, folders=folders)
-    if len(found) > 1:
+    files = find_files(str(name), base, folders=folders)
+    if len(files) > 1:
         raise InputError(
-            f"matches {len(found)} files ({', '.join(file.name for file in found[:3])}{', ...' if found[3:] else ''}) "
+            f"matches {len(files)} files ({', '.join(file.name for file in files[:3])}{', ...' if files[3:] else ''}) "
             "but one file is expected",
             where=str(name),
             remedy="name the file; if every recording has its own commands, give an entry for each recording",
         )
-    return found[0]
+    return files[0]
 
 
 def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:

@@ -1,4 +1,4 @@
-"""Readings that each come at times of their own, such as the topics of a bag, brought to one table.
+"""Readings with their own times, such as the topics of a bag, brought to one table.
 
 Observations get the times of the first marker's stream. Readings of the other streams are interpolated linearly between
 two that are no further apart than one and a half rows; a lone reading goes to the row nearest to it; other cells are
@@ -47,8 +47,8 @@ def in_order(name: str, time: Float[np.ndarray, " reading"], values: pd.DataFram
     order = np.argsort(time, kind="stable")
     kept = order[np.append(np.diff(time[order]) > 0.0, True)]
     if len(kept) < len(time):
-        said = "%s: %d of %d readings have the time of another reading and are left out"
-        logging.getLogger(__name__).warning(said, name, len(time) - len(kept), len(time))
+        message = "%s: %d of %d readings have the time of another reading and are left out"
+        logging.getLogger(__name__).warning(message, name, len(time) - len(kept), len(time))
     return Stream(name, time[kept], values.iloc[kept].reset_index(drop=True), frames)
 
 
@@ -98,8 +98,8 @@ def commanded(streams: Sequence[Stream], clock: str, names: Sequence[str], where
         if held[name].isna().all():
             raise InputError("holds no commands", where=f"{where}, {name}", remedy="name another column")
         if late[name]:
-            said = "%s: %s is not commanded in the first %d rows; its first command is taken for them"
-            logging.getLogger(__name__).warning(said, where, name, late[name])
+            message = "%s: %s is not commanded in the first %d rows; its first command is taken for them"
+            logging.getLogger(__name__).warning(message, where, name, late[name])
     held = held.bfill()
     held.insert(0, clock, held.index)
     return held.reset_index(drop=True)
@@ -134,21 +134,21 @@ def _at_rows(
     """A quantity at the times of rows; NaN if no reading is near."""
     value = np.asarray(value, dtype=float)
     time, value = time[np.isfinite(value)], value[np.isfinite(value)]
-    found = np.full(len(rows), np.nan)
+    filled = np.full(len(rows), np.nan)
     if not len(time) or len(rows) < 2:
-        return found
+        return filled
     step = float(np.median(np.diff(rows)))
     after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
     nearest = np.where(time - rows[after - 1] < rows[after] - time, after - 1, after)
     distance = np.abs(rows[nearest] - time)
     closest_last = np.argsort(-distance, kind="stable")
     lone = closest_last[distance[closest_last] <= 0.5 * step]
-    found[nearest[lone]] = value[lone]
-    left = np.searchsorted(time, rows, side="right") - 1
-    inside = (left >= 0) & (left < len(time) - 1)
-    left = left[inside]
-    span = time[left + 1] - time[left]
-    weight = (rows[inside] - time[left]) / span
-    between = (1.0 - weight) * value[left] + weight * value[left + 1]
-    found[inside] = np.where(span <= ADJACENT * step, between, found[inside])
-    return found
+    filled[nearest[lone]] = value[lone]
+    before = np.searchsorted(time, rows, side="right") - 1
+    inside = (before >= 0) & (before < len(time) - 1)
+    before = before[inside]
+    span = time[before + 1] - time[before]
+    weight = (rows[inside] - time[before]) / span
+    between = (1.0 - weight) * value[before] + weight * value[before + 1]
+    filled[inside] = np.where(span <= ADJACENT * step, between, filled[inside])
+    return filled

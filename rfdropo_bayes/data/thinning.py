@@ -29,7 +29,7 @@ def needed_interval(run: Trajectory) -> float:
     seen = [(time[good], position[good, marker]) for marker, good in enumerate(mask.T) if good.sum() > 2]
     if not seen:
         return step
-    spread = float(np.sqrt(np.mean([place.var(axis=0).sum() for _, place in seen])))
+    deviation = float(np.sqrt(np.mean([place.var(axis=0).sum() for _, place in seen])))
 
     def error(every: int) -> float:
         """Root mean square distance from a straight line between every n-th row."""
@@ -40,9 +40,9 @@ def needed_interval(run: Trajectory) -> float:
             squares.append(np.mean(np.sum((place[inside] - np.stack(lines, axis=1)) ** 2, axis=1)))
         return float(np.sqrt(np.mean(squares)))
 
-    if error(2) > UNRESOLVED * spread:
+    if error(2) > UNRESOLVED * deviation:
         return step
-    allowed, longest = max(LIKE_NOISE * error(2), CLOSE * spread), 2
+    allowed, longest = max(LIKE_NOISE * error(2), CLOSE * deviation), 2
     for every in FACTORS[2:]:
         if every * step > SLOWEST or every > len(time) // 4 or error(every) > allowed:
             break

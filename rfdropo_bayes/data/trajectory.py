@@ -88,13 +88,13 @@ class Trajectory:
             given: ``time`` (time,), numbers in ``time_unit`` ("s", "ms", "us", "ns") or dates; ``position`` (time,
                 marker, 3) in ``position_unit`` ("m", "cm", "mm"), in the frame of the robot's base, z along the axis
                 away from the clamp, lost positions as NaN; ``command`` (command, channel) in ``command_unit`` ("m",
-                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "-"), cumulative, pull > 0, each in force
-                until the next; ``markers`` and ``channels``, their names. These five are required. ``command_time``:
-                start time of each command, on the clock of ``time``; ``largest_command``: largest plausible command of
-                drives of many turns. ``tension`` (time, channel) [N], ``motor_angle`` (time, channel) [rad],
-                ``object_pose`` (time, 7): centre and unit quaternion x, y, z, w. ``orientation`` (time, section, 4),
-                unit quaternions x, y, z, w, and ``sections``, their names. ``name`` of the recording; ``robot``: name
-                of the recorded robot.
+                "cm", "mm" of cable, "rad", "deg" of a motor, "N", "N m", "Pa", "-"), cumulative, pull > 0, each in
+                force until the next; ``markers`` and ``channels``, their names. These five are required.
+                ``command_time``: start time of each command, on the clock of ``time``; ``largest_command``: largest
+                plausible command of drives of many turns. ``tension`` (time, channel) [N], ``motor_angle`` (time,
+                channel) [rad], ``object_pose`` (time, 7): centre and unit quaternion x, y, z, w. ``orientation`` (time,
+                section, 4), unit quaternions x, y, z, w, and ``sections``, their names. ``name`` of the recording;
+                ``robot``: name of the recorded robot.
 
         Raises:
             InputError: an unknown or missing keyword, an unknown unit, values that are not numbers, shapes that do not
@@ -135,7 +135,7 @@ class Trajectory:
     def from_xarray(cls, dataset: xr.Dataset, name: str = "recording", *, robot: str = "") -> Trajectory:
         """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
 
-        Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels
+        Dimensions may be in any order; ``command`` may have its own clock, ``command_time``. Markers and channels
         are named by their coordinates, units stand in the variables' attribute ``units`` ("m" if missing, and "s" of
         ``time``, which may hold dates). Further variables are ``initial_command``, ``tension`` [N], ``motor_angle``
         [rad] and ``object_pose``; their own units, and the unit of ``command_time``, count if stated.
@@ -150,8 +150,8 @@ class Trajectory:
     def __repr__(self) -> str:
         rows, last = len(self.time), float(self.time[-1])
         channels = f"{len(self.cable_names)} commands [{self.command_unit}]: {', '.join(self.cable_names)}"
-        left = int((~self.position_mask).sum())
-        out = f"; {left} of {self.position_mask.size} positions left out" if left else ""
+        masked = int((~self.position_mask).sum())
+        out = f"; {masked} of {self.position_mask.size} positions left out" if masked else ""
         markers = f"markers {', '.join(self.marker_names)}"
         return f"<Trajectory {self.name}: {rows} rows over {last:.4g} s; {markers}; {channels}{out}>"
 
@@ -190,7 +190,7 @@ class Trajectory:
 
     @property
     def command_unit(self) -> str:
-        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"`` or ``"-"``."""
+        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"``, ``"Pa"`` or ``"-"``."""
         return str(self.dataset["command"].attrs["unit"])
 
     @property
@@ -251,8 +251,8 @@ class Trajectory:
         faults = self.settings.get("faults", {})
         counts = {"held poses": "held", "jumps": "jump", "lost markers": "missing"}
         counts |= {"lost markers at zero": "zero", "positions under other markers' names": "renamed"}
-        said = [f"{sum(faults[kind])} {name}" for name, kind in counts.items() if sum(faults.get(kind, ()))]
-        return ", ".join([*said, self.missing] if self.missing else said)
+        parts = [f"{sum(faults[kind])} {name}" for name, kind in counts.items() if sum(faults.get(kind, ()))]
+        return ", ".join([*parts, self.missing] if self.missing else parts)
 
     @property
     def notes(self) -> list[str]:
@@ -388,23 +388,23 @@ class Trajectory:
                 remedy="correct resample, or the unit of the times ([data.columns] time_unit)",
             )
         grid = sample_time * np.arange(int(np.floor(duration / sample_time + 1e-9)) + 1)
-        left, weight = _brackets(self.time, grid)
-        right = np.minimum(left + 1, self.time.size - 1)
+        before, weight = _brackets(self.time, grid)
+        after = np.minimum(before + 1, self.time.size - 1)
         data: dict[str, Any] = {}
         for key in ("position", "tension", "motor_angle", "object_pose"):
             if key in self.dataset:
                 values = self.dataset[key].values
                 share = weight.reshape((-1,) + (1,) * (values.ndim - 1))
-                data[key] = (self.dataset[key].dims, (1.0 - share) * values[left] + share * values[right])
+                data[key] = (self.dataset[key].dims, (1.0 - share) * values[before] + share * values[after])
         if "object_pose" in data:
-            data["object_pose"][1][:, 3:] = _slerp(self.dataset["object_pose"].values[:, 3:], left, right, weight)
+            data["object_pose"][1][:, 3:] = _slerp(self.dataset["object_pose"].values[:, 3:], before, after, weight)
         if "orientation" in self.dataset:
             turns = self.dataset["orientation"].values
-            found = [_slerp(turns[:, k], left, right, weight) for k in range(turns.shape[1])]
-            data["orientation"] = (self.dataset["orientation"].dims, np.stack(found, axis=1))
+            resampled = [_slerp(turns[:, k], before, after, weight) for k in range(turns.shape[1])]
+            data["orientation"] = (self.dataset["orientation"].dims, np.stack(resampled, axis=1))
         for key in checks.MASKS & set(self.dataset.variables):
             mask = self.dataset[key].values
-            usable = (mask[left] | (weight == 1.0)[:, None]) & (mask[right] | (weight == 0.0)[:, None])
+            usable = (mask[before] | (weight == 1.0)[:, None]) & (mask[after] | (weight == 0.0)[:, None])
             data[key] = (self.dataset[key].dims, usable)
         dataset = self.dataset.drop_dims("time").assign(data).assign_coords(time=grid)
         return Trajectory(dataset.assign_attrs(sample_time=float(sample_time)))
@@ -468,18 +468,18 @@ _INSTANT = 1e-9  # [s]: times that differ by less are the same instant
 
 def _brackets(time: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
     """Row before each grid time and the weight of the row after it; exactly 0 or 1 on a row."""
-    left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, time.size - 2)
-    weight = (grid - time[left]) / (time[left + 1] - time[left])
+    before = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, time.size - 2)
+    weight = (grid - time[before]) / (time[before + 1] - time[before])
     weight[np.abs(weight) < 1e-6] = 0.0
     weight[np.abs(weight - 1.0) < 1e-6] = 1.0
-    return left, np.clip(weight, 0.0, 1.0)
+    return before, np.clip(weight, 0.0, 1.0)
 
 
-def _slerp(quaternion: np.ndarray, left: np.ndarray, right: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    known = np.isfinite(quaternion[left]).all(axis=1) & np.isfinite(quaternion[right]).all(axis=1)
-    start, end = Rotation.from_quat(quaternion[left[known]]), Rotation.from_quat(quaternion[right[known]])
+def _slerp(quaternion: np.ndarray, before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    known = np.isfinite(quaternion[before]).all(axis=1) & np.isfinite(quaternion[after]).all(axis=1)
+    start, end = Rotation.from_quat(quaternion[before[known]]), Rotation.from_quat(quaternion[after[known]])
     turn = (start.inv() * end).as_rotvec()
-    between = np.full((len(left), 4), np.nan)
+    between = np.full((len(before), 4), np.nan)
     between[known] = (start * Rotation.from_rotvec(weight[known, None] * turn)).as_quat()
     return continuous_quaternions(np.hstack([np.zeros((len(between), 3)), between]))[:, 3:]
 

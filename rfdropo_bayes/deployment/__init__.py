@@ -1,6 +1,6 @@
 """Motors: CiA 402 drives over CANopen, the control loop, its safety, its log in the format of recordings; no JAX.
 
-Names are imported when they are first used: hub and drives are processes of their own, and start in a tenth of the time
+Names are imported when they are first used: hub and drives are separate processes, and start in a tenth of the time
 without xarray.
 """
 

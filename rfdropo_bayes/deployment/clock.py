@@ -23,7 +23,7 @@ _SWITCH = 5e-4  # [s]: time after which another thread gives the interpreter bac
 
 
 class Tick(NamedTuple):
-    """One beat: its number, its time [s, monotonic], the delay of the loop [s], and the number of skipped beats."""
+    """A control cycle: number, time [s, monotonic], delay of the loop [s], and number of skipped cycles."""
 
     number: int
     time: float
@@ -42,9 +42,9 @@ class CycleClock:
         self._number = 0
 
     def wait(self) -> Tick:
-        """Sleep until the next beat.
+        """Sleep until the next cycle.
 
-        A loop that wakes more than a whole period late has missed beats: they are counted, not made up for.
+        A loop that wakes more than a whole period late has missed cycles: they are counted, not repeated.
         """
         self._number += 1
         due = self._start + self._number * self.period
@@ -114,31 +114,31 @@ def steady_interpreter() -> Iterator[None]:
 
 
 class Jitter(NamedTuple):
-    """Lateness of the beats of an idle loop.
+    """Lateness of the cycles of an idle loop.
 
     Attributes:
         fifo: whether the system permitted real-time scheduling.
         lateness: lateness of each cycle [s].
-        missed: beats that passed unused.
+        missed: skipped cycles.
     """
 
     fifo: bool
-    lateness: Float[np.ndarray, " beats"]
+    lateness: Float[np.ndarray, " cycles"]
     missed: int
 
 
 def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:
-    """Run an idle loop, in a thread of its own so that the calling thread keeps its priority."""
-    found: list[Jitter] = []
+    """Run an idle loop, in its own thread so that the calling thread keeps its priority."""
+    jitters: list[Jitter] = []
 
     def loop() -> None:
         with real_time() if fifo else contextlib.nullcontext(False) as granted:
             clock = CycleClock(period)
             ticks = [clock.wait() for _ in range(max(2, round(seconds / period)))]
-        found.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))
+        jitters.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))
 
     with steady_interpreter():
         thread = threading.Thread(target=loop, name="idle loop")
         thread.start()
         thread.join()
-    return found[0]
+    return jitters[0]

@@ -55,11 +55,11 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
         problems.append(
             f"an idle loop misses {jitter['missed']} deadlines in {seconds:g} s: free this machine of other work"
         )
-    found: dict[str, Any] = {}
+    drives: dict[str, Any] = {}
     if bus is not None:
         try:
-            found = scan(bus)
-            if not found:
+            drives = scan(bus)
+            if not drives:
                 problems.append("no node answers: check power, termination and bit rate")
         except InputError as error:
             problems.append(str(error))
@@ -71,7 +71,7 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
         "versions": versions,
         "jitter": jitter,
         "bus": None if bus is None else f"{bus.interface} {bus.channel}",
-        "drives": found,
+        "drives": drives,
         "problems": problems,
     }
 

@@ -174,32 +174,32 @@ class Drive:
         kind = self.read(Object.PROFILE if own else Object.DEVICE_TYPE)
         if kind & 0xFFFF != 402:
             raise InputError(
-                f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
+                f"is not a CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
             )
-        found = self._check_identity(identity, check_eds)
+        answers = self._check_identity(identity, check_eds)
         if self.knows(Object.SUPPORTED_MODES):
-            found["modes"] = self.read(Object.SUPPORTED_MODES)
-            if not found["modes"] & objects.CSP_BIT:
+            answers["modes"] = self.read(Object.SUPPORTED_MODES)
+            if not answers["modes"] & objects.CSP_BIT:
                 raise InputError("has no cyclic synchronous position mode", where=self.name, remedy="use another drive")
         check_guards(self.lacking(), self.unguarded, where=f"{self.name}, data sheet")
         self._check_positions()
         if self.knows(Object.RATED_TORQUE):
-            found["rated_torque"] = self.read(Object.RATED_TORQUE)
+            answers["rated_torque"] = self.read(Object.RATED_TORQUE)
             where = f"{self.name}, object 0x6076"
-            check_rated_torque(found["rated_torque"], self.motor.rated_torque_n_m, self.units.torque, where)
+            check_rated_torque(answers["rated_torque"], self.motor.rated_torque_n_m, self.units.torque, where)
         self._factors()
-        found["statusword"] = self.read(Object.STATUSWORD)
-        found["position"] = self.read(Object.POSITION)
-        return found
+        answers["statusword"] = self.read(Object.STATUSWORD)
+        answers["position"] = self.read(Object.POSITION)
+        return answers
 
     def lacking(self) -> list[int]:
         """Objects that would be set or asked, and that its data sheet does not have, or lets nobody write."""
-        found = []
+        missing = []
         for index, subindexes in _SET.items():
             variables = [self.variable(index, subindex) for subindex in subindexes]
             if not all(variable is not None and variable.writable for variable in variables):
-                found.append(int(index))
-        return found if self.knows(Object.RATED_TORQUE) else [*found, int(Object.RATED_TORQUE)]
+                missing.append(int(index))
+        return missing if self.knows(Object.RATED_TORQUE) else [*missing, int(Object.RATED_TORQUE)]
 
     def _factors(self) -> tuple[float, float]:
         """Counts per second in one unit of 0x6080, and counts per second squared in one unit of 0x6085.
@@ -250,7 +250,7 @@ class Drive:
     def _check_identity(self, identity: Identity, check_eds: bool) -> dict[str, int]:
         sheet = self.node.remote.object_dictionary.device_information
         stated = {"vendor": sheet.vendor_number, "product": sheet.product_number} if check_eds else {}
-        found = {}
+        answers = {}
         for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
             if not self.knows(Object.IDENTITY, subindex):
                 if expected is not None:
@@ -260,18 +260,18 @@ class Drive:
                         remedy=f"{EDS_REMEDY}, or leave [drives] {key} out",
                     )
                 continue
-            found[key] = self.read(Object.IDENTITY, subindex)
+            answers[key] = self.read(Object.IDENTITY, subindex)
             where = f"{self.name}, object 0x1018:{subindex}"
-            if expected is not None and found[key] != expected:
+            if expected is not None and answers[key] != expected:
                 remedy = "this is another drive: correct the wiring, the node, or [drives]"
-                raise InputError(f"{key} is 0x{found[key]:X}, not 0x{expected:X}", where=where, remedy=remedy)
-            if stated.get(key) not in (None, found[key]):
+                raise InputError(f"{key} is 0x{answers[key]:X}, not 0x{expected:X}", where=where, remedy=remedy)
+            if stated.get(key) not in (None, answers[key]):
                 raise InputError(
-                    f"{key} is 0x{found[key]:X}, but 0x{stated[key]:X} in the data sheet",
+                    f"{key} is 0x{answers[key]:X}, but 0x{stated[key]:X} in the data sheet",
                     where=where,
                     remedy=f"{EDS_REMEDY}, or set check_eds = false",
                 )
-        return found
+        return answers
 
     def disable(self) -> bool:
         """Switch off the power of a drive before its configuration; True if it was powered.
@@ -282,11 +282,11 @@ class Drive:
             InputError: the drive is still powered after a second.
         """
         end = time.monotonic() + 1.0
-        found, previous = False, 0
+        powered, previous = False, 0
         while (state := state_of(self.read(Object.STATUSWORD))) is not None:
             if not state.powered and state is not DriveState.SWITCHED_ON:
-                return found
-            found = True
+                return powered
+            powered = True
             previous = controlword_towards(state, DriveState.SWITCH_ON_DISABLED, previous)
             self.write(Object.CONTROLWORD, previous, read_back=False)
             if time.monotonic() > end:
@@ -396,11 +396,11 @@ class Drive:
             pdo.cob_id, pdo.trans_type, pdo.enabled = cob, kind, True
             pdo.save()
             pdo.read()
-        found = [(variable.index, variable.subindex, variable.length) for variable in pdo.map]
-        if found != wanted or pdo.cob_id != cob or pdo.trans_type != kind or not pdo.enabled:
-            said = ", ".join(f"0x{index:04X}:{sub} {bits} bits" for index, sub, bits in found)
+        mapped = [(variable.index, variable.subindex, variable.length) for variable in pdo.map]
+        if mapped != wanted or pdo.cob_id != cob or pdo.trans_type != kind or not pdo.enabled:
+            entries_read = ", ".join(f"0x{index:04X}:{sub} {bits} bits" for index, sub, bits in mapped)
             raise InputError(
-                f"the drive keeps another mapping ({said}; 0x{pdo.cob_id:X}, type {pdo.trans_type})",
+                f"the drive keeps another mapping ({entries_read}; 0x{pdo.cob_id:X}, type {pdo.trans_type})",
                 where=where,
                 remedy="read its manual: it may map only the objects in its EDS",
             )
@@ -566,7 +566,7 @@ class Drives:
     def quick_stop(self, patience: float = 0.02) -> list[str]:
         """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
 
-        The controlword goes out in a PDO of its own that needs no SYNC. If a frame cannot be sent, the others still
+        The controlword goes out in its own PDO that needs no SYNC. If a frame cannot be sent, the others still
         are, and the drive's own guard stops it.
 
         Returns:
@@ -574,7 +574,7 @@ class Drives:
         """
         self._stopped.set()
         # Behind a cycle that is being sent: its set-points still say "enable", and would undo the stop.
-        held = self._sending.acquire(timeout=patience)
+        locked = self._sending.acquire(timeout=patience)
         failures = []
         try:
             for drive in self.all:
@@ -584,7 +584,7 @@ class Drives:
                 except can.CanError as error:
                     failures.append(f"{drive.name}: {error}")
         finally:
-            if held:
+            if locked:
                 self._sending.release()
         return failures
 
@@ -622,4 +622,4 @@ _SET: dict[Object, tuple[int, ...]] = {
 }
 """Objects that `Drive.configure` writes, with their subindexes."""
 
-_MODE_TIME = 0.2  # [s]: a drive may take some cycles of its own to change its mode
+_MODE_TIME = 0.2  # [s]: a drive may take some cycles to change its mode

@@ -131,8 +131,8 @@ class EmergencyStop:
 
     def _look(self) -> str:
         for hook in self._hooks:
-            if found := hook():
-                return found if isinstance(found, str) else "button"
+            if request := hook():
+                return request if isinstance(request, str) else "button"
         if self._keyboard and select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 1)
             if key in [bytes([code]) for code in STOP_KEYS]:

@@ -75,11 +75,11 @@ def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
         raise InputError(f"cannot be read ({error})", where=where, remedy=again) from None
     result = parse_table(HomingResult, table, where=where)
     if result.robot != robot.name or tuple(home.channel for home in result.homes) != robot.channel_names:
-        raise InputError(f"is of robot {result.robot!r} with other channels", where=where, remedy=again)
+        raise InputError(f"belongs to robot {result.robot!r}, whose name or channels differ", where=where, remedy=again)
     age = datetime.datetime.now(datetime.UTC) - result.date
     if age > datetime.timedelta(hours=valid_h):
         raise InputError(
-            f"is {age.total_seconds() / 3600:.1f} h old, valid for {valid_h:g} h", where=where, remedy=again
+            f"is {age.total_seconds() / 3600:.1f} h old; the limit is {valid_h:g} h", where=where, remedy=again
         )
     return result
 
@@ -129,24 +129,24 @@ class Homing:
         goal = loop.set_points.length.copy()
         while True:
             recent = [*recent, drive.tension][-_MEDIAN:]
-            found = float(np.median(recent))
-            if len(recent) == _MEDIAN and (found < tension if below else found >= tension):
+            carried = float(np.median(recent))
+            if len(recent) == _MEDIAN and (carried < tension if below else carried >= tension):
                 break
             if below and goal[index] <= motor.length_limit_m[0] + 1e-9:
                 break  # slack enough: it may hang loose further than the cap lets it out
             if time.monotonic() > end:
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {self._table.time_s:g} s")
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {self._table.time_s:g} s")
             goal[index] += step
             if goal[index] > motor.length_limit_m[1]:
                 way = 1e3 * self._table.travel_m
                 asked = "is its cable off, or has it the opposite sign in the robot file?"
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {found:.2f} N after {way:.0f} mm: {asked}")
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {way:.0f} mm: {asked}")
             loop.set_points.towards(loop.set_points.clamp(goal))
             loop.command = loop.set_points.length.copy()
             loop.cycle(Phase.HOMING, acted=True)
         assert drive.reading is not None
         position = drive.reading.position
-        return Home(channel=motor.channel, offset_counts=position, tension_n=found, travel_m=drive.length)
+        return Home(channel=motor.channel, offset_counts=position, tension_n=carried, travel_m=drive.length)
 
 
 def homing_result(robot: Robot, homing: Homing) -> HomingResult:

@@ -196,7 +196,7 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
         header = json.loads(content[8:size])
     except (OSError, ValueError) as error:
         raise InputError(
-            f"is no journal of a session ({error})", where=str(path), remedy="give a session's folder"
+            f"is not a journal of a session ({error})", where=str(path), remedy="give a session's folder"
         ) from None
     if header["schema_version"] != SCHEMA_VERSION:
         raise InputError(
@@ -223,8 +223,8 @@ def _seen_when(
     position[place], seen[place] = rows["position"][heard], rows["seen"][heard]
     if not rows["object_seen"].any():
         return position, seen, None
-    pose, found = np.full(rows["object_pose"].shape, np.nan), rows["object_seen"][heard]
-    pose[place[found]] = rows["object_pose"][heard[found]]
+    pose, sighted = np.full(rows["object_pose"].shape, np.nan), rows["object_seen"][heard]
+    pose[place[sighted]] = rows["object_pose"][heard[sighted]]
     return position, seen, pose
 
 

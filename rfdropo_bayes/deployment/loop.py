@@ -1,4 +1,4 @@
-"""The control loop: set-points out and status in at every beat, and every phase of a session from enabling to rest."""
+"""The control loop: set-points out and status in at every cycle, and every phase of a session from enabling to rest."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Snapshot(NamedTuple):
 
 
 class ControlLoop:
-    """One session on configured drives. Runs in a thread of its own; `run` returns why it ended.
+    """One session on configured drives. Runs in its own thread; `run` returns why it ended.
 
     Args:
         robot: robot to drive.
@@ -373,10 +373,10 @@ class ControlLoop:
             except can.CanError:
                 self._say("the bus is lost: the drives' heartbeat guards stop them")
         self.pulse = None
-        if not after.found:
+        if not after.events:
             return stop
         cause = Cause.DRIVE_STATE if stop.cause is Cause.FINISHED else stop.cause
-        return Stop(cause, "; ".join(filter(None, [stop.detail, *after.found])))
+        return Stop(cause, "; ".join(filter(None, [stop.detail, *after.events])))
 
     def _hold_where_it_is(self) -> bool:
         """Set the command to the drives' positions once they no longer follow it; returns whether it changed."""

@@ -113,17 +113,17 @@ def identifiers(places: Sequence[tuple[int, int]]) -> list[Identifiers]:
     Raises:
         InputError: if there are too many axes beyond the second.
     """
-    free, found = iter(_FREE), []
+    free, assigned = iter(_FREE), []
     for node, axis in places:
         if axis <= len(_PREDEFINED):
-            found.append(Identifiers(*(base + node for base in _PREDEFINED[axis - 1])))
+            assigned.append(Identifiers(*(base + node for base in _PREDEFINED[axis - 1])))
             continue
         try:
-            found.append(Identifiers(next(free), next(free), next(free)))
+            assigned.append(Identifiers(next(free), next(free), next(free)))
         except StopIteration:
             many = f"more than {len(_FREE) // 3} motors are on third or further axes"
             raise InputError(many, where="motors", remedy="spread them over nodes") from None
-    return found
+    return assigned
 
 
 class Nmt(IntEnum):

@@ -292,10 +292,10 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
     for part in layout.observation:
         if part.name not in sizes:
             known = ", ".join(sizes)
-            raise InputError(f"wants {part.name!r}, which nothing here measures", where=where, remedy=f"known: {known}")
+            raise InputError(f"needs {part.name!r}, which no sensor measures", where=where, remedy=f"known: {known}")
         if part.size != sizes[part.name]:
             raise InputError(
-                f"wants {part.size} numbers of {part.name!r}; here there are {sizes[part.name]}",
+                f"needs {part.size} numbers of {part.name!r}; there are {sizes[part.name]}",
                 where=where,
                 remedy="name the markers that it sees: [policy] markers"
                 if part.name in ("markers", "moved", EARLIER_MOVED)
@@ -327,7 +327,9 @@ def _open(content: bytes, where: str) -> tuple[Any, PolicyLayout]:
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise InputError(f"is no ONNX model ({type(error).__name__})", where=where, remedy="export it again") from None
+        raise InputError(
+            f"is not an ONNX model ({type(error).__name__})", where=where, remedy="export it again"
+        ) from None
     text = session.get_modelmeta().custom_metadata_map.get(METADATA)
     if text is None:
         raise InputError("has no layout in its metadata", where=where, remedy="export it with `rfdropo train`")
@@ -389,10 +391,10 @@ class RecordedCommands:
         times = np.append(recording.command_time, max(recording.time[-1], recording.command_time[-1] + 1.0 / rate_hz))
         periods = (times - min(0.0, times[0])) * rate_hz  # since the recording or its first command began
         apart, place = np.diff(periods), np.floor(periods + 0.5 + _INSTANT)
-        held = np.maximum(1, np.round(apart)) if _evenly(apart[:-1]) else np.diff(place)
+        cycles = np.maximum(1, np.round(apart)) if _evenly(apart[:-1]) else np.diff(place)
         commands = np.concatenate([recording.initial_command[None], recording.command])
-        self._commands = np.repeat(commands, np.append(place[0], held).astype(int), axis=0)
-        self.last_s = float(len(self._commands) - held[-1]) / rate_hz
+        self._commands = np.repeat(commands, np.append(place[0], cycles).astype(int), axis=0)
+        self.last_s = float(len(self._commands) - cycles[-1]) / rate_hz
         """After how long the last command is sent [s]."""
         self._next = 0
 

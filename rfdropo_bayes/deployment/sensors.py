@@ -199,11 +199,11 @@ class NatNetMarkers:
         missing = [name for name in robot.marker_names if name not in table.rigid_bodies]
         if missing:
             raise InputError(
-                f"marker {missing[0]!r} has none", where="sensor.rigid_bodies", remedy="give its identifier"
+                f"marker {missing[0]!r} has no rigid body", where="sensor.rigid_bodies", remedy="give its identifier"
             )
         self._identifiers = {table.rigid_bodies[name]: place for place, name in enumerate(robot.marker_names)}
         if len(self._identifiers) < len(robot.marker_names):
-            remedy = "give each marker the identifier of its own"
+            remedy = "give each marker its own identifier"
             raise InputError("two markers have the same rigid body", where="sensor.rigid_bodies", remedy=remedy)
         if table.object_body in self._identifiers:
             remedy = "give the identifier of the object's own"

@@ -152,7 +152,7 @@ class _Session:
         self.simulated, self._stack = simulated, stack
         self.period = 1.0 / settings.rate_hz
         self._facts: dict[str, Any] = {"mode": mode.value, "simulated": simulated, "rate_hz": settings.rate_hz}
-        self.found: dict[str, dict[str, int]] = {}
+        self.identities: dict[str, dict[str, int]] = {}
         self.without: dict[str, list[str]] = {}
         self.source: CommandSource | None = None
         settings.drives.check_serial(robot.channel_names)
@@ -217,12 +217,14 @@ class _Session:
         )
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:
-            self.found[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel), identity.check_eds)
-            self.log.event("checked", drive.name, **self.found[drive.motor.channel])
+            self.identities[drive.motor.channel] = drive.check(
+                identity.identity(drive.motor.channel), identity.check_eds
+            )
+            self.log.event("checked", drive.name, **self.identities[drive.motor.channel])
             self.without[drive.motor.channel] = [f"0x{index:04X}: {LEFT_OUT[index]}" for index in drive.lacking()]
         if self.mode is Mode.HOME:
             for drive in drives:
-                drive.offset = float(self.found[drive.motor.channel]["position"])
+                drive.offset = float(self.identities[drive.motor.channel]["position"])
 
     def _motors(self) -> list[Motor]:
         motors = list(self.robot.motors)
@@ -272,7 +274,7 @@ class _Session:
             self.drives.configure(self.period, lambda text: self.log.event("note", text))
 
     def run(self, hooks: tuple[Hook, ...], show: bool, keyboard: bool) -> Outcome:
-        """Run the phases of the mode in a thread of their own, with the emergency stop beside it."""
+        """Run the phases of the mode in their own thread, with the emergency stop beside it."""
         if self.mode is Mode.CHECK:
             return self._outcome(Stop(Cause.FINISHED, "nothing was written"), None)
         safety = self.settings.safety
@@ -339,7 +341,7 @@ class _Session:
         if loop is not None:
             self._write_recording(stop)
         self.summarise(stop.cause.word, stop.detail, figures)
-        return Outcome(stop.cause, stop.detail, self.out, figures, self.found, self.without)
+        return Outcome(stop.cause, stop.detail, self.out, figures, self.identities, self.without)
 
     def _write_recording(self, stop: Stop) -> None:
         running = (Phase.RUNNING, Phase.STOPPING, Phase.HOLDING, Phase.BRAKED, Phase.SHADOW)
@@ -359,7 +361,7 @@ class _Session:
             "detail": detail,
             "facts": self._facts,
             "figures": dict(figures),
-            "drives": self.found,
+            "drives": self.identities,
             "without": self.without,
             "versions": {"rfdropo_bayes": __version__, "python": platform.python_version()}
             | {name: metadata.version(name) for name in names},

@@ -175,7 +175,7 @@ class SimulationSettings(_Table):
     Attributes:
         plant: "springs", or MODULE:CALLABLE.
         settings: settings of the plant, or a .toml file of settings.
-        own_process: whether the plant runs in a process of its own.
+        own_process: whether the plant runs in its own process.
     """
 
     plant: str = "springs"
@@ -243,15 +243,15 @@ def load_deployment(path: Path | str, overrides: Sequence[str] = ()) -> Deployme
 
 
 def _resolved(settings: Deployment, base: Path) -> dict[str, object]:
-    found: dict[str, object] = {}
+    resolved: dict[str, object] = {}
     if settings.robot.endswith(".toml"):
-        found["robot"] = str(base / settings.robot)
+        resolved["robot"] = str(base / settings.robot)
     if settings.policy is not None:
-        found["policy"] = settings.policy.model_copy(update={"file": str(base / settings.policy.file)})
-    found["drives"] = settings.drives.model_copy(update={"eds": str(base / settings.drives.eds)})
+        resolved["policy"] = settings.policy.model_copy(update={"file": str(base / settings.policy.file)})
+    resolved["drives"] = settings.drives.model_copy(update={"eds": str(base / settings.drives.eds)})
     plant = settings.simulation.settings
     files = {key: str(base / str(name)) for key, name in plant.items() if str(name).endswith(".toml")}
-    found["simulation"] = settings.simulation.model_copy(update={"settings": plant | files})
+    resolved["simulation"] = settings.simulation.model_copy(update={"settings": plant | files})
     if settings.homing.file is not None:
-        found["homing"] = settings.homing.model_copy(update={"file": str(base / settings.homing.file)})
-    return found
+        resolved["homing"] = settings.homing.model_copy(update={"file": str(base / settings.homing.file)})
+    return resolved

@@ -34,7 +34,7 @@ def data_sheet(eds: str, node: int, axes: int = 1) -> canopen.ObjectDictionary:
             text += "".join(_further_axis(text, axis) for axis in range(2, axes + 1))
         return import_eds(io.StringIO(text), node)
     except Exception as error:  # configparser and canopen raise many types on damaged data sheets
-        raise InputError(f"is no readable data sheet ({error})", where=eds, remedy=EDS_REMEDY) from None
+        raise InputError(f"is not a readable data sheet ({error})", where=eds, remedy=EDS_REMEDY) from None
 
 
 def _further_axis(text: str, axis: int) -> str:
@@ -42,17 +42,17 @@ def _further_axis(text: str, axis: int) -> str:
     sections = []
     for section in re.split(r"^(?=\[)", text, flags=re.MULTILINE):
         name, _, body = section.partition("\n")
-        found = _COPIED.match(name.strip())
-        if found is None:
+        match = _COPIED.match(name.strip())
+        if match is None:
             continue
-        index = int(found["index"], 16)
+        index = int(match["index"], 16)
         shifted = objects.of_axis(index, axis)
         if index & 0xFE00 in _PDO:
             shifted = index + objects.PDOS_OF_AXIS * (axis - 1)
             body = re.sub(r"=\$NODEID.*", f"={objects.PDO_INVALID:#x}", body)
             body = re.sub(r"=0x([6-9]\w{3})(\w{4})$", lambda entry: _mapped(entry, axis), body, flags=re.MULTILINE)
         if shifted != index:
-            sections.append(f"\n[{shifted:04X}{found['sub']}]\n{body}")
+            sections.append(f"\n[{shifted:04X}{match['sub']}]\n{body}")
     return "".join(sections)
 
 

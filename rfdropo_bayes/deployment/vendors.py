@@ -110,44 +110,44 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
                 remedy='look into its manual, and state [drives] acceleration_unit, "counts/s2" or "rpm/s"',
             )
         return told
-    found = counts_of(stated, counts_per_turn)
-    if told is not None and not math.isclose(told, found):
+    counts = counts_of(stated, counts_per_turn)
+    if told is not None and not math.isclose(told, counts):
         raise InputError(
             f"has another unit of accelerations (0x60AA is 0x{word:08X}) than {stated}",
             where=where,
             remedy="leave [drives] acceleration_unit out, or correct it",
         )
-    return found
+    return counts
 
 
-def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: str) -> None:
+def check_rated_torque(reported: int, torque_n_m: float, unit: TorqueUnit, where: str) -> None:
     """Compare a drive's rated torque with the rated torque of the robot file; a wrong unit is distinguished from a
     wrong motor.
 
     Args:
-        found: content of 0x6076.
+        reported: content of 0x6076.
         torque_n_m: rated torque in the robot file [N m].
-        unit: unit of ``found``.
+        unit: unit of ``reported``.
         where: location for messages.
 
     Raises:
         InputError: if they differ by more than two per cent; names the unit that would make them agree.
     """
     expected = torque_n_m / _TORQUE[unit]
-    if _agree(found, expected):
+    if _agree(reported, expected):
         return
-    what = f"its rated torque is {found} {unit}, but {expected:.9g} {unit} in the robot file"
-    if found == 0:
+    what = f"its rated torque is {reported} {unit}, but {expected:.9g} {unit} in the robot file"
+    if reported == 0:
         raise InputError(what, where=where, remedy="set the motor of the drive with the vendor's own program")
-    power = 3 * round(math.log10(found / expected) / 3.0)
-    if power == 0 or not _agree(found, expected * 10.0**power):
+    power = 3 * round(math.log10(reported / expected) / 3.0)
+    if power == 0 or not _agree(reported, expected * 10.0**power):
         raise InputError(
             what,
             where=where,
             remedy="this is another motor, or rated_torque_n_m is wrong: tensions are computed from it",
         )
     times = f"{10 ** abs(power):,} times {'too large' if power > 0 else 'too small'}"
-    fitting = [name for name, size in _TORQUE.items() if _agree(found, torque_n_m / size)]
+    fitting = [name for name, size in _TORQUE.items() if _agree(reported, torque_n_m / size)]
     remedy = (
         f'state [drives] torque_unit = "{fitting[0]}" if rated_torque_n_m = {torque_n_m:.9g} N m is right for the motor'
         if fitting
@@ -156,8 +156,8 @@ def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: s
     raise InputError(f"{what}: {times}, which is another unit, not another motor", where=where, remedy=remedy)
 
 
-def _agree(found: float, expected: float) -> bool:
-    return abs(found - expected) <= 0.02 * expected + 1.0  # drives round to whole units
+def _agree(value: float, expected: float) -> bool:
+    return abs(value - expected) <= 0.02 * expected + 1.0  # drives round to whole units
 
 
 POSITION_REVERSED = 1 << 7

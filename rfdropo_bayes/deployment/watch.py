@@ -139,13 +139,13 @@ class AfterStop:
     def __init__(self, drives: Drives) -> None:
         self._to_hold = [drive for drive in drives.all if drive.state in _HOLDING]
         self._stopped: set[Drive] = set()
-        self.found: list[str] = []
+        self.events: list[str] = []
 
     def look(self) -> list[str]:
         """Events since the last call; each drive is reported once."""
         new = [line for drive in self._to_hold if (line := self._seen(drive))]
         self._to_hold = [drive for drive in self._to_hold if not any(line.startswith(drive.name) for line in new)]
-        self.found += new
+        self.events += new
         return new
 
     def _seen(self, drive: Drive) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
+from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
@@ -14,7 +15,7 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.differences import Groups
 from rfdropo_bayes.discrepancy.extension import Rules
-from rfdropo_bayes.discrepancy.forward import Forward, Lanes
+from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.measurements import Measurements, gather_measurements
 from rfdropo_bayes.mechanisms.ports import PortMap
 from rfdropo_bayes.simulators.commands import Commands

@@ -388,9 +388,9 @@ def _candidate(answer: Answer, row: ScreenRow, screen: Screen, refit: float | No
 def force_power(unit: str) -> int:
     """Power of the unit of force in a unit such as "kg", "N/m", "Pa s" or "1/Pa"; exponents of its parts do not count.
 
-    1 for masses, forces and stiffnesses, -1 for compliances. Of equations of motion in which every such parameter is
-    multiplied by one factor to that power, no motion changes: where only positions are measured and lengths commanded,
-    data say nothing of that factor (Buckingham's theorem).
+    1 for masses, forces and stiffnesses, -1 for compliances. If every such parameter is multiplied by one factor to
+    that power, no motion changes. Positions under commanded lengths therefore do not determine the factor (Buckingham's
+    theorem).
     """
     above, *below = [sum(part in FORCES for part in re.findall(r"[A-Za-z]+", side)) for side in unit.split("/")]
     return above - sum(below)

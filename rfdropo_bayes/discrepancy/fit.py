@@ -21,12 +21,13 @@ from scipy.stats import norm
 
 from rfdropo_bayes.bayes.channels import Seen
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
+from rfdropo_bayes.bayes.lanes import Fields
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
-from rfdropo_bayes.discrepancy.forward import Fields, Forward
+from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
@@ -150,8 +151,7 @@ class FitTarget:
     def evaluate(
         self, points: Float[np.ndarray, "n d"], rows: int | None = None
     ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, " n"], np.ndarray]:
-        """Whitened residuals, the logarithms of the sizes that errors are relative to, and the mask of successful
-        rollouts.
+        """Whitened residuals, the log standard deviations that whiten them, and the mask of successful rollouts.
 
         Only the first ``rows`` rows of every recording, all by default, are simulated; later rows are meaningless. Half
         the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.

@@ -70,6 +70,6 @@ def _read(path: Path) -> Arrays | None:
 
 
 def _write(path: Path, arrays: Arrays) -> None:
-    """Replace the file whole: a kill leaves all of it or nothing."""
+    """Replace the whole file: a killed process leaves the old file or the new file."""
     with whole(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)

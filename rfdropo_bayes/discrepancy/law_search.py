@@ -1,8 +1,8 @@
 """Law of an effect at a port: terms are chosen by cross-validation between recordings, and refitted.
 
-One term at a time: every feature at every port is fitted together with the base parameters, linearly, to all recordings
-but one, and predicts the recording left out. The best are refitted without linearisation. The next term is then
-searched in the residuals. Choosing several terms before the first refit admits false terms.
+Terms are added one by one. Every feature at every port is fitted linearly, together with the base parameters, to all
+recordings but one, and predicts the omitted recording. The best features are refitted without linearisation. The next
+term is then searched in the residuals. Choosing several terms before the first refit admits false terms.
 
 Ports and terms use the same noise model as candidates of the library: for a misspecified model, noise of the size of
 its residuals (see `inadequacy`), updated after each term.

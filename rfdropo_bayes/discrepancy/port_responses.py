@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import BSpline
 
+from rfdropo_bayes.bayes.lanes import STEP, Fields
 from rfdropo_bayes.discrepancy.deadline import about
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
-from rfdropo_bayes.discrepancy.forward import STEP, Fields
 from rfdropo_bayes.discrepancy.inadequacy import noise_share, rewhitened
 from rfdropo_bayes.discrepancy.port_rollouts import FeatureTable, as_sensed, signals_of
 from rfdropo_bayes.discrepancy.score import span

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
+from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
-from rfdropo_bayes.discrepancy.forward import STEP, Fields, Forward, Lanes, Points
+from rfdropo_bayes.discrepancy.forward import Forward, Points
 from rfdropo_bayes.discrepancy.journal import digest
 from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import Feature, gauges_of, motion_dictionary

@@ -10,6 +10,7 @@ configure_jax()
 
 from rfdropo_bayes.fem.balance import energies  # noqa: E402
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
+from rfdropo_bayes.fem.chambers import chamber_layout  # noqa: E402
 from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     Material,
     Prepared,
@@ -49,6 +50,7 @@ __all__ = [
     "Wall",
     "attach",
     "cable_layout",
+    "chamber_layout",
     "energies",
     "material",
     "point_positions",

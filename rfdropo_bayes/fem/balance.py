@@ -61,7 +61,7 @@ class Balance(NamedTuple):
     kinetic_energy: Float[Array, " rows"]  # [J]
     elastic_energy: Float[Array, " rows"]  # [J]
     gravitational_energy: Float[Array, " rows"]  # [J]; zero with every node at the origin
-    cable_work: Float[Array, " rows"]  # done by the cables on the body [J]
+    cable_work: Float[Array, " rows"]  # done by cables and chambers on the body [J]
     contact_work: Float[Array, " rows"]  # done on the body by touching bodies [J]
     damping_loss: Float[Array, " rows"]  # to Rayleigh damping [J]
 

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from rfdropo_bayes.fem import rod_elements
 from rfdropo_bayes.fem.cable_friction import PRESLIDING, Slip, slip_problem, slip_rows, slipped, start_slip
 from rfdropo_bayes.fem.cables import CableLayout, rest_lengths, threads
+from rfdropo_bayes.fem.chambers import Layout, inflation
 from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
@@ -42,11 +43,25 @@ LOST = 3.0
 
 
 class System(NamedTuple):
-    """Constants of all rollouts: body, cables, and number of held stations, from the first."""
+    """Constants of all rollouts: body, cables, number of held stations, from the first, and chambers.
+
+    Its drives are the displacements of the cables [m], then the pressures of the chambers [Pa].
+    """
 
     body: Rod
     cables: CableLayout
     clamped_stations: int = 1
+    chambers: Layout | None = None
+
+    @property
+    def drives(self) -> int:
+        """Number of cables and chambers."""
+        return len(self.cables.anchor) + (0 if self.chambers is None else len(self.chambers))
+
+    def split(self, drive: Float[Array, " drives"]) -> tuple[Float[Array, " cables"], Float[Array, " chambers"] | None]:
+        """Displacements of the cables [m], and pressures of the chambers [Pa]; None without chambers."""
+        cables = len(self.cables.anchor)
+        return drive[:cables], None if self.chambers is None else drive[cables:]
 
 
 class Material(NamedTuple):
@@ -94,7 +109,7 @@ class State(NamedTuple):
     memory: Memory = Memory()  # of the effects; see ``remembering``
     cube: CubeState | None = None  # that the body pushes
     touch: Float[Array, "pairs 3"] | None = None  # impulses of the stage before between the pairs that can touch [N s]
-    commanded: Float[Array, " cables"] | None = None  # displacements [m]; if a step has several stages
+    commanded: Float[Array, " drives"] | None = None  # drives; if a step has several stages
 
 
 class StepInfo(NamedTuple):
@@ -194,11 +209,11 @@ def remembering(
 ) -> State:
     """The state with the memory that effects and contacts start from: clock at zero, branches relaxed, no friction.
 
-    A memory that is there is kept. Commanded displacements that are not given are zero.
+    A memory that is there is kept. Drives that are not given are zero.
     """
     effects, memory = prepared.effects, state.memory
     if len(STAGES[integrator]) > 1 and state.commanded is None:
-        state = state._replace(commanded=jnp.zeros(len(system.cables.anchor)))
+        state = state._replace(commanded=jnp.zeros(system.drives))
     if scene is not None and state.touch is None:
         state = state._replace(touch=untouched(scene))
     if jax.tree.leaves(memory):
@@ -265,6 +280,7 @@ def stage_body(
     external: Float[Array, "stations 6"] | float = 0.0,
     stage: Stage = EULER,
     carried: Carried | None = None,
+    pressure: Float[Array, " chambers"] | None = None,
 ) -> StageBody:
     """The system that a stage linearises: the body, its effects and its surroundings at a state, with the memory of the
     stage.
@@ -301,6 +317,7 @@ def stage_body(
         added=added,
         gain=None if memory.branch is None else gain,
         branch=None if memory.branch is None else memory.branch.T,
+        blown=None if system.chambers is None or pressure is None else inflation(system.chambers, pressure),
     )
 
 
@@ -308,14 +325,14 @@ def step(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     time_step: Scalar,
     external_force: Float[Array, "stations 6"] | float = 0.0,
     scene: PushGeometry | None = None,
     cube: Cube | None = None,
     integrator: Integrator = "euler",
 ) -> tuple[State, StepInfo]:
-    """One time step to the commanded cable displacements [m] (pull > 0) at its end.
+    """One time step to the commanded cable displacements [m] (pull > 0) and pressures [Pa] at its end.
 
     ``external_force`` are forces [N] and moments [N m] on the stations throughout the step. With a ``scene`` and a
     ``cube`` the body touches them; the state has the cube's pose. A step that is not finite keeps the old positions, at
@@ -323,13 +340,13 @@ def step(
     several stages a step, the state comes from ``remembering``.
     """
     take = partial(take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
-    return in_stages(take, state, displacement, STAGES[integrator])
+    return in_stages(take, state, drive, STAGES[integrator])
 
 
 def in_stages(
-    take: Callable[[State, Float[Array, " cables"], Stage, Carried | None], tuple[State, StepInfo, Carried | None]],
+    take: Callable[[State, Float[Array, " drives"], Stage, Carried | None], tuple[State, StepInfo, Carried | None]],
     state: State,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     stages: Sequence[Stage],
 ) -> tuple[State, StepInfo]:
     """A step made of stages; commands within the step are interpolated to the commands at its end.
@@ -337,8 +354,8 @@ def in_stages(
     Several stages are one loop, compiled once: nothing is carried into the first.
     """
     if len(stages) == 1:
-        return take(state, displacement, stages[0], None)[:2]
-    start = jnp.zeros_like(displacement) if state.commanded is None else state.commanded
+        return take(state, drive, stages[0], None)[:2]
+    start = jnp.zeros_like(drive) if state.commanded is None else state.commanded
 
     def one(
         before: tuple[State, StepInfo, Carried], timed: Float[Array, "4"]
@@ -346,7 +363,7 @@ def in_stages(
         here, codes, carried = before
         elapsed, length, share, until = timed
         stage = Stage(elapsed, length, share, stages[0].predicted)
-        moved, info, done = take(here, start + until * (displacement - start), stage, carried)
+        moved, info, done = take(here, start + until * (drive - start), stage, carried)
         assert done is not None
         return (moved, StepInfo(codes.diverged | info.diverged, codes.converged & info.converged), done), None
 
@@ -354,7 +371,7 @@ def in_stages(
     times = np.concatenate([times, np.cumsum(times[:, :1], axis=0)], axis=1)
     codes = StepInfo(jnp.array(False), jnp.array(True))
     (after, codes, _), _ = lax.scan(one, (state, codes, _nothing_carried(state)), jnp.asarray(times))
-    return after._replace(commanded=displacement), codes
+    return after._replace(commanded=drive), codes
 
 
 def _nothing_carried(state: State) -> Carried:
@@ -379,6 +396,7 @@ def begin_stage(
     state: State,
     stage: Stage,
     carried: Carried | None,
+    pressure: Float[Array, " chambers"] | None,
     *,
     time_step: Scalar,
     external: Float[Array, "stations 6"] | float = 0.0,
@@ -395,7 +413,7 @@ def begin_stage(
         change = None if carried is None else carried.twist
         place = at.position, at.orientation, twist_of(at), around
         push, stage = meet(scene, cube, state.cube, state.touch, *place, stage, time_step, change)
-    body = stage_body(system, prepared, at, time_step, external, stage, carried)
+    body = stage_body(system, prepared, at, time_step, external, stage, carried, pressure)
     return StageBegun(at, push, stage, body)
 
 
@@ -403,7 +421,7 @@ def take_stage(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     stage: Stage,
     carried: Carried | None,
     *,
@@ -414,7 +432,8 @@ def take_stage(
 ) -> tuple[State, StepInfo, Carried | None]:
     """One stage of a step, see ``fem.integrators``."""
     around: dict[str, Any] = {"time_step": time_step, "external": external, "scene": scene, "cube": cube}
-    at, push, stage, body = begin_stage(system, prepared, state, stage, carried, **around)
+    displacement, pressure = system.split(drive)
+    at, push, stage, body = begin_stage(system, prepared, state, stage, carried, pressure, **around)
     length, slip = stage.span * time_step, None
     mobilised, segment = state.memory.slip, state.memory.segment
     if mobilised is not None and segment is not None:

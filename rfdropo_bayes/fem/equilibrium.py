@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem.cable_friction import PRESLIDING, Slip, slip_problem, slip_rows, slipped
 from rfdropo_bayes.fem.cables import threads
+from rfdropo_bayes.fem.chambers import thrust
 from rfdropo_bayes.fem.components import turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.derivatives import pushed_forward
@@ -50,7 +51,7 @@ class Task(NamedTuple):
 
     prepared: Prepared
     start: State  # start of the iterations; the slip of cables counts from it
-    displacement: Float[Array, " cables"]
+    drive: Float[Array, " drives"]
     external: Float[Array, "stations 6"]
     slip: Slip | None
 
@@ -82,7 +83,8 @@ def _body(system: System, task: Task, place: State) -> StageBody:
     prepared = task.prepared
     timeless = prepared._replace(effects=prepared.effects._replace(drag=None, viscoelasticity=None))
     still = place._replace(velocity=jnp.zeros_like(place.velocity), spin=jnp.zeros_like(place.spin))
-    body = stage_body(system, timeless, still, 1.0, task.external, NO_TIME)
+    pressure = system.split(task.drive)[1]
+    body = stage_body(system, timeless, still, 1.0, task.external, NO_TIME, pressure=pressure)
     none = jnp.zeros(())
     light = body._replace(mass=jnp.zeros_like(body.mass), inertia=jnp.zeros_like(body.inertia))
     return light._replace(lookahead=jnp.ones(()), behind=none, loss=none, gain=None, branch=None)
@@ -92,7 +94,7 @@ def _bonds(system: System, task: Task, place: State, previous: Float[Array, " ca
     compliance = task.prepared.effects.cable_compliance
     bonds = Bonds(
         thread=threads(system.cables),
-        reach=task.prepared.rest_length - task.displacement,
+        reach=task.prepared.rest_length - system.split(task.drive)[0],
         previous=previous,
         give=jnp.zeros(()) if compliance is None else jnp.asarray(compliance, dtype=float),
         follows=jnp.ones(()),
@@ -196,13 +198,13 @@ def settled(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     external_force: Float[Array, "stations 6"] | float = 0.0,
     iterations: int = ITERATIONS,
     bound: float = ROW_SETTLED,
 ) -> tuple[State, EquilibriumInfo]:
-    """The equilibrium that a state comes to under commanded cable displacements [m] and forces [N] and moments [N m] on
-    the stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
+    """The equilibrium that a state comes to under drives (see `System`), and forces [N] and moments [N m] on the
+    stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
     radians.
 
     Friction of the cables continues from the state's memory; viscoelastic effects have relaxed. Needs a clamped
@@ -214,11 +216,13 @@ def settled(
             system.cables, prepared.effects, memory.slip, memory.segment, state.position, state.orientation
         )
     external = jnp.broadcast_to(jnp.asarray(external_force, dtype=float), (len(state.position), 6))
-    task = Task(prepared, state._replace(memory=memory._replace(slip=None, segment=None)), displacement, external, slip)
+    task = Task(prepared, state._replace(memory=memory._replace(slip=None, segment=None)), drive, external, slip)
     found = _balanced(system, iterations, bound, task)
-    cables, unknown = len(displacement), jnp.zeros((len(state.position), 6))
+    cables, unknown = len(system.cables.anchor), jnp.zeros((len(state.position), 6))
     forces = _unbalanced(system, task, found, unknown, found.impulse)[0]
     loads = jnp.sum(jnp.abs(prepared.weight)) + jnp.sum(jnp.abs(external)) + jnp.sum(jnp.abs(found.impulse))
+    if system.chambers is not None:
+        loads = loads + thrust(system.chambers, drive[cables:])
     residual = lax.stop_gradient(jnp.max(jnp.abs(forces[:3]), initial=0.0) / jnp.maximum(loads, 1e-300))
     tension = jnp.maximum(found.impulse[:cables], 0.0)
     if slip is not None:
@@ -237,22 +241,22 @@ def settled(
 def static_equilibrium(
     system: System,
     prepared: Prepared,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     external_force: Float[Array, "stations 6"] | float = 0.0,
     iterations: int = ITERATIONS,
 ) -> tuple[State, EquilibriumInfo]:
-    """Body at rest under its weight, forces [N] and moments [N m] on the stations, and the commanded cable
-    displacements [m], from the undeformed body; see `settled`. Cables enter without friction."""
-    return settled(system, prepared, state_at_rest(system), displacement, external_force, iterations, SETTLED)
+    """Body at rest under its weight, forces [N] and moments [N m] on the stations, and drives (see `System`), from the
+    undeformed body; see `settled`. Cables enter without friction."""
+    return settled(system, prepared, state_at_rest(system), drive, external_force, iterations, SETTLED)
 
 
 def quasi_static_step(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     external_force: Float[Array, "stations 6"] | float = 0.0,
 ) -> tuple[State, StepInfo]:
     """A row of quasi-static motion, in place of ``dynamics.step``."""
-    moved, info = settled(system, prepared, state, displacement, external_force)
+    moved, info = settled(system, prepared, state, drive, external_force)
     return moved, StepInfo(info.diverged, info.converged)

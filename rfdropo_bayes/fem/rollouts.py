@@ -61,14 +61,14 @@ Recorded = tuple[Float[Array, "points 3"], Float[Array, " cables"], Float[Array,
 def roll(
     take: Callable[[Any, Any], tuple[Any, StepInfo]],
     start: Any,
-    displacement: Any,
+    drive: Any,
     points: PointMap,
     horizon: Int[Array, ""] | int | None = None,
 ) -> Rollout:
-    """Rollout of any body, from its step function to commanded cable displacements [m].
+    """Rollout of any body, from its step function to the drives at the ends of its steps.
 
     Args:
-        displacement: (rows, substeps, cables), or a tree of arrays (rows, substeps, ...) split into steps.
+        drive: (rows, substeps, drives), or a tree of arrays (rows, substeps, ...) split into steps.
         horizon: rows to compute; later rows are zero. It may be traced: one compilation serves every prefix, rows
             beyond it cost nothing, and there is no reverse mode. None computes all rows and allows reverse mode.
     """
@@ -89,14 +89,14 @@ def roll(
         return progress, recorded(progress.state)
 
     def next_row(index: Int[Array, ""], carry: tuple[_Progress, Any]) -> tuple[_Progress, Any]:
-        progress, here = row(carry[0], jax.tree.map(lambda part: part[index], displacement))
+        progress, here = row(carry[0], jax.tree.map(lambda part: part[index], drive))
         return progress, jax.tree.map(lambda rows, new: rows.at[index].set(new), carry[1], here)
 
     first = _Progress(start, StepInfo(jnp.array(False), jnp.array(True)))
     if horizon is None:
-        last, rows = lax.scan(row, first, displacement)
+        last, rows = lax.scan(row, first, drive)
     else:
-        count = jax.tree.leaves(displacement)[0].shape[0]
+        count = jax.tree.leaves(drive)[0].shape[0]
         empty = jax.tree.map(lambda part: jnp.zeros((count, *part.shape)), recorded(start))
         last, rows = lax.fori_loop(0, jnp.minimum(horizon, count), next_row, (first, empty))
     return Rollout(rows[0], rows[1], last.state, *last.info, rows[2])
@@ -106,7 +106,7 @@ def simulate(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, "rows substeps cables"],
+    drive: Float[Array, "rows substeps drives"],
     time_step: Scalar,
     points: PointMap,
     scene: PushGeometry | None = None,
@@ -115,10 +115,10 @@ def simulate(
     integrator: Integrator = "euler",
     loads: SectionLoads | None = None,
 ) -> Rollout:
-    """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
+    """Rollout from ``state`` through the drives (see `System`) of every step, recorded after every row.
 
     ``time_step`` [s] is the length of a substep. With a ``scene`` and a ``cube`` the body pushes it; ``state.cube`` is
-    its initial pose. ``horizon`` as for `roll`. If a step has several stages, ``state.commanded`` are the displacements
+    its initial pose. ``horizon`` as for `roll`. If a step has several stages, ``state.commanded`` are the drives
     before the first step, zero if None. ``loads`` act in every step.
 
     Raises:
@@ -129,19 +129,19 @@ def simulate(
         raise InputError("a cube cannot be pushed in quasi-static motion", where="[simulator] motion")
     if loads is not None:
 
-        def pushed(before: State, given: tuple[Float[Array, " cables"], Int[Array, ""]]) -> tuple[State, StepInfo]:
+        def pushed(before: State, given: tuple[Float[Array, " drives"], Int[Array, ""]]) -> tuple[State, StepInfo]:
             under, force = loaded(system, prepared, loads, given[1])
             if still:
                 return quasi_static_step(system, under, before, given[0], force)
             return step(system, under, before, given[0], time_step, force, scene, cube, integrator)
 
-        number = 1 + jnp.arange(displacement.shape[0] * displacement.shape[1]).reshape(displacement.shape[:2])
+        number = 1 + jnp.arange(drive.shape[0] * drive.shape[1]).reshape(drive.shape[:2])
         begin = remembering(system, prepared, state, scene, integrator)
-        return roll(pushed, begin, (displacement, number), points, horizon)
+        return roll(pushed, begin, (drive, number), points, horizon)
 
-    def take(before: State, commanded: Float[Array, " cables"]) -> tuple[State, StepInfo]:
+    def take(before: State, commanded: Float[Array, " drives"]) -> tuple[State, StepInfo]:
         if still:
             return quasi_static_step(system, prepared, before, commanded)
         return step(system, prepared, before, commanded, time_step, scene=scene, cube=cube, integrator=integrator)
 
-    return roll(take, remembering(system, prepared, state, scene, integrator), displacement, points, horizon)
+    return roll(take, remembering(system, prepared, state, scene, integrator), drive, points, horizon)

@@ -42,7 +42,7 @@ class _Done(NamedTuple):
 
     residual: Float[Array, "stations 6"]  # of holding and touching bodies
     held: Float[Array, ""]  # its work
-    pulled: Float[Array, ""]  # work of the cables
+    pulled: Float[Array, ""]  # work of cables and chambers
     lost: Float[Array, ""]  # to Rayleigh damping
 
 
@@ -73,36 +73,39 @@ def _done(system: System, prepared: Prepared, before: State, after: State, begun
     rates = strain_rates(line.elements, twist.T)
     viscous = jnp.sum(body.length * dot(rates, linear(line.slope, rates)))
     dragged = jnp.sum(twist.T * inertia_times(body, line.frame, twist.T))
+    pulled = jnp.sum(cable * twist)
+    if body.blown is not None:
+        pulled = pulled + length * jnp.sum(body.length * dot(body.blown, rates))
     lost = length * (body.loss * dragged + prepared.rayleigh_stiffness * viscous)
-    return _Done(residual, jnp.sum(residual * twist), jnp.sum(cable * twist), lost)
+    return _Done(residual, jnp.sum(residual * twist), pulled, lost)
 
 
 def _step(
     system: System,
     prepared: Prepared,
     before: State,
-    displacement: Float[Array, " cables"],
+    drive: Float[Array, " drives"],
     integrator: Integrator,
     around: dict[str, Any],
 ) -> tuple[State, _Reached]:
-    """One step to the commanded cable displacements [m]."""
-    start = displacement if before.commanded is None else before.commanded
+    """One step to the drives at its end."""
+    start = drive if before.commanded is None else before.commanded
     here, elapsed, carried, done = before, 0.0, None, None
     for stage in STAGES[integrator]:
         elapsed += stage.elapsed
-        begun = begin_stage(system, prepared, here, stage, carried, **around)
+        given = start + elapsed * (drive - start)
+        begun = begin_stage(system, prepared, here, stage, carried, system.split(given)[1], **around)
         if carried is not None and done is not None:
             going = begun.stage.going
             impact, velocity = going * carried.sudden, twist_of(here)
             done = jax.tree.map(lambda part, share=1.0 + going: share * part, done)
             done = done._replace(residual=done.residual - impact, held=done.held - jnp.sum(impact * velocity))
-        given = start + elapsed * (displacement - start)
         after, _, following = take_stage(system, prepared, here, given, stage, carried, **around)
         own = _done(system, prepared, here, after, begun, begun.stage.span * around["time_step"])
         done = own if done is None else jax.tree.map(jnp.add, done, own)
         here, carried = after, following
     if before.commanded is not None:
-        here = here._replace(commanded=displacement)
+        here = here._replace(commanded=drive)
     assert done is not None
     return here, _Reached(here.position, done, energies(system, prepared, here))
 
@@ -111,7 +114,7 @@ def stepped_balance(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, "steps cables"],
+    drive: Float[Array, "steps drives"],
     time_step: Scalar,
     integrator: Integrator,
     scene: PushGeometry | None = None,
@@ -120,8 +123,8 @@ def stepped_balance(
     """Forces and energies of a rollout of a rod.
 
     Args:
-        state: initial state, with the commanded displacements before the first step.
-        displacement: commanded displacement at the end of every step [m].
+        state: initial state, with the drives before the first step.
+        drive: drives at the end of every step.
         integrator: scheme of a step.
         scene, cube: bodies in contact.
 
@@ -131,10 +134,9 @@ def stepped_balance(
     check_effects(prepared.effects)
     around: dict[str, Any] = {"time_step": time_step, "scene": scene, "cube": cube}
     first = remembering(system, prepared, state, scene, integrator)
-    reached = lax.scan(lambda before, to: _step(system, prepared, before, to, integrator, around), first, displacement)[
-        1
-    ]
-    body = stage_body(system, prepared, first, time_step)
+    reached = lax.scan(lambda before, to: _step(system, prepared, before, to, integrator, around), first, drive)[1]
+    begun = jnp.zeros(system.drives) if first.commanded is None else first.commanded
+    body = stage_body(system, prepared, first, time_step, pressure=system.split(begun)[1])
     way = Way(system.clamped_stations, True, system.cables)
     right = linearised(way, body, threads(system.cables), first.tension).right
     still = -right.T / time_step - cable_wrench(system, first, first.tension)

@@ -61,6 +61,7 @@ class StageBody(NamedTuple):
     added: Matrix | None = None  # to the matrix, of translations [kg]
     gain: Scalar | None = None  # stiffness of a Prony branch, relative
     branch: Six | None = None  # strains of its dashpot
+    blown: Six | None = None  # forces and moments that chambers take from the sections [N], [N m]
 
 
 class Bonds(NamedTuple):
@@ -132,6 +133,8 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
     resultant = answer(body.section, elements.strain) + body.behind * linear(slope, rates)
     if body.branch is not None and body.gain is not None:
         resultant = resultant + body.gain * linear(body.section, elements.strain - body.branch)
+    if body.blown is not None:
+        resultant = resultant - body.blown
     if not way.predicted:
         resultant = resultant + body.span * rod_elements.held_resultant(elements, between, rates)
     momentum = inertia_times(body, frame, body.twist)

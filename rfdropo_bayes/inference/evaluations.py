@@ -127,5 +127,5 @@ def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tu
     elif spacing == "geometric":
         raw = [n_rows * 2.0 ** (k + 1 - blocks) for k in range(blocks)]
     else:
-        raise InputError(f"unknown spacing {spacing!r}", where="[inference] spacing", remedy=f"one of {SPACINGS}")
+        raise InputError(f"unknown spacing {spacing!r}", where="[inference] spacing", remedy=f"use one of {SPACINGS}")
     return tuple(sorted({max(1, math.ceil(value - 1e-9)) for value in raw}))

@@ -68,7 +68,7 @@ def method_of(config: Any) -> str:
         if isinstance(config, method.config):
             return name
     known = ", ".join(f"rb.{method.config.called}()" for method in METHODS.values())
-    raise InputError(f"{config!r} is no method", where="method", remedy=f"give one of {known}")
+    raise InputError(f"{config!r} is not a method", where="method", remedy=f"give one of {known}")
 
 
 def make_config(name: str, options: Mapping[str, Any]) -> Any:

@@ -331,6 +331,7 @@ class CoulombFriction:
     name = "coulomb_friction"
     stage = "body"
     bodies = ("rod",)
+    needs_cables = True
     cause = "cables that rub in their guides, sheaths or seals with a force that does not depend on tension"
     remedy = "pull a slack cable through the body with a spring scale; lubricate or line the guides"
     parameters = (
@@ -350,6 +351,7 @@ class CapstanFriction:
     name = "capstan_friction"
     stage = "body"
     bodies = ("rod",)
+    needs_cables = True
     cause = "friction of cables pressed against their guides as the body bends"
     remedy = "measure the tension at both ends of a cable over a known bend; lubricate or line the guides"
     parameters = (
@@ -375,6 +377,7 @@ class CableCompliance:
     name = "cable_compliance"
     stage = "body"
     bodies = ("rod",)
+    needs_cables = True
     cause = "stretch of the cables, of their anchorage and of the transmission under load"
     remedy = "hang a known weight on each cable and measure its stretch; use stiffer cable"
     parameters = (

@@ -230,7 +230,7 @@ def _check_kind(kind: Any, name: str, where: str) -> None:
         lacking.append("parameters")
     if lacking:
         raise InputError(
-            f"{name!r} is no mechanism: it lacks {', '.join(lacking)}", where=where, remedy="see docs/mechanisms.md"
+            f"{name!r} is not a mechanism: it lacks {', '.join(lacking)}", where=where, remedy="see docs/mechanisms.md"
         )
     if kind.stage in ACTS and not any(hasattr(kind, method) for method in ACTS[kind.stage]):
         raise InputError(

@@ -2,8 +2,8 @@
 
 A play of half a millimetre is much for a robot that pulls eight, and nothing for a robot that pulls eighty. So lengths
 of cable scale with the pull of usual commands, other lengths with the body's length, masses with the body's mass, and
-forces with the tension that bends the body by a usual pull, ``E I pull / (length radius^2)``. Times, angles and
-ratios stay, and so does the density of a fluid around the body.
+forces with the tension, or the thrust of a chamber, that bends the body by a usual pull, ``E I pull / (length
+radius^2)``. Times, angles and ratios stay, and so does the density of a fluid around the body.
 """
 
 from __future__ import annotations
@@ -44,9 +44,11 @@ def scales_of(robot: Robot) -> Scales:
     """Scales of a robot at nominal parameters."""
     nominal = robot.nominal()
     rigidity = nominal["young_modulus"] * float(np.mean(robot.body.bending_moment_area_m4))
-    arm = float(np.mean([np.hypot(*guides[:, :2].T).mean() for guides in robot.guides()]))
+    middles = [*robot.guides(), *(chamber.ends() for chamber in robot.chambers)]
+    arm = float(np.mean([np.hypot(*middle[:, :2].T).mean() for middle in middles]))
     if robot.held_by_force:
-        force = robot.usual_command * float(np.abs(np.asarray(robot.channel_matrix(nominal))).max())
+        areas = np.array([1.0] * len(robot.cables) + [chamber.area_m2 for chamber in robot.chambers])
+        force = robot.usual_command * float((areas @ np.abs(np.asarray(robot.channel_matrix(nominal)))).max())
         pull = force * robot.length * arm**2 / rigidity
     else:
         pull = robot.usual_command * float(np.abs(np.asarray(robot.channel_matrix(nominal))).max())

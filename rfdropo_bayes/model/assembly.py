@@ -302,7 +302,7 @@ def scoping(
         for key, table in others_of.items():
             if name in expand_groups(table, specs):
                 remedy = "keep it in one of them"
-                raise InputError(f"{name} is in [model.{key}], too", where="[model.only_in]", remedy=remedy)
+                raise InputError(f"{name} is also in [model.{key}]", where="[model.only_in]", remedy=remedy)
         asked = [given] if isinstance(given, str) else list(given)
         for group in asked:
             if group not in spec.groups:

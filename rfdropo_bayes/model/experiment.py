@@ -46,16 +46,16 @@ class LawTermTable(ExperimentTable):
     commands: list[str] = Field(default_factory=list, description="commands of the feature")
     motion: list[str] = Field(
         default_factory=list,
-        description="motion in their place, at ports of the body: tip x, tip y, tip z or tip distance, from the first "
-        "position of the last marker",
+        description="motion of the body in place of commands, at ports of the body: tip x, tip y, tip z or tip "
+        "distance, from the first position of the last marker",
     )
     shape: float | None = Field(
         default=None, gt=0.0, description="time constant [s] of a low pass or lag, or half the width of a play"
     )
     shape_parameter: str | None = Field(
         default=None,
-        description="name of a parameter in the place of shape, which is inferred; its default prior is a normal about"
-        " shape with half of it as deviation",
+        description="name of a parameter that is inferred in place of shape; its default prior is normal, "
+        "with mean shape and standard deviation shape / 2",
     )
     scale: float = Field(gt=0.0, description="scale of the coefficient's default prior, a normal about zero")
 
@@ -82,9 +82,9 @@ class ModelTable(ExperimentTable):
     )
     noise: NoiseModel = Field(
         default="auto",
-        description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed "
-        "(student-t); of all channels, the spread between repeats (repeats); the values of [noise] "
-        "(stated); see docs/likelihood.md",
+        description='noise of the positions: "auto" (white and correlated), "white", "ar1" (correlated), "student-t" '
+        '(heavy-tailed), "repeats" (the spread between repeats, for all channels), "stated" (the values of [noise]); '
+        "see docs/likelihood.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
@@ -137,7 +137,7 @@ class ModelTable(ExperimentTable):
     )
     weighed: list[WeighedTable] = Field(
         default_factory=list,
-        description="parameters, or sums of them, known from measurements of their own",
+        description="measured parameters, or measured sums of parameters",
     )
 
 
@@ -168,13 +168,13 @@ class SimulatorTable(ExperimentTable):
     )
     precision: Literal["float64", "float32"] = Field(
         default="float64",
-        description="floating-point precision of the compiled engine; stiff bodies lose their answer in float32",
+        description="floating-point precision of the compiled engine; stiff bodies need float64",
     )
     time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
     integrator: Literal["euler", "sdirk2"] | None = Field(
         default=None,
-        description='"sdirk2", of order 2 (1.6 with taut cables), takes two solves a step; its error is about a tenth '
-        'of the error of "euler", which takes one, as SOFA does; the robot\'s by default',
+        description='"sdirk2" has order 2 (1.6 with taut cables) and two solves a step; "euler", the scheme of SOFA, '
+        "has one solve and about ten times the error; the robot's by default",
     )
     refine: int = Field(default=1, ge=1, le=16, description="number of pieces of every element of the robot's rod")
     threads: int | None = Field(default=None, ge=1, description="threads of the engine; one per processor by default")
@@ -188,14 +188,14 @@ class SimulatorTable(ExperimentTable):
         for key, stated in moving.items():
             if stated:
                 remedy = 'remove it, or set motion = "dynamic"'
-                raise InputError(f'{key} beside motion = "quasi-static"', where="[simulator]", remedy=remedy)
+                raise InputError(f'motion = "quasi-static" does not allow {key}', where="[simulator]", remedy=remedy)
         return self
 
     @model_validator(mode="after")
     def _has_mesh(self) -> SimulatorTable:
         if self.body == "tetrahedra" and self.tetrahedra is None:
             raise InputError(
-                'body = "tetrahedra" without a mesh',
+                'body = "tetrahedra" needs a mesh',
                 where="[simulator]",
                 remedy="add a table [simulator.tetrahedra] with mesh, unit and clamp_height",
             )
@@ -245,9 +245,7 @@ class CommandsTable(ExperimentTable):
     sample_time: float = Field(gt=0.0, description="time between observations [s]")
     recordings: list[str] = Field(min_length=1, description="a name for each recording")
     markers: list[str] = Field(default_factory=list, description="markers that are observed; all by default")
-    blind: bool = Field(
-        default=False, description="leave the parameters out of the recordings, for data whose truth is to be guessed"
-    )
+    blind: bool = Field(default=False, description="do not store the true parameters in the recordings")
 
 
 class NoiseTable(ExperimentTable):
@@ -266,7 +264,7 @@ class AuditTable(ExperimentTable):
 
     candidates: list[str] = Field(
         default_factory=list,
-        description="mechanisms that are tried beside the registry's, e.g. mine.py:MyMechanism",
+        description="further mechanisms to try, e.g. mine.py:MyMechanism",
     )
     exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
     library: bool = Field(
@@ -282,7 +280,7 @@ class AuditTable(ExperimentTable):
         gt=0.0,
         description="distance of a marker [mm] below which a discrepancy does not matter",
     )
-    bootstraps: int = Field(default=999, ge=199, description="simulated data sets that the p-values rest on")
+    bootstraps: int = Field(default=999, ge=199, description="number of simulated data sets for the p-values")
     minutes: float = Field(
         default=30.0,
         gt=0.0,

@@ -98,7 +98,7 @@ class ModelSpec:
     def __post_init__(self) -> None:
         if not isinstance(self.robot, Robot | BlackBox):
             raise InputError(
-                f"{type(self.robot).__name__} is no robot",
+                f"{type(self.robot).__name__} is not a robot",
                 where="Model",
                 remedy="give a name, a path, a Robot or a BlackBox",
             )

@@ -21,7 +21,7 @@ def robot_rows() -> list[Row]:
         rows.append(
             {
                 "robot": name,
-                "cables": str(len(robot.cables)),
+                "drives": str(len(robot.actuators)),
                 "commands": f"{len(robot.channel_names)} in {robot.command_unit}",
                 "markers": str(len(robot.markers)),
                 "description": robot.description,
@@ -48,7 +48,8 @@ def robot_facts(robot: Robot) -> Row:
         "from the clamp",
         "starts": "undeformed" if robot.initial_state == "rest" else "in equilibrium with the command before row 0",
         "commands": f"{', '.join(robot.channel_names)} ({robot.command_unit})",
-        "cables": ", ".join(robot.cable_names),
+        **({"cables": ", ".join(robot.cable_names)} if robot.cables else {}),
+        **({"chambers": ", ".join(chamber.name for chamber in robot.chambers)} if robot.chambers else {}),
         "markers": ", ".join(f"{m.name} (z = {1e3 * m.point_m[2]:.4g} mm)" for m in robot.markers),
         "parameters": ", ".join(robot.parameters),
     }

@@ -40,7 +40,7 @@ MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
 
 class RunKind(NamedTuple):
     """Output files of a command: the first of ``results`` marks its completion; whether it can be resumed; and whether
-    several programs may share its folder, each with rows of its own.
+    several programs may share its folder, each with its own rows.
     """
 
     results: tuple[str, ...]

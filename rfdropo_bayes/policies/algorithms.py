@@ -13,7 +13,7 @@ from rfdropo_bayes.tables import nearest
 ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN")
 CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
 ACTOR_CRITIC = ("PPO", "A2C")
-"""Whose actor and critic have networks of their own and one observation: the critic may see more."""
+"""Whose actor and critic have their own networks and one observation: the critic may see more."""
 OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
 """Arguments that the training sets itself."""
 OBJECTS = ("action_noise", "replay_buffer_class", "rollout_buffer_class")
@@ -87,7 +87,7 @@ def algorithm_options(
         policy["log_std_init"] = -1.0
     own = given.get("policy_kwargs", {})
     if not isinstance(own, Mapping):
-        raise InputError("policy_kwargs is no table", where="[training.options]", remedy="give it keys and values")
+        raise InputError("policy_kwargs is not a table", where="[training.options]", remedy="give it keys and values")
     policy |= {**own, **{key: given[key] for key in short if key in given}}
     if "activation" in policy:
         policy["activation_fn"] = _activation(policy.pop("activation"))

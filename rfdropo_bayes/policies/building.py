@@ -45,8 +45,8 @@ def trunk_simulator(
     backend = Backend("numba", precision, threads)
     settled = robot.initial_state == "equilibrium"
     engine = Engine(assembly, discretisation.time_step, backend, settled, integrator=integrator or robot.integrator)
-    found = mechanisms_named(list(mechanisms), robot, folder=folder)
-    trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
+    effects = mechanisms_named(list(mechanisms), robot, folder=folder)
+    trunk = TrunkSimulator(robot, engine, assembly, discretisation, effects)
     return trunk.pushing() if push else trunk
 
 
@@ -85,7 +85,9 @@ def make_episodes(
         options: dict[str, Any] = {"precision": precision, "threads": threads, "integrator": integrator}
         simulator = trunk_simulator(described, push=chosen.push, mechanisms=mechanisms, **options)
     if randomisation is not None and parameters:
-        raise InputError("fixed parameters beside a randomisation", where=task, remedy="give one of the two")
+        raise InputError(
+            "both fixed parameters and a randomisation are given", where=task, remedy="give one of the two"
+        )
     known = set(Settings.__dataclass_fields__)
     for name in settings:
         if name not in known:

@@ -99,8 +99,8 @@ class ParametersBeside(VecEnvWrapper):
         """Take in the parameters of episodes that have begun."""
         names, mean, deviation = self.varied
         for lane in lanes:
-            found = self.venv.unwrapped.reset_infos[lane]["parameters"]
-            values = (np.array([found[name] for name in names]) - mean) / deviation
+            drawn = self.venv.unwrapped.reset_infos[lane]["parameters"]
+            values = (np.array([drawn[name] for name in names]) - mean) / deviation
             self._now[lane] = np.clip(values, -LIMIT, LIMIT)
 
 

@@ -107,7 +107,11 @@ class Episodes:
         self.simulator, self.robot = simulator, simulator.robot
         limit = settings.tension_limit
         if limit is not None and not 0.0 < limit < np.inf:
-            raise InputError(f"tension_limit = {limit:g}", where=task.name, remedy="give a positive number [N]")
+            raise InputError(
+                f"tension_limit = {limit:g} is not positive and finite",
+                where=task.name,
+                remedy="give a positive number [N]",
+            )
         if limit is not None and not simulator.cable_names:
             raise _without_tensions(self.robot.name, "name its cables, see docs/your_simulator.md, or leave it out")
         asked = (settings.actions, settings.observed, settings.period, settings.step, settings.history)
@@ -159,16 +163,16 @@ class Episodes:
             self.goal[row] = np.asarray(option.get("goal", drawn), dtype=float)
         waiting = {int(row): option.get("parameters") for row, option in zip(rows, given, strict=True)}
         for attempt in range(REDRAWS + 1):
-            found = self._begin(waiting)
-            good = np.asarray(found.status) == int(Result.OK)
-            self._take(np.array(list(waiting))[good], _rows_of(found, good))
+            observation = self._begin(waiting)
+            good = np.asarray(observation.status) == int(Result.OK)
+            self._take(np.array(list(waiting))[good], _rows_of(observation, good))
             failed = [row for row, well in zip(waiting, good, strict=True) if not well]
             if not failed:
                 self._compare_at_rest(rows)
                 return self._observe(rows)
             fixed = [row for row in failed if waiting[row] is not None]
             if fixed or attempt == REDRAWS:
-                row, code = failed[0], Result(int(np.asarray(found.status)[~good][0]))
+                row, code = failed[0], Result(int(np.asarray(observation.status)[~good][0]))
                 raise InputError(
                     f"no initial state for {_brief(self.parameters[row])} ({code.name.lower().replace('_', ' ')})",
                     where=f"{self.task.name}, lane {row}",
@@ -196,18 +200,18 @@ class Episodes:
         moved = (self.seen - self.seen_before)[:, self.shown]
         self.earlier.add(self.commands, moved.reshape(self.lanes, -1))
         self.commands = np.clip(self.commands + change, self.layout.low, self.layout.high)
-        found = self.session.act(self.commands)
-        good = (np.asarray(found.status) == int(Result.OK)) & np.isfinite(found.position).all(axis=(1, 2))
-        self.marker = np.where(good[:, None, None], found.position, self.marker)
+        observation = self.session.act(self.commands)
+        good = (np.asarray(observation.status) == int(Result.OK)) & np.isfinite(observation.position).all(axis=(1, 2))
+        self.marker = np.where(good[:, None, None], observation.position, self.marker)
         if self.pose is not None:
-            self.pose = np.where(good[:, None], np.asarray(found.object_pose), self.pose)
+            self.pose = np.where(good[:, None], np.asarray(observation.object_pose), self.pose)
         self.age += 1
         self.seen_before = self.seen
         self._look(np.arange(self.lanes))
         distance = self.distance()
         gained = np.where(good, reward(distance, self.first), FLOOR * (EPISODE - self.age + 1))
         ended = ~good if self.settings.near is None else ~good | (distance <= self.settings.near)
-        tension, limit = self._largest_tension(found, good), self.settings.tension_limit
+        tension, limit = self._largest_tension(observation, good), self.settings.tension_limit
         stopped = np.zeros(self.lanes, dtype=bool) if limit is None else good & (tension > limit)
         # Who holds still keeps the reward of the place: at the worst that was met, a stop is never worth more.
         self.worst = np.minimum(self.worst, gained)
@@ -225,13 +229,13 @@ class Episodes:
         """Parameters and goal of a lane's episode, as options of `reset` that start it again."""
         return {"parameters": dict(self.parameters[lane]), "goal": self.goal[lane].tolist()}
 
-    def _largest_tension(self, found: Observation, good: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
+    def _largest_tension(self, observation: Observation, good: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
         """Largest tension of any cable since the last action [N]; NaN if the simulator reports none, which is an error
         in ``good`` lanes under a limit.
         """
         tension = np.full(self.lanes, np.nan)
-        if found.peak is not None and self.simulator.cable_names:
-            tension = np.asarray(found.peak, dtype=float).max(axis=1)
+        if observation.peak is not None and self.simulator.cable_names:
+            tension = np.asarray(observation.peak, dtype=float).max(axis=1)
         if self.settings.tension_limit is not None and not np.isfinite(tension[good]).all():
             raise _without_tensions(self.robot.name, "let its lanes return finite Motion.peak, or leave it out")
         return tension
@@ -244,13 +248,17 @@ class Episodes:
         if self._compared or len(rows) < self.lanes:
             return
         self._compared, before = True, self.session.save()
-        found = self.session.act(self.commands)
+        observation = self.session.act(self.commands)
         self.session.restore(before)
-        good = np.asarray(found.status) == int(Result.OK)
-        least, limit = np.min(self._largest_tension(found, good)[good], initial=np.inf), self.settings.tension_limit
+        good = np.asarray(observation.status) == int(Result.OK)
+        least, limit = (
+            np.min(self._largest_tension(observation, good)[good], initial=np.inf),
+            self.settings.tension_limit,
+        )
         if limit is not None and limit < least < np.inf:
             raise InputError(
-                f"cables of {self.robot.name} pull {least:.3g} N and more without an action; {limit:g} N ends it",
+                f"cables of {self.robot.name} pull at least {least:.3g} N before any action, "
+                f"above the limit of {limit:g} N",
                 where="tension_limit",
                 remedy="raise it, or leave it out",
             )
@@ -275,15 +283,15 @@ class Episodes:
             values_of[f"cube_{'xyz'[up]}"] = resting_height(self.robot, side)
         return self.session.reset(np.array(rows), values_of)
 
-    def _take(self, rows: Int[np.ndarray, " row"], found: Observation) -> None:
+    def _take(self, rows: Int[np.ndarray, " row"], observation: Observation) -> None:
         """Set the state of lanes from an observation, at the start of an episode."""
         if not len(rows):
             return
         self.marker = self.marker.copy()
-        self.marker[rows] = found.position
+        self.marker[rows] = observation.position
         if self.pose is not None:
             self.pose = self.pose.copy()
-            self.pose[rows] = found.object_pose
+            self.pose[rows] = observation.object_pose
         self.commands[rows], self.age[rows], self.worst[rows] = 0.0, 0, FLOOR
         self.earlier.begin(rows, self.commands[rows])
         self.first[rows] = self.distance()[rows]
@@ -322,9 +330,9 @@ def pose_with_errors(
     return np.concatenate([pose[:, :3] + errors[:, :3], turn.as_quat()], axis=1)
 
 
-def _rows_of(found: Observation, chosen: Bool[np.ndarray, " row"]) -> Observation:
+def _rows_of(observation: Observation, chosen: Bool[np.ndarray, " row"]) -> Observation:
     """Some rows of an observation."""
-    parts: list[Any] = [None if part is None else np.asarray(part)[chosen] for part in found]
+    parts: list[Any] = [None if part is None else np.asarray(part)[chosen] for part in observation]
     return Observation(*parts)
 
 
@@ -338,7 +346,7 @@ def _check_options(option: Mapping[str, Any]) -> None:
         raise InputError(f"unknown option {sorted(unknown)[0]!r}", where="reset", remedy="use parameters and goal")
     goal = option.get("goal")
     if goal is not None and (np.shape(goal) != (3,) or not np.all(np.isfinite(np.asarray(goal, dtype=float)))):
-        raise InputError(f"goal = {goal!r}", where="reset", remedy="give three finite numbers in metres")
+        raise InputError(f"goal = {goal!r} is not a point", where="reset", remedy="give three finite numbers in metres")
 
 
 def _brief(values: Mapping[str, float]) -> str:

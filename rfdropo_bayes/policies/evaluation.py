@@ -187,11 +187,11 @@ def interquartile_mean(
     def middle(*parts: np.ndarray, axis: int = -1) -> np.ndarray:
         return trim_mean(np.concatenate(parts, axis=axis), 0.25, axis=axis)
 
-    found = float(middle(*distances))
-    if not np.isfinite(found):  # a quarter and more of the simulations failed
-        return found, found, found
+    mean = float(middle(*distances))
+    if not np.isfinite(mean):  # a quarter and more of the simulations failed
+        return mean, mean, mean
     if min(map(len, distances)) < 2:
-        return found, float("nan"), float("nan")
+        return mean, float("nan"), float("nan")
     # Strata are resampled apart: each argument of `bootstrap` is one.
     with np.errstate(invalid="ignore"):  # resamples of which a quarter failed have no middle
         interval = bootstrap(
@@ -203,7 +203,7 @@ def interquartile_mean(
             vectorized=True,
             rng=np.random.default_rng(seed),
         ).confidence_interval
-    return found, float(interval.low), float(interval.high)
+    return mean, float(interval.low), float(interval.high)
 
 
 def episode_table(policies: Mapping[str, Sequence[Episode]], cases: Sequence[Case]) -> pd.DataFrame:

@@ -162,7 +162,7 @@ class ExportedPolicy:
         options.intra_op_num_threads = 1  # two threads take longer over so small a network
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime raises classes of its own for each way to fail
+        except Exception as error:  # ONNX Runtime raises its own classes for each way to fail
             reason = str(error).splitlines()[0]
             raise InputError(f"cannot read the policy: {reason}", where=str(path), remedy="check the path") from None
         facts = dict(self._session.get_modelmeta().custom_metadata_map)

@@ -57,15 +57,15 @@ def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float
 
 def difference(policy: ExportedPolicy, act: Act, seen: Float[np.ndarray, "row size"]) -> str | None:
     """Difference between an exported policy and ``act``, in words; None if it does not."""
-    found, wanted = policy.act(seen), np.asarray(act(seen))
+    exported, wanted = policy.act(seen), np.asarray(act(seen))
     if policy.layout.kind == "discrete":
-        share = float(np.mean(found != wanted))
+        share = float(np.mean(exported != wanted))
         return f"in {share:.0%} of its actions" if share > TIES else None
-    apart = np.abs(found - wanted)
+    apart = np.abs(exported - wanted)
     row = np.unravel_index(np.argmax(np.where(np.isnan(apart), np.inf, apart)), apart.shape)
     if apart[row] <= TOLERANCE:
         return None
-    return f"{found[row]:.3f} for {wanted[row]:.3f} of an action from -1 to 1"
+    return f"{exported[row]:.3f} for {wanted[row]:.3f} of an action from -1 to 1"
 
 
 def check_exportable(model: Any, normalisation: Any, act: Act, layout: PolicyLayout) -> None:
@@ -119,8 +119,8 @@ def _drawn(model: Any, normalisation: Any) -> Iterator[None]:
         for parameter, data in kept:
             # He et al. (2015): with variance 2 / n of the weights neither ReLU nor tanh lets a signal die or blow up.
             gain = OUTPUT if parameter is outputs else np.sqrt(2.0)
-            spread = gain / np.sqrt(max(data.shape[-1], 1)) if data.ndim > 1 else 0.5
-            parameter.data = torch.as_tensor(rng.normal(scale=spread, size=data.shape)).to(data)
+            scale = gain / np.sqrt(max(data.shape[-1], 1)) if data.ndim > 1 else 0.5
+            parameter.data = torch.as_tensor(rng.normal(scale=scale, size=data.shape)).to(data)
         if moments is not None:
             drawn = moments.copy()
             drawn.mean = rng.normal(scale=0.3, size=drawn.mean.shape)  # m, as a robot of that length

@@ -46,10 +46,10 @@ def success_figure(policies: Mapping[str, Sequence[Episode]], thresholds: Sequen
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for colour, (name, episodes) in zip(CYCLE * len(policies), policies.items(), strict=False):
-        found = MILLIMETRES * np.sort([episode.distance for episode in episodes])
-        share = 100.0 * np.arange(1, len(found) + 1) / len(found)
-        finite = np.isfinite(found)
-        axes.step(found[finite], share[finite], where="post", color=colour, label=name)
+        distances = MILLIMETRES * np.sort([episode.distance for episode in episodes])
+        share = 100.0 * np.arange(1, len(distances) + 1) / len(distances)
+        finite = np.isfinite(distances)
+        axes.step(distances[finite], share[finite], where="post", color=colour, label=name)
     for threshold in thresholds:
         axes.axvline(MILLIMETRES * threshold, color="0.7", linewidth=0.8, zorder=0)
     axes.set(xscale="log", xlabel="final distance to the goal [mm]", ylabel="episodes within it [%]", ylim=(0, 101))

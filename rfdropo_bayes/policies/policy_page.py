@@ -141,28 +141,28 @@ def render_policy(summary: Mapping[str, Any], played: Played, title: str, config
 
 def next_steps(summary: Mapping[str, Any], played: Played) -> list[str]:
     """Recommended next steps, each a sentence with its reason."""
-    found = []
+    steps = []
     medians = [np.inf if row["distance_median"] is None else row["distance_median"] for row in summary["curve"]]
     before = medians[(2 * len(medians)) // 3 - 1] if len(medians) > 2 else np.inf
     if medians[-1] < RISING * before < np.inf:
         ratio = f"{1e3 * before:.1f} to {1e3 * medians[-1]:.1f} mm"
-        found.append(f"The median distance fell from {ratio} in the last third of the training: raise training.steps.")
+        steps.append(f"The median distance fell from {ratio} in the last third of the training: raise training.steps.")
     if played.stopped:
         words = f"{played.stopped} of {len(played.episodes)} episodes were stopped by the limit on tension"
-        found.append(f"{words}: train longer, or raise training.tension_limit if the motors allow more.")
+        steps.append(f"{words}: train longer, or raise training.tension_limit if the motors allow more.")
     if played.failed:
         words = f"{played.failed} of {len(played.episodes)} simulations failed"
-        found.append(f"{words}: see for which parameters below, and shorten simulator.time_step or narrow their range.")
+        steps.append(f"{words}: see for which parameters below, and shorten simulator.time_step or narrow their range.")
     finite = np.isfinite(played.distances)
     for name, values in played.varied.items():
         rank = spearmanr(values[finite], played.distances[finite]) if finite.sum() > 2 else None
         if rank is not None and rank.pvalue * len(played.varied) < SIGNIFICANT and abs(rank.statistic) > STRONG:
             side = "large" if rank.statistic > 0.0 else "small"
-            found.append(
+            steps.append(
                 f"Episodes end farther from the goal when {name} is {side} (rank correlation "
                 f"{rank.statistic:.2f}): train longer, or record motions that determine it better."
             )
-    found.append(
+    steps.append(
         "It has seen a simulator only: play it on another model with rfdropo evaluate, then on simulated drives."
     )
-    return found
+    return steps

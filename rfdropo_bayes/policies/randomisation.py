@@ -82,7 +82,11 @@ class Uniform:
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges.items():
             if not low <= high:
-                raise InputError(f"{name} from {low:g} to {high:g}", where="ranges", remedy="give the lower end first")
+                raise InputError(
+                    f"the range of {name} begins at {low:g} and ends at {high:g}",
+                    where="ranges",
+                    remedy="give the lower end first",
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -118,12 +122,12 @@ class Phi:
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
         """Independent draws."""
-        found = {}
+        values = {}
         for name, normal in self.normals.items():
             mean, std = normal["mean"], max(normal["std"], 1e-300)
             low, high = (normal["low"] - mean) / std, (normal["high"] - mean) / std
-            found[name] = float(truncnorm.rvs(low, high, loc=mean, scale=std, random_state=rng))
-        return found
+            values[name] = float(truncnorm.rvs(low, high, loc=mean, scale=std, random_state=rng))
+        return values
 
 
 @dataclass(frozen=True)
@@ -170,10 +174,10 @@ class Days:
         """One row, and a day's deviations from it: normal, of the row's own spread; sums end at the hard bounds, as in
         fits and predictions."""
         index = int(rng.integers(len(self.draws.rows)))
-        found = dict(zip(self.names, map(float, self.draws.rows[index]), strict=True))
+        values = dict(zip(self.names, map(float, self.draws.rows[index]), strict=True))
         for name, column in self.spreads.items():
-            found[name] = float(np.clip(rng.normal(found[name], float(column[index])), *self.ends[name]))
-        return found
+            values[name] = float(np.clip(rng.normal(values[name], float(column[index])), *self.ends[name]))
+        return values
 
 
 @dataclass(frozen=True)
@@ -253,8 +257,8 @@ def spread_out(randomisation: Randomisation, width: float, specs: Sequence[Param
         InputError: ranges or one point, whose width is given by the user.
     """
     if isinstance(randomisation, Layers):
-        *held, last = randomisation.parts
-        return replace(randomisation, parts=(*held, spread_out(last, width, specs)))
+        *before, last = randomisation.parts
+        return replace(randomisation, parts=(*before, spread_out(last, width, specs)))
     known = {spec.name: spec for spec in specs}
     if isinstance(randomisation, Days):
         spreads = {name: width * column for name, column in randomisation.spreads.items()}
@@ -265,7 +269,7 @@ def spread_out(randomisation: Randomisation, width: float, specs: Sequence[Param
         normals = {name: {**normal, "std": width * normal["std"]} for name, normal in randomisation.normals.items()}
         return replace(randomisation, normals=normals)
     raise InputError(
-        f"width = {width:g} beside a randomisation that is no posterior",
+        f"width = {width:g} applies only to a posterior and to phi",
         where="[training]",
         remedy='leave width out, or set randomisation = "posterior" or "phi"',
     )
@@ -336,18 +340,18 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
     path = Path(path)
     file = path / PHI if path.is_dir() else path
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        summary = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InputError("cannot read the summary of a run", where=str(file), remedy="name a run folder") from None
-    if not found.get("phi"):
+    if not summary.get("phi"):
         raise InputError(
-            f"the method {found.get('method')!r} has no phi",
+            f"the method {summary.get('method')!r} has no phi",
             where=str(file),
             remedy='calibrate with method = "rfdropo", or randomise over the posterior',
         )
     known = {spec.name for spec in specs}
-    _require_mechanisms([name for name in found["phi"] if name not in known], robot, str(file))
-    shared = {name: normal for name, normal in found["phi"].items() if name in known}
+    _require_mechanisms([name for name in summary["phi"] if name not in known], robot, str(file))
+    shared = {name: normal for name, normal in summary["phi"].items() if name in known}
     if not shared:
         raise InputError("phi shares no parameter with the simulator", where=str(file), remedy="use one of this robot")
     return Phi(shared)

@@ -239,10 +239,10 @@ def parts_seen(
     """Pieces of an observation that a layout may ask for, from the measurements now and one action ago."""
     seen, moved = marker[:, shown], (marker - before)[:, shown]
     lanes = len(goal)
-    found = {
+    parts = {
         "markers": seen.reshape(lanes, -1),
         "goal": goal,
         "commands": commands,
         "moved": moved.reshape(lanes, -1),
     }
-    return found if pose is None else {**found, "object": pose}
+    return parts if pose is None else {**parts, "object": pose}

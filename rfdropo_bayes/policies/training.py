@@ -137,7 +137,7 @@ def _plain(table: TrainingTable) -> dict[str, Any]:
         return table.model_dump(mode="json")
     except PydanticSerializationError as error:
         raise InputError(
-            f"a value that no file can hold: {error}",
+            f"a value cannot be stored in a file: {error}",
             where="[training.options]",
             remedy='use numbers, words, lists and tables, such as activation = "relu"',
         ) from None
@@ -158,8 +158,8 @@ def _begin(
 
     tensorboard = str(Path(out) / "tensorboard")
     if state is None:
-        spread = LEAST_SPREAD**2  # added to variances
-        normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=spread) if table.normalise else None
+        variance = LEAST_SPREAD**2  # added to variances
+        normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=variance) if table.normalise else None
         ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
         around = _learnt_in(normalisation or venv, table)
         policy, options = _policy_class(around, table, options)
@@ -232,12 +232,12 @@ def _leg(
     model.set_env(model.get_env(), force_reset=True)
     venv.set_attr("log", log)
     count = _failures(table.steps)
-    left = table.steps - model.num_timesteps
+    remaining = table.steps - model.num_timesteps
     if table.anneal:
         # Stable-Baselines3's own schedules count from the start of a leg.
-        rate = model.learning_rate * left / table.steps
+        rate = model.learning_rate * remaining / table.steps
         model.lr_schedule = lambda _: rate
-    steps = min(table.evaluate_every, left)
+    steps = min(table.evaluate_every, remaining)
     model.learn(steps, callback=count, reset_num_timesteps=False, tb_log_name="run", log_interval=1)
     venv.set_attr("log", None)
     policy = Trained(model, normalisation, [], 0, 0.0)
@@ -287,8 +287,8 @@ def _failures(steps: int) -> Any:
 def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
     distance = np.array([episode.distance for episode in episodes])
     # NumPy returns NaN for a quantile with an infinite neighbour of zero weight.
-    found = np.quantile(np.where(np.isfinite(distance), distance, NO_END), [0.05, 0.5, 0.95])
-    low, middle, high = np.where(found > 1e-100 * NO_END, np.inf, found)
+    quantiles = np.quantile(np.where(np.isfinite(distance), distance, NO_END), [0.05, 0.5, 0.95])
+    low, middle, high = np.where(quantiles > 1e-100 * NO_END, np.inf, quantiles)
     pull = peak_tension(episodes)
     return {
         "reward": float(np.mean([episode.total for episode in episodes])),

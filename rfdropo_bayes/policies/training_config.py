@@ -44,9 +44,10 @@ class TrainingTable(BaseModel):
         gt=0.0,
         description="an episode fails and ends once any cable pulls more [N], as drives then stop; none by default",
     )
-    algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
+    algorithm: str = Field(default="PPO", description="name of an algorithm of Stable-Baselines3")
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"
+        default_factory=dict,
+        description="options of the algorithm, under their names in Stable-Baselines3, with net_arch",
     )
     critic: Literal["observation", "parameters"] = Field(
         default="observation",
@@ -93,8 +94,8 @@ class TrainingTable(BaseModel):
     evaluate_every: int = Field(
         default=100_000,
         ge=1,
-        description="environment steps between evaluations, of which the best has the policy that is kept; a run that "
-        "was killed goes on from the last",
+        description="environment steps between evaluations; the policy of the best evaluation is kept, and an "
+        "interrupted run resumes from the last",
     )
     evaluation_episodes: int = Field(default=64, ge=1, description="episodes of an evaluation during training")
 

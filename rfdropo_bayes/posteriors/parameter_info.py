@@ -19,7 +19,7 @@ class Scope:
     Attributes:
         owner: the recording or group of recordings that has it; empty if all recordings share it.
         group: whether the owner is a group, whose further recordings have it as well.
-        added_to: the parameter that it is added to; empty if it is a value of its own.
+        added_to: the parameter that it is added to; empty if it is not added to another parameter.
         scaled_by: the parameter that is its standard deviation, instead of its prior's; empty if there is none.
         spread: whether it is the standard deviation of others, between groups.
     """

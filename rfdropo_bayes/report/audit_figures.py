@@ -128,28 +128,28 @@ class Shown:
 
 def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:
     """Abscissae of the residual plots, by name: a label and a value for each row."""
-    held = _strongest(residuals.command, residuals.main)
+    strongest = _strongest(residuals.command, residuals.main)
     turned = _strongest(residuals.rate, residuals.main)
     channel, unit = residuals.channels[turned], residuals.unit
-    found = {
+    abscissae = {
         "time": ("time [s]", residuals.time),
-        "command": (f"command {residuals.channels[held]} [{unit}]", residuals.command[:, held]),
+        "command": (f"command {residuals.channels[strongest]} [{unit}]", residuals.command[:, strongest]),
         "rate": (f"rate of {channel} [{unit}/s]", residuals.rate[:, turned]),
         SIGN: (f"sign of the rate of {channel} [-]", np.sign(residuals.rate[:, turned])),
         "position": ("position along the pattern [mm]", MILLIMETRES * residuals.position),
     }
     if residuals.cables:  # a black box may have none
         cable = _strongest(residuals.tension, residuals.main)
-        found["tension"] = (f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable])
-    return found
+        abscissae["tension"] = (f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable])
+    return abscissae
 
 
 def draw_residual(axes: Axes, residuals: Residuals, against: str) -> None:
     """Draw the residual's dominant pattern against one of `causes`, with its mean in bins and two standard errors."""
     label, values = causes(residuals)[against]
     main, signs = MILLIMETRES * residuals.main, against == SIGN
-    spread = 0.12 * np.random.default_rng(0).standard_normal(len(values)) if signs else 0.0
-    axes.scatter(values + spread, main, s=4, color=style.PRIOR, alpha=0.4, linewidths=0)
+    jitter = 0.12 * np.random.default_rng(0).standard_normal(len(values)) if signs else 0.0
+    axes.scatter(values + jitter, main, s=4, color=style.PRIOR, alpha=0.4, linewidths=0)
     centre, mean, error = _binned(values, main, 3 if signs else BINS)
     axes.errorbar(centre, mean, 2 * error, color=style.POSTERIOR, marker="o", markersize=3, capsize=2)
     axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)

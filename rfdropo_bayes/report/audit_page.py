@@ -60,9 +60,9 @@ def residuals_of(answer: Answer) -> figures.Residuals:
     shown = forward.observe_one(answer.base.x)
     position = shown["position"].reshape(*shown["position"].shape[:2], -1)
     valid = measured.valid[..., : measured.markers]
-    left = np.where(valid, target.errors(answer.base.x)[..., : measured.markers], 0.0)
+    residual = np.where(valid, target.errors(answer.base.x)[..., : measured.markers], 0.0)
     rows = valid.any(axis=2)
-    flat = left[rows]
+    flat = residual[rows]
     values, vectors = np.linalg.eigh(flat.T @ flat)
     pattern = vectors[:, -1]
     times = np.asarray(measured.time)
@@ -92,17 +92,17 @@ def shown(answer: Answer) -> figures.Shown:
     step = float(np.median(np.diff(answer.target.measurements.time[0])))
     probed = [row for row in answer.causes.screens[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
-    unseen, found, tracks = None, answer.validation, list[Track]()
-    if found.predictions is not None and found.unseen is not None and found.gain is not None:
-        recordings, (base, extended) = found.unseen, map(found.unseen.predicted, found.predictions)
+    unseen, validation, tracks = None, answer.validation, list[Track]()
+    if validation.predictions is not None and validation.unseen is not None and validation.gain is not None:
+        recordings, (base, extended) = validation.unseen, map(validation.unseen.predicted, validation.predictions)
         valid = recordings.valid[..., : recordings.markers]
-        worst = int(np.argmax([each.rmse_base for each in found.gain.differences.values()]))
+        worst = int(np.argmax([each.rmse_base for each in validation.gain.differences.values()]))
         seen = valid[worst].any(axis=1)
         measured = np.where(valid, recordings.position, np.nan)
         series = {"measured": measured, "base model": base, "extended model": extended}
         unseen = (step * np.flatnonzero(seen), {name: path[worst, seen, -3:] for name, path in series.items()})
         names = answer.problem.model.recordings.markers  # markers that all recordings have
-        for index in np.argsort([-each.rmse_base for each in found.gain.differences.values()]):
+        for index in np.argsort([-each.rmse_base for each in validation.gain.differences.values()]):
             rows = slice(0, int(np.flatnonzero(valid[index].any(axis=1))[-1]) + 1)
             moved = {name: path[index, rows].reshape(-1, len(names), 3) for name, path in series.items()}
             time = step * np.arange(len(moved["measured"]))
@@ -145,8 +145,11 @@ def _alike(first: ScreenRow, second: ScreenRow) -> float:
 def _effect(answer: Answer, screen: Screen, members: Sequence[ScreenRow]) -> figures.ClassEffect:
     """The linear effect of the leading member of a class at the size that explains most."""
     assert members[0].probe is not None
-    measured, basis, left = answer.target.measurements, members[0].probe.mark.basis, screen.fit.residual
-    both = [measured.series(each)[..., : measured.markers] ** 2 for each in (left, left - basis @ (basis.T @ left))]
+    measured, basis, residual = answer.target.measurements, members[0].probe.mark.basis, screen.fit.residual
+    both = [
+        measured.series(each)[..., : measured.markers] ** 2
+        for each in (residual, residual - basis @ (basis.T @ residual))
+    ]
     valid = measured.valid[..., : measured.markers]
     rows, each = valid.any(axis=2), valid.reshape(*valid.shape[:2], -1, 3)
     counts = np.maximum(valid.sum(axis=2), 1)
@@ -154,8 +157,8 @@ def _effect(answer: Answer, screen: Screen, members: Sequence[ScreenRow]) -> fig
     def pairs(names: Sequence[str], axis: int) -> dict[str, tuple[float, float]]:
         others = tuple(k for k in range(4) if k != axis)
         count = np.maximum(each.sum(axis=others), 1)
-        found = [np.where(each, square.reshape(each.shape), 0.0).sum(axis=others) / count for square in both]
-        return {name: (float(b), float(a)) for name, b, a in zip(names, *found, strict=True)}
+        means = [np.where(each, square.reshape(each.shape), 0.0).sum(axis=others) / count for square in both]
+        return {name: (float(b), float(a)) for name, b, a in zip(names, *means, strict=True)}
 
     before, after = ((np.where(valid, square, 0.0).sum(axis=2) / counts)[rows] for square in both)
     names = tuple(row.name for row in members)

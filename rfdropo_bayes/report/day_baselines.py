@@ -65,7 +65,7 @@ def copied(
     alike = [path for path in earlier if same_opening(own, openings.get(path.name, {}))]
     if not alike:
         raise InputError("no fitted recording has its commands", where=recording.name)
-    found = np.zeros(recording.position.shape)
+    mean = np.zeros(recording.position.shape)
     for column, marker in enumerate(recording.marker_names):
         seen = [p for p in alike if marker in p.marker_names and p.mask[:, p.marker_names.index(marker)].any()]
         if not seen:
@@ -74,9 +74,9 @@ def copied(
             index = path.marker_names.index(marker)
             usable = path.mask[:, index]
             time, position = path.time[usable], path.position[usable, index]
-            found[:, column] += np.stack([np.interp(recording.time, time, axis) for axis in position.T], axis=-1)
-        found[:, column] /= len(seen)
-    return found
+            mean[:, column] += np.stack([np.interp(recording.time, time, axis) for axis in position.T], axis=-1)
+        mean[:, column] /= len(seen)
+    return mean
 
 
 def scaled_copy(
@@ -85,14 +85,14 @@ def scaled_copy(
     """`copied`, with a scale and a shift of each marker by least squares on the known part of the day."""
 
     def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-        copy, found = copied(shown, earlier, openings), copied(recording, earlier, openings)
-        for marker in range(found.shape[1]):
+        copy, scaled = copied(shown, earlier, openings), copied(recording, earlier, openings)
+        for marker in range(scaled.shape[1]):
             rows = shown.position_mask[:, marker]
             there, here = copy[rows, marker], shown.position[rows, marker]
             middle, about = there.mean(axis=0), here.mean(axis=0)
             power = float(np.sum((there - middle) ** 2))
             scale = float(np.sum((there - middle) * (here - about))) / power if power > 0.0 else 1.0
-            found[:, marker] = about + scale * (found[:, marker] - middle)
-        return found
+            scaled[:, marker] = about + scale * (scaled[:, marker] - middle)
+        return scaled
 
     return predict

@@ -91,8 +91,10 @@ def _train(
     fit: Sequence[Trajectory], fold: Int[np.ndarray, " row"], lags: Float[np.ndarray, " lag"], degree: int
 ) -> FirRegression:
     features = np.concatenate([_features(t, lags, degree) for t in fit])
-    centre, spread = features.mean(axis=0), features.std(axis=0)
-    scale = np.where(spread > 1e-12 * np.maximum(np.abs(centre), 1e-12), spread, np.inf)  # constants weigh nothing
+    centre, deviation = features.mean(axis=0), features.std(axis=0)
+    scale = np.where(
+        deviation > 1e-12 * np.maximum(np.abs(centre), 1e-12), deviation, np.inf
+    )  # constants weigh nothing
     standard = (features - centre) / scale
     position = np.concatenate([t.position for t in fit])
     mask = np.concatenate([t.position_mask for t in fit])
@@ -100,15 +102,15 @@ def _train(
     squares, total = np.zeros(len(PENALTIES)), 0
     for usable, markers in alike:  # one factorisation serves all markers that are usable in the same rows
         for number in np.unique(fold):
-            held, used = usable & (fold == number), usable & (fold != number)
-            if held.any() and used.any():
+            tested, used = usable & (fold == number), usable & (fold != number)
+            if tested.any() and used.any():
                 offset, weights = _ridge(standard[used], position[used][:, markers], PENALTIES)
-                predicted = offset[:, None] + (standard[held] @ weights.reshape(*weights.shape[:2], -1)).reshape(
+                predicted = offset[:, None] + (standard[tested] @ weights.reshape(*weights.shape[:2], -1)).reshape(
                     len(PENALTIES), -1, len(markers), 3
                 )
-                residual = position[held][:, markers] - predicted
+                residual = position[tested][:, markers] - predicted
                 squares += (residual**2).sum(axis=(1, 2, 3))
-                total += int(held.sum()) * len(markers)
+                total += int(tested.sum()) * len(markers)
     best = int(np.argmin(squares))
     offset, weights = np.zeros(position.shape[1:]), np.zeros((position.shape[1], standard.shape[1], 3))
     for usable, markers in alike:

@@ -96,12 +96,12 @@ def _objects(summary: Mapping[str, Any]) -> str:
     scores = list((summary.get("objects") or {}).values())
     if not scores:
         return ""
-    own, held = (sum(s[key] for s in scores) / len(scores) for key in ("energy_score_mm", "held_mm"))
+    own, constant = (sum(s[key] for s in scores) / len(scores) for key in ("energy_score_mm", "held_mm"))
     repeats = [s["repeats_mm"] for s in scores if s["repeats_mm"] is not None]
     against = f", {sum(repeats) / len(repeats):.3g} mm for who has seen its other repeats" if repeats else ""
     return (
         f"The final position of the object has an energy score of {own:.3g} mm in test recordings, the mean of "
-        f"{len(scores)}; {held:.3g} mm for who says that it stays{against}."
+        f"{len(scores)}; {constant:.3g} mm for who says that it stays{against}."
     )
 
 

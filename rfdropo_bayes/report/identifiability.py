@@ -70,9 +70,9 @@ def identify(record: PosteriorRecord, *, names: list[str] | None = None) -> list
     scaled = [info.name for info in varying if _has_scale(record, info)]
     logs = {n: np.log(record.flat(n)) for n in scaled}
     prior = {n: np.log(record.prior[n]) for n in scaled if n in record.prior}
-    found = [combination for group in _groups(logs) for combination in _eigen_combinations(group, logs, prior)]
-    found += [_alone(record, info) for info in varying if info.name not in scaled]
-    return sorted(found, key=lambda c: c.sd if c.contraction is None else c.contraction)
+    combinations = [combination for group in _groups(logs) for combination in _eigen_combinations(group, logs, prior)]
+    combinations += [_alone(record, info) for info in varying if info.name not in scaled]
+    return sorted(combinations, key=lambda c: c.sd if c.contraction is None else c.contraction)
 
 
 def _has_scale(record: PosteriorRecord, info: ParameterInfo) -> bool:

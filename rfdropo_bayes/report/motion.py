@@ -122,10 +122,10 @@ def save_vtk(motion: DrawnMotion, folder: Path) -> list[Path]:
 
 
 def _surfaces(motion: DrawnMotion, row: int) -> list[tuple[str, Float[np.ndarray, "points 3"], np.ndarray]]:
-    found = [("trunk", tube(motion.centre[row], motion.radius).reshape(-1, 3), tube_faces(len(motion.radius)))]
+    surfaces = [("trunk", tube(motion.centre[row], motion.radius).reshape(-1, 3), tube_faces(len(motion.radius)))]
     if motion.cube is not None:
-        found.append(("cube", motion.cube[row], CUBE_FACES))
-    return found
+        surfaces.append(("cube", motion.cube[row], CUBE_FACES))
+    return surfaces
 
 
 def save_frames(motion: DrawnMotion, folder: Path, frames_per_second: int) -> list[Path]:

@@ -46,7 +46,7 @@ def energy_score(draws: Float[np.ndarray, "n d"], outcome: Float[np.ndarray, " d
         InputError: fewer than two draws.
     """
     if len(draws) < 2:
-        raise InputError("one draw is no distribution", where="energy score", remedy="give two or more")
+        raise InputError("a single draw is not a distribution", where="energy score", remedy="give two or more")
     return float(np.mean(cdist(draws, outcome[None])) - 0.5 * np.mean(pdist(draws)))
 
 
@@ -68,15 +68,15 @@ def score_objects(
         for index in group:
             repeats[seen[index].name] = MILLIMETRES * float(np.mean(alone)) if alone else None
     start = {t.name: np.asarray(t.object_pose)[0, :3] for t in seen}
-    found = {}
+    object_scores = {}
     for prediction in predictions:
         if prediction.object_pose is None or prediction.name not in ended:
             continue
         draws, outcome = final_position(prediction.object_pose), ended[prediction.name]
-        found[prediction.name] = ObjectScore(
+        object_scores[prediction.name] = ObjectScore(
             MILLIMETRES * energy_score(draws, outcome),
             MILLIMETRES * float(np.linalg.norm(draws.mean(axis=0) - outcome)),
             repeats[prediction.name],
             MILLIMETRES * float(np.linalg.norm(start[prediction.name] - outcome)),
         )
-    return found
+    return object_scores

@@ -48,8 +48,8 @@ class _Scale:
         self.label = style.label_with_unit(info.name, unit)
         self.log = info.logarithmic and bool(np.all(values > 0))
         low, high = self.forward(np.quantile(values, [0.002, 0.998]))
-        spread = (high - low) or abs(high) or 1.0
-        limits = self.backward(np.array([low - margin * spread, high + margin * spread]))
+        width = (high - low) or abs(high) or 1.0
+        limits = self.backward(np.array([low - margin * width, high + margin * width]))
         self.limits = np.clip(limits, info.low / self.factor, info.high / self.factor)
 
     def forward(self, values: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ class Safety:
         return asdict(self)
 
 
-def judge(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
+def rate_safety(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
     """Rate a posterior by the numbers of its summary (without its key "randomisation")."""
     against = [*_bands(summary), *_against_baselines(summary), *_sampling(summary), *_conflicts(record)]
     slight = [*_systematic(summary), *_reservations(summary)]
@@ -62,25 +62,25 @@ def judge(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
 
 def _bands(summary: Mapping[str, Any]) -> list[str]:
     """Bands that are too narrow, over all or at a marker; residuals that the noise model takes for independent."""
-    found = []
+    reasons = []
     share = summary["coverage"].get(BAND)
     if share is not None and share < OVERCONFIDENT:
-        found.append(f"its 90 % bands hold only {100 * share:.0f} % of the measurements, so it is over-confident")
+        reasons.append(f"its 90 % bands hold only {100 * share:.0f} % of the measurements, so it is over-confident")
     role = _role(summary)
     rows = summary["coverage_by_role"][role]
     shares = {marker: row.get(BAND) for marker, row in rows.items()}
     narrow = {marker: share for marker, share in shares.items() if share is not None and share < OVERCONFIDENT}
     if narrow:
         places = ", ".join(f"{100 * share:.0f} % at {_place(marker, shares)}" for marker, share in narrow.items())
-        found.append(f"its 90 % bands of the {role} recordings hold only {places}")
+        reasons.append(f"its 90 % bands of the {role} recordings hold only {places}")
     checks = summary["residuals"]
     correlated = {name: row for name, row in checks.items() if row["correlated"]}
     if correlated:
         worst = max(row["narrowing"] for row in correlated.values())
-        found.append(
+        reasons.append(
             f"its noise model leaves residuals correlated, and intervals too narrow by up to {worst:.2g} times"
         )
-    return found
+    return reasons
 
 
 def _against_baselines(summary: Mapping[str, Any]) -> list[str]:
@@ -103,24 +103,24 @@ def _place(marker: str, markers: Mapping[str, Any]) -> str:
 
 def _systematic(summary: Mapping[str, Any]) -> list[str]:
     """Errors that no noise explains: beside the noise floor and the best baseline, and from row to row."""
-    found, role = [], _role(summary)
+    reasons, role = [], _role(summary)
     errors = {marker: error for marker, error in summary["rmse"][role].items() if error}
     floor = summary["noise_floor_mm"] or {}
     above = {m: error for m, error in errors.items() if floor.get(m) and HALF * error**2 > floor[m] ** 2}
     if above:
         worst = max(above, key=lambda marker: above[marker] / floor[marker])
-        found.append(
+        reasons.append(
             f"the simulator is off by {above[worst]:.3g} mm at {_place(worst, errors)}, where repeats differ by "
             f"{floor[worst]:.3g} mm: most of the error is the simulator's"
         )
     lasting = {m: r for m, r in summary["error_correlation"][role].items() if r is not None and r > HALF}
     if lasting:
         places = ", ".join(f"{r:.2f} at {_place(m, summary['error_correlation'][role])}" for m, r in lasting.items())
-        found.append(
+        reasons.append(
             f"errors of the {role} recordings last from row to row (correlation {places}): something systematic is "
             "missing from the simulator, and randomising its parameters does not put it there"
         )
-    return [*found, *_near_baselines(summary, errors)] if role == "test" else found
+    return [*reasons, *_near_baselines(summary, errors)] if role == "test" else reasons
 
 
 def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> list[str]:
@@ -139,20 +139,20 @@ def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> 
 
 def _sampling(summary: Mapping[str, Any]) -> list[str]:
     """A sampler that did not arrive."""
-    found = []
+    reasons = []
     rows = {name: row for name, row in summary["parameters"].items() if not row.get("derived")}
     few = [name for name, row in rows.items() if (row.get("ess_bulk") or np.inf) < FEW_DRAWS]
     if few and summary["method"] not in CHOSEN:
         named = ", ".join(few[:NAMED]) + (f" and {len(few) - NAMED} more" if len(few) > NAMED else "")
-        found.append(f"fewer than {FEW_DRAWS} effective draws of {named}")
+        reasons.append(f"fewer than {FEW_DRAWS} effective draws of {named}")
     apart = [name for name, row in rows.items() if (row.get("r_hat") or 1.0) > UNMIXED]
     if apart:
-        found.append(f"independent runs disagree about {', '.join(apart)}")
-    found += [caution.sentence for caution in grave(read_cautions(summary["cautions"]))]
+        reasons.append(f"independent runs disagree about {', '.join(apart)}")
+    reasons += [caution.sentence for caution in grave(read_cautions(summary["cautions"]))]
     total = sum(summary["excluded"].values())
     if summary["evaluations"] and total > LOST * summary["evaluations"]:
-        found.append(f"{100 * total / summary['evaluations']:.0f} % of the rollouts failed")
-    return found
+        reasons.append(f"{100 * total / summary['evaluations']:.0f} % of the rollouts failed")
+    return reasons
 
 
 def _conflicts(record: PosteriorRecord) -> list[str]:
@@ -163,19 +163,19 @@ def _conflicts(record: PosteriorRecord) -> list[str]:
 
 
 def _reservations(summary: Mapping[str, Any]) -> list[str]:
-    found = []
+    reasons = []
     edge = [name for name, row in summary["parameters"].items() if row["at_bound"]]
     if edge:
-        found.append(
+        reasons.append(
             f"{', '.join(edge)} {'sits' if len(edge) == 1 else 'sit'} on a hard bound or at an end of the prior, "
             "which decided and not the data"
         )
     share = summary["coverage"].get(BAND)
     if share is not None and share > VAGUE:
-        found.append(f"its 90 % bands hold {100 * share:.0f} % of the measurements: wider than need be")
+        reasons.append(f"its 90 % bands hold {100 * share:.0f} % of the measurements: wider than need be")
     if not summary["rmse"]["test"]:
-        found.append("no recording was kept back to test it on")
-    return found
+        reasons.append("no recording was kept back to test it on")
+    return reasons
 
 
 def _advice(summary: Mapping[str, Any]) -> list[str]:

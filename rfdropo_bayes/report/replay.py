@@ -43,14 +43,14 @@ class Track:
 
 def tracks_of(recordings: Sequence[RecordingPrediction]) -> list[Track]:
     """Recordings of a calibration: measured, and simulated before the fit (if kept) and after it."""
-    found = []
+    tracks = []
     for recording in sorted(recordings, key=lambda r: r.split != "test")[:MOST_RECORDINGS]:
         series = {"measured": np.where(recording.mask[..., None], recording.observed, np.nan)}
         if recording.prior_predicted is not None:
             series["before the fit"] = np.asarray(recording.prior_predicted).mean(axis=0)
         series["after the fit"] = recording.central
-        found.append(Track(recording.name, recording.split, recording.time, recording.marker_names, series))
-    return found
+        tracks.append(Track(recording.name, recording.split, recording.time, recording.marker_names, series))
+    return tracks
 
 
 def replay(tracks: Sequence[Track], outline: Mapping[str, Any] | None) -> Markup | None:

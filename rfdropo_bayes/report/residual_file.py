@@ -22,12 +22,12 @@ def residual_dataset(answer: Answer) -> xr.Dataset:
         models["last"] = (answer.law.last.target, answer.law.last.fit.x)
     valid = measured.valid[..., : measured.markers]
     shape = (*valid.shape[:2], len(markers), 3)
-    left = {
+    residuals = {
         name: np.where(valid, target.errors(x)[..., : measured.markers], np.nan).reshape(shape)
         for name, (target, x) in models.items()
     }
     along = ("recording", "row", "marker", "axis")
-    variables: dict[str, Any] = {f"residual_{name}": (along, part, {"units": "m"}) for name, part in left.items()}
+    variables: dict[str, Any] = {f"residual_{name}": (along, part, {"units": "m"}) for name, part in residuals.items()}
     variables["time"] = (("recording", "row"), np.asarray(measured.time), {"units": "s"})
     coordinates: dict[str, Any] = {"recording": list(measured.names), "marker": list(markers), "axis": list("xyz")}
     described = answer.causes.described

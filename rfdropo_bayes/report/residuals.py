@@ -75,14 +75,14 @@ def check(white: Sequence[Float[np.ndarray, "time series"]], counted: bool = Fal
     total = float(correlation[:lags].sum())
     narrowing = 1.0 if counted else float(np.sqrt(1.0 + 2.0 * total))
     chance = stats.norm.isf(MORE_THAN_CHANCE) * np.sqrt(max(lags, 1) / len(values))
-    far = int(np.sum(np.abs(values) > FAR))
+    outliers = int(np.sum(np.abs(values) > FAR))
     expected = 2.0 * stats.norm.sf(FAR) * len(values)
-    heavy = far > 1 and stats.poisson.sf(far - 1, expected) < MORE_THAN_CHANCE
+    heavy = outliers > 1 and stats.poisson.sf(outliers - 1, expected) < MORE_THAN_CHANCE
     return ResidualCheck(
         float(correlation[0]),
         narrowing,
         bool(narrowing > TOO_NARROW and total > chance),
-        far / len(values),
+        outliers / len(values),
         bool(heavy),
         len(values),
     )
@@ -105,7 +105,7 @@ def residual_cautions(checks: Mapping[str, ResidualCheck], noise: str) -> list[C
         checks: result of `check_residuals`.
         noise: name of the noise model.
     """
-    found = []
+    cautions = []
     correlated = _names(checks, "correlated")
     if correlated:
         worst = max(check.narrowing for check in checks.values() if check.correlated)
@@ -113,27 +113,27 @@ def residual_cautions(checks: Mapping[str, ResidualCheck], noise: str) -> list[C
             f"residuals are correlated beyond the noise model {noise!r} ({correlated}): intervals are too narrow, by "
             f"up to {worst:.2g} times; {REMEDIES.get(noise, NO_REMEDY)}"
         )
-        found.append(Caution(Code.RESIDUALS_CORRELATED, sentence))
+        cautions.append(Caution(Code.RESIDUALS_CORRELATED, sentence))
     if noise != "student-t" and (heavy := _names(checks, "heavy")):
         share = max(check.far for check in checks.values() if check.heavy)
         sentence = (
             f"up to {share:.1%} of the residuals are more than {FAR:g} deviations off ({heavy}) and inflate the noise: "
             'mask recording faults, or use noise = "student-t"'
         )
-        found.append(Caution(Code.RESIDUALS_HEAVY, sentence))
-    return found
+        cautions.append(Caution(Code.RESIDUALS_HEAVY, sentence))
+    return cautions
 
 
 def _names(checks: Mapping[str, ResidualCheck], flag: str) -> str:
-    own = [name for name, found in checks.items() if name != "all" and getattr(found, flag)]
+    own = [name for name, marker_check in checks.items() if name != "all" and getattr(marker_check, flag)]
     return ", ".join(own) or ("all markers together" if getattr(checks.get("all"), flag, False) else "")
 
 
 def error_correlations(recordings: Sequence[RecordingPrediction], split: str) -> dict[str, float]:
     """Lag-one correlation of each marker's prediction error, about zero mean."""
     chosen = [r for r in recordings if r.split == split]
-    found = {}
+    correlations = {}
     for index, name in enumerate(chosen[0].marker_names if chosen else ()):
         parts = [np.where(r.mask[:, index, None], (r.observed - r.central)[:, index], np.nan) for r in chosen]
-        found[name] = check(parts).correlation
-    return found
+        correlations[name] = check(parts).correlation
+    return correlations

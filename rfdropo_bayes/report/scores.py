@@ -133,8 +133,8 @@ def _settled_row(position: Float[np.ndarray, "time 3"], usable: Bool[np.ndarray,
     distance = np.linalg.norm(position[index] - final, axis=1)
     outside = np.flatnonzero(distance > max(SETTLED_DISTANCE, SETTLED_SHARE * distance.max()))
     row = int(index[outside[-1]]) + 1 if len(outside) else 0
-    held = len(usable) - row
-    return row if row > 0 and held >= max(LEAST_HELD * len(usable), FINAL_ROWS) else None
+    count = len(usable) - row
+    return row if row > 0 and count >= max(LEAST_HELD * len(usable), FINAL_ROWS) else None
 
 
 def score(

@@ -71,7 +71,7 @@ def render_session(session: MotorSession) -> str:
         pictures["timing"] = embed(punctuality_figure(recording, figures["period_s"]), "How late the cycles began")
         time, distance = distance_to_goal(recording, session.goal)
         if len(distance):
-            pictures["goal"] = embed(goal_figure(time, distance), f"Distance of {_judged(recording)} from the goal")
+            pictures["goal"] = embed(goal_figure(time, distance), f"Distance of {_goal_point(recording)} from the goal")
     shown = [(anchor, words) for anchor, words in SECTIONS if anchor in (*pictures, "result", "events", "reproduce")]
     began = session.events[0]["monotonic"] if session.events else 0.0
     return render(
@@ -81,7 +81,7 @@ def render_session(session: MotorSession) -> str:
         pictures=pictures,
         drives=[] if recording is None else drive_rows(recording),
         ended_at=None if recording is None else _final_distance(recording, session.goal),
-        judged=None if recording is None else _judged(recording),
+        goal_point=None if recording is None else _goal_point(recording),
         seconds=0.0 if recording is None else float(recording.time[-1]),
         events=[(each["monotonic"] - began, each) for each in session.events if each["event"] != ROUTINE],
         checked=sum(each["event"] == ROUTINE for each in session.events),
@@ -131,7 +131,7 @@ def _pushes(recording: Trajectory) -> bool:
     return GOAL_AXES in recording.settings
 
 
-def _judged(recording: Trajectory) -> str:
+def _goal_point(recording: Trajectory) -> str:
     """Name of the marker or object that must reach the goal."""
     return "the object" if _pushes(recording) else f"the last marker, {recording.marker_names[-1]},"
 
@@ -159,27 +159,27 @@ def _held_back(recording: Trajectory) -> float:
 
 def session_steps(session: MotorSession) -> list[str]:
     """Recommended next steps, each a sentence with its reason."""
-    summary, recording, found = session.summary, session.recording, []
+    summary, recording, steps = session.summary, session.recording, []
     cause, figures = summary["cause"], summary["figures"]
     if cause != PLANNED:
-        found.append(REMEDIES.get(cause, "Correct the cause that is named above, and run --mode check again."))
+        steps.append(REMEDIES.get(cause, "Correct the cause that is named above, and run --mode check again."))
     if figures and figures["missed"]:
-        found.append(f"{figures['missed']} cycles missed their time: run rfdropo doctor to find the reason.")
+        steps.append(f"{figures['missed']} cycles missed their time: run rfdropo doctor to find the reason.")
     lacking = [channel for channel, guards in summary["without"].items() if guards]
     if lacking:
-        found.append(f"{', '.join(lacking)} lack guards: --mode check lists them with their consequences.")
+        steps.append(f"{', '.join(lacking)} lack guards: --mode check lists them with their consequences.")
     if recording is None:
-        return found or ["Nothing was recorded: go on with --mode home, shadow or run."]
+        return steps or ["Nothing was recorded: go on with --mode home, shadow or run."]
     clipped = _held_back(recording)
     if clipped:
         words = f"A limit on length or rate held back {100 * clipped:.0f} % of the actions"
-        found.append(f"{words}: see the commands below.")
+        steps.append(f"{words}: see the commands below.")
     if cause == PLANNED and summary["facts"].get("simulated"):
-        found.append("The drives were simulated. On a robot, begin with --mode check, home and shadow.")
+        steps.append("The drives were simulated. On a robot, begin with --mode check, home and shadow.")
     if recording.unsent:
-        return [*found, "No drive has carried these commands out: this recording is no data. Go on with --mode run."]
-    found.append(
+        return [*steps, "No drive has carried these commands out: this recording is no data. Go on with --mode run."]
+    steps.append(
         'The recording is data: put session.nc under fit in [data] with format = "netcdf", then rfdropo calibrate and '
         "rfdropo audit find how this robot differs from its model."
     )
-    return found
+    return steps

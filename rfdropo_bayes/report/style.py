@@ -150,14 +150,14 @@ def _panels(figure: Figure, cells: Sequence[tuple[Axes, Bbox]]) -> list[Panel]:
     parts += [(axes, box, "cell") for axes, box in cells]
     artists = [*figure.legends, *figure.axes]
     seen = [artist.get_visible() for artist in artists]
-    found = []
+    panels = []
     for own, box, kind in parts:
         for artist in artists:
             artist.set_visible(artist is own)
-        found.append(Panel(_svg(figure, box), 100.0 * box.width / width, kind))
+        panels.append(Panel(_svg(figure, box), 100.0 * box.width / width, kind))
     for artist, visible in zip(artists, seen, strict=True):
         artist.set_visible(visible)
-    return found
+    return panels
 
 
 def _inches(figure: Figure, box: Bbox) -> Bbox:

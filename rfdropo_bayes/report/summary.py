@@ -21,7 +21,7 @@ from rfdropo_bayes.report.coverage import Coverage, coverage
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.headline import headline
 from rfdropo_bayes.report.identifiability import identify
-from rfdropo_bayes.report.randomisation_safety import judge
+from rfdropo_bayes.report.randomisation_safety import rate_safety
 from rfdropo_bayes.report.residuals import error_correlations
 from rfdropo_bayes.report.scores import MILLIMETRES, ErrorFigures, MeasuredPath, score
 from rfdropo_bayes.tables import parse_table
@@ -121,8 +121,8 @@ def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"],
     """Ratio of standard deviations, of the values or of their logarithms."""
     if log and np.all(draws > 0) and np.all(prior > 0):
         draws, prior = np.log(draws), np.log(prior)
-    spread = float(np.std(prior))
-    return float(np.std(draws)) / spread if spread > 0 else None
+    prior_deviation = float(np.std(prior))
+    return float(np.std(draws)) / prior_deviation if prior_deviation > 0 else None
 
 
 class _Open(BaseModel):
@@ -234,7 +234,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         missing["log_evidence"] = f"{facts.method} computes no evidence"
     plain = _plain(summary, "", missing)
     plain["not_available"] = missing
-    plain["randomisation"] = judge(record, plain).as_dict()
+    plain["randomisation"] = rate_safety(record, plain).as_dict()
     plain["headline"] = [*headline(plain), plain["randomisation"]["sentence"]]
     check_summary(plain, where="summary.json")
     return plain

@@ -28,7 +28,7 @@ AXES = ("x", "y", "z")
 
 
 def shown_markers(count: int) -> list[int]:
-    """Markers that have a row of their own: evenly chosen, the last always among them."""
+    """Markers that have their own row: evenly chosen, the last always among them."""
     return sorted(
         {round(i) for i in np.linspace(count - 1, 0, min(count, MOST_MARKERS) + (count > MOST_MARKERS))[:MOST_MARKERS]}
     )
@@ -121,10 +121,10 @@ def residual_figure(recording: RecordingPrediction, settled: int | None) -> Figu
     rows = style.thin(len(recording.time))
     usable = recording.mask[:, -1]
     residual = MILLIMETRES * np.where(usable[:, None], recording.observed[:, -1] - recording.central[:, -1], np.nan)
-    spread = MILLIMETRES * (recording.predicted[:, rows, -1] - recording.central[rows, -1])
+    deviation = MILLIMETRES * (recording.predicted[:, rows, -1] - recording.central[rows, -1])
     figure = Figure(figsize=(style.WIDTH, 2.9))
     over_time, distance, memory = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 0.9))
-    low, high = np.quantile(spread, [0.05, 0.95], axis=0).mean(axis=-1)
+    low, high = np.quantile(deviation, [0.05, 0.95], axis=0).mean(axis=-1)
     over_time.fill_between(
         recording.time[rows],
         low,

@@ -80,9 +80,9 @@ class Audit:
         """One row per parameter of the named effects: mean, 5 and 95 % quantile, unit, and explained share."""
         columns = ("explained_fraction", "adjusted_p", "log_bayes_factor")
         rows = [
-            {"mechanism": found["mechanism"], "parameter": name, **row, **{key: found[key] for key in columns}}
-            for found in self.content["findings"]
-            for name, row in found["parameters"].items()
+            {"mechanism": finding["mechanism"], "parameter": name, **row, **{key: finding[key] for key in columns}}
+            for finding in self.content["findings"]
+            for name, row in finding["parameters"].items()
         ]
         index = ["mechanism", "parameter"]
         return pd.DataFrame(rows).set_index(index) if rows else pd.DataFrame(columns=["mean", "unit", *columns])

@@ -93,8 +93,8 @@ class Calibration:
     @property
     def log_evidence(self) -> tuple[float | None, float | None]:
         """Value and standard deviation [nats]; None if the method has none."""
-        found = self.content["log_evidence"]
-        return found["value"], found["sd"]
+        evidence = self.content["log_evidence"]
+        return evidence["value"], evidence["sd"]
 
     @property
     def rmse(self) -> pd.DataFrame:

@@ -20,7 +20,7 @@ class Cable(RobotTable):
     It starts at the anchor, a point fixed to the base, and passes the guides to its end at the last guide.
     """
 
-    name: Name = Field(description="unique among the robot's cables")
+    name: Name = Field(description="unique among the robot's cables and chambers")
     azimuth_deg: float = Field(description="azimuth of the cable, from +x towards +y")
     anchor_z_m: float = Field(description="axial coordinate of the anchor, a point fixed to the base")
     anchor_radius_m: Positive = Field(description="distance of the anchor from the axis")
@@ -37,12 +37,12 @@ class Cable(RobotTable):
     )
     displacement_limit_m: Pair | None = Field(
         default=None,
-        description="least and greatest displacement, pull > 0; commands beyond are held at the limit; of a cable that "
-        "is driven by a displacement",
+        description="least and greatest displacement, pull > 0; commands beyond it stop at the limit; only "
+        "for cables driven by displacement",
     )
     tension_limit_n: Pair | None = Field(
         default=None,
-        description="least and greatest tension; commands beyond are held at the limit; of a cable that is driven by a "
+        description="least and greatest tension; commands beyond it stop at the limit; only for cables driven by "
         "tension",
     )
 
@@ -74,6 +74,18 @@ class Cable(RobotTable):
         assert given is not None
         return given
 
+    @property
+    def end_m(self) -> float:
+        """Axial coordinate of its end in the undeformed body."""
+        return self.guide_z_m[-1]
+
+    def turned(self, angle: float) -> Cable:
+        """The cable turned about +z [deg]."""
+        anchor = self.anchor_azimuth_deg
+        changes = {"azimuth_deg": self.azimuth_deg + angle}
+        changes |= {} if anchor is None else {"anchor_azimuth_deg": anchor + angle}
+        return self.model_copy(update=changes)
+
     def anchor(self) -> Float[np.ndarray, "3"]:
         """Point at which the cable leaves the base [m]."""
         azimuth = self.azimuth_deg if self.anchor_azimuth_deg is None else self.anchor_azimuth_deg
@@ -91,15 +103,15 @@ def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[
 
 
 class Channels(RobotTable):
-    """Map from commands to the drives of cables: ``radius * gain @ command``."""
+    """Map from commands to the drives of cables and chambers: ``radius * gain @ command``."""
 
     names: tuple[Name, ...] = Field(
         min_length=1,
         description="the command channels, in the order of the columns of gain",
     )
     gain: tuple[tuple[float, ...], ...] = Field(
-        description="one row per cable, one column per channel: displacement [m] or tension [N] = gain @ command, "
-        "times the radius if commands are angles; pull > 0",
+        description="one row per cable, then per chamber, one column per channel: displacement [m], tension [N] or "
+        "pressure [Pa] = gain @ command, times the radius if commands are angles; pull > 0",
     )
     radius_parameter: Name | None = Field(
         default=None,
@@ -111,5 +123,5 @@ class Channels(RobotTable):
         if any(len(row) != len(self.names) for row in self.gain):
             raise ValueError(f"a row of gain does not have one entry for each of the {len(self.names)} channels")
         if np.any(np.all(np.array(self.gain) == 0, axis=0)):
-            raise ValueError("a channel moves no cable")
+            raise ValueError("a channel drives nothing")
         return self

@@ -39,8 +39,7 @@ class DriveTravel(RobotTable):
     high: Values | None = Field(default=None, description="greatest value of the counter; none by default")
     start: Values | None = Field(
         default=None,
-        description="the counter when a recording begins; the command in force there by default, so that the counter "
-        "is the command",
+        description="counter at the start of a recording; by default the command in force there",
     )
     count_size: float = Field(
         default=1.0,

@@ -34,7 +34,7 @@ def read_tetrahedra(path: str | Path, unit: str) -> TetrahedralMesh:
             inverted elements, nodes that belong to no element, or parts that do not touch.
     """
     if unit not in METRES:
-        raise InputError(f"length unit {unit!r}", where=str(path), remedy=f"use one of {', '.join(METRES)}")
+        raise InputError(f"unknown length unit {unit!r}", where=str(path), remedy=f"use one of {', '.join(METRES)}")
     path = Path(path)
     if not path.is_file():
         raise InputError("no such file", where=str(path))

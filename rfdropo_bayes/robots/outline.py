@@ -1,4 +1,4 @@
-"""A robot from a few answers: shape, cables, markers, mass; written as a commented robot file to go on from."""
+"""A robot from a few answers: shape, cables or chambers, markers, mass; written as a commented robot file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,13 @@ LEAST_GUIDES, GUIDES_PER_SEGMENT = 8, 4
 cables bend a silicone arm by up to 1.5 rad, and .6 % for a body five times softer. A cone with a tip of .6 of its
 base's radius has twice this number (.6 %), and at .3 four times this number (.4 % up to half a radian).
 """
-COMMANDS = ("m", "rad", "N", "N m", "-")
+DRIVES = {"Pa": ("chamber", "pressure")}
+"""Words for a drive and its command, if they are not a cable and its pull."""
+COMMANDS = ("m", "rad", "N", "N m", "Pa", "-")
+CHAMBER_RADIUS = 0.2
+"""Radius of a chamber over the body's, if it is not given."""
+VACUUM = -101325.0
+"""[Pa] Least pressure above the surroundings."""
 USUAL_PULL = 0.15
 """Usual pull of a cable over the body's length."""
 FORCE_LIMIT = 5.0
@@ -45,10 +51,11 @@ class RobotOutline:
         markers: heights along the axis by name.
         shape: "cylinder", "cone" (with ``tip_radius``), "tube" (with ``inner_radius``), or "disks" on a backbone.
         segments: number of segments, each with cables that end at its end.
-        cables: number of cables per segment, evenly around it.
-        cable_radius: distance of the cables from the axis at the base; they follow the taper.
+        cables: number of cables, or of chambers, per segment, evenly around it.
+        cable_radius: distance of the cables from the axis at the base, which follow the taper; or of the chambers.
         pairs: opposite cables share a motor: one cable is wound as the other is released.
-        command_unit: "m" of cable or "rad" of a motor, whose spool then has ``spool_radius``.
+        command_unit: "m" of cable, "rad" or "N m" of a motor, whose spool then has ``spool_radius``, "N" of tension,
+            "-" of other drives of cables, or "Pa": the body then has chambers in place of cables.
         gravity: direction of gravity, such as "+z" for a robot that hangs.
         mass: mass of the body [kg]; None for silicone of its volume.
         young_modulus: Young's modulus [Pa].
@@ -73,7 +80,7 @@ class RobotOutline:
     cables: int = 4
     cable_radius: float | None = None
     pairs: bool = False
-    command_unit: Literal["m", "rad", "N", "N m", "-"] = "m"
+    command_unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = "m"
     spool_radius: float = 0.01
     gravity: str = "+z"
     mass: float | None = None
@@ -88,13 +95,15 @@ class RobotOutline:
     def __post_init__(self) -> None:
         where = "robot outline"
         if self.gravity not in DIRECTIONS:
-            remedy = f"one of {', '.join(DIRECTIONS)}: the direction of gravity, with z away from the clamp"
-            raise InputError(f"gravity = {self.gravity!r} is no direction", where=where, remedy=remedy)
+            remedy = f"use one of {', '.join(DIRECTIONS)}: the direction of gravity, with z away from the clamp"
+            raise InputError(f"gravity = {self.gravity!r} is not a direction", where=where, remedy=remedy)
         if self.command_unit not in COMMANDS:
             remedy = '"m" of cable or "rad" of a motor; recordings in mm or deg are converted when they are read'
-            raise InputError(f"command_unit = {self.command_unit!r} is no unit of a robot", where=where, remedy=remedy)
+            raise InputError(
+                f"command_unit = {self.command_unit!r} is not a unit of a robot", where=where, remedy=remedy
+            )
         if self.shape not in SHAPES:
-            raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"one of {', '.join(SHAPES)}")
+            raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"use one of {', '.join(SHAPES)}")
         for key in ("length", "radius", "young_modulus", "spool_radius"):
             if not getattr(self, key) > 0.0:
                 raise InputError(f"{key} = {getattr(self, key):g} is not positive", where=where)
@@ -107,6 +116,8 @@ class RobotOutline:
             raise InputError(f"segments of {said} mm do not make up the body", where=where, remedy=remedy)
         if self.shape == "disks" and len({self.end_of_cables(k) for k in range(self.segments)}) < self.segments:
             raise InputError("two segments end at one disk", where=where, remedy="give more disks")
+        if self.pairs and self.command_unit == "Pa":
+            raise InputError("chambers make no pairs", where=where, remedy="give each chamber its own command")
         if self.pairs and self.cables % 2:
             raise InputError(f"{self.cables} cables make no pairs", where=where, remedy="give an even number")
         if self.shape == "disks" and self.number_of_disks % self.segments:
@@ -178,12 +189,12 @@ class RobotOutline:
 
     @property
     def arm(self) -> float:
-        """Distance of the cables from the axis at the base [m]."""
+        """Distance of the cables at the base, or of the chambers, from the axis [m]."""
         return CABLES_AT * self.radius if self.cable_radius is None else self.cable_radius
 
     @property
     def bending_force(self) -> float:
-        """Tension that bends the body by a usual pull [N], see `mechanisms.sizes`."""
+        """Tension, or thrust of a chamber, that bends the body by a usual pull [N], see `mechanisms.sizes`."""
         moment = float(np.mean(section_profile([self.section]).bending_moment_area_m4))
         return self.young_modulus * moment * USUAL_PULL / self.arm**2
 
@@ -224,9 +235,19 @@ class RobotOutline:
             tip = None if sized.tip_radius is None else _rounded(wider * sized.tip_radius)
             return replace(sized, radius=_rounded(wider * sized.radius), tip_radius=tip)
         if self.sets_bend == "young_modulus":
-            before, after = (o.bending_force / o.young_modulus * o.arm / o.length for o in (self, sized))
+            before, after = (o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized))
             return replace(sized, young_modulus=_rounded(self.young_modulus / bend * before / after))
         return sized
+
+    @property
+    def force_of_unit(self) -> float:
+        """Force of a unit command as far as the body's size sets it: the area of a chamber [m2], else 1."""
+        return self.chamber_area if self.command_unit == "Pa" else 1.0
+
+    @property
+    def chamber_area(self) -> float:
+        """Area of a chamber across the axis [m2], assumed."""
+        return np.pi * (CHAMBER_RADIUS * self.radius) ** 2
 
     @property
     def newtons(self) -> float:
@@ -238,16 +259,17 @@ class RobotOutline:
     def channel_names(self) -> list[str]:
         """One per cable, or one per pair of cables."""
         count = self.cables // 2 if self.pairs else self.cables
-        word = "motor" if self.command_unit == "rad" or self.pairs else "pull"
+        word = "motor" if self.command_unit == "rad" or self.pairs else DRIVES.get(self.command_unit, ("", "pull"))[1]
         if self.segments == 1:
             return [f"{word}_{k + 1}" for k in range(count)]
         return [f"s{s + 1}_{word}_{k + 1}" for s in range(self.segments) for k in range(count)]
 
     def cable_names(self) -> list[str]:
-        """Names of the cables of all segments, base to tip."""
+        """Names of the cables, or chambers, of all segments, base to tip."""
+        word = DRIVES.get(self.command_unit, ("cable",))[0]
         if self.segments == 1:
-            return [f"cable_{k + 1}" for k in range(self.cables)]
-        return [f"s{s + 1}_cable_{k + 1}" for s in range(self.segments) for k in range(self.cables)]
+            return [f"{word}_{k + 1}" for k in range(self.cables)]
+        return [f"s{s + 1}_{word}_{k + 1}" for s in range(self.segments) for k in range(self.cables)]
 
     @property
     def number_of_disks(self) -> int:
@@ -266,9 +288,8 @@ def not_given(answers: Mapping[str, Any]) -> frozenset[str]:
 
 def robot_text(outline: RobotOutline) -> str:
     """A commented robot file."""
-    return "\n".join(
-        [*_head(outline), *_channels(outline), *_cables(outline), *_markers(outline), *_parameters(outline)]
-    )
+    drives = _chambers(outline) if outline.command_unit == "Pa" else _cables(outline)
+    return "\n".join([*_head(outline), *_channels(outline), *drives, *_markers(outline), *_parameters(outline)])
 
 
 def outlined_tables(outline: RobotOutline) -> dict[str, Any]:
@@ -281,13 +302,13 @@ def _head(o: RobotOutline) -> list[str]:
     sign, axis = DIRECTIONS[o.gravity]
     gravity = [0.0, 0.0, 0.0]
     gravity[axis] = GRAVITY if sign == "+" else -GRAVITY
-    section = o.section.model_dump()
+    section, kind = o.section.model_dump(), DRIVES.get(o.command_unit, ("cable",))[0]
     return [
         "# Written by rfdropo init; docs/reference/robot.md has every key. SI units, in the frame of the base: z along",
         "# the undeformed body, away from the clamp. Values marked ASSUMED are defaults: measure them, or let them be",
         "# inferred.",
         f'name = "{o.name}"',
-        f'description = "{o.segments} segment{"s" if o.segments > 1 else ""}, {o.segments * o.cables} cables"',
+        f'description = "{o.segments} segment{"s" if o.segments > 1 else ""}, {o.segments * o.cables} {kind}s"',
         f"gravity_m_s2 = {gravity}{_mark(o, 'gravity')}",
         "time_step_s = 0.01             # rfdropo check measures its error",
         'integrator = "sdirk2"          # or "euler": half the work, and ten times the error',
@@ -320,6 +341,7 @@ def _channels(o: RobotOutline) -> list[str]:
     words = {
         "rad": "# Cable displacement = gain @ command, times the spool's radius; pull > 0.",
         "N m": "# Tension = gain @ command: one over the spool's radius." + _mark(o, "spool_radius"),
+        "Pa": "# Pressure = gain @ command.",
         "-": "# Tension = gain @ command. ASSUMED: the usual command bends the body by a usual pull; "
         "the inferred stiffness is relative to it.",
     }
@@ -357,6 +379,29 @@ def _cables(o: RobotOutline) -> list[str]:
             f"guide_z_m = {_toml([round(float(z), 6) for z in heights[inside]])}",
             f"guide_radius_m = {_toml([round(float(r), 6) for r in radius[inside]])}",
             *_limits(o),
+            "",
+        ]
+    return lines
+
+
+def _chambers(o: RobotOutline) -> list[str]:
+    usual = o.bending_force / o.chamber_area if o.usual_command is None else o.usual_command
+    lines = [
+        "# Chambers beside the axis, from +x towards +y. ASSUMED: their area, and that they reach along their segment;",
+        "# the inferred stiffness is relative to the area." + _mark(o, "cables", "cable_radius", "segment_lengths"),
+        *([f"# ASSUMED azimuths: {o.azimuth_evidence}."] if o.azimuth_evidence else []),
+    ]
+    names, ends = o.cable_names(), [0.0, *o.segment_ends()]
+    for row in range(o.segments * o.cables):
+        segment, chamber = divmod(row, o.cables)
+        lines += [
+            "[[chambers]]",
+            f'name = "{names[row]}"',
+            f"azimuth_deg = {360.0 / o.cables * chamber + o.first_azimuths()[segment]:g}",
+            f"radius_m = {o.arm:.6g}",
+            f"z_m = [{ends[segment]:.6g}, {ends[segment + 1]:.6g}]",
+            f"area_m2 = {o.chamber_area:.6g}",
+            f"pressure_limit_pa = [{VACUUM:g}, {FORCE_LIMIT * usual:.6g}]  # ASSUMED",
             "",
         ]
     return lines

@@ -34,6 +34,7 @@ def implausible(robot: Robot) -> str | None:
     for cable in robot.cables:
         sizes[f"anchor_radius_m of the cable {cable.name}"] = cable.anchor_radius_m
         sizes[f"distance of anchor_z_m of the cable {cable.name} from the body"] = station[0] - cable.anchor_z_m
+    sizes |= {f"radius_m of the chamber {chamber.name}": chamber.radius_m for chamber in robot.chambers}
     if robot.channels.radius_parameter is not None:
         sizes[robot.channels.radius_parameter] = robot.parameters[robot.channels.radius_parameter].nominal
     for name, size in sizes.items():

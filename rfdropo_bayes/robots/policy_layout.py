@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 
-CommandUnit = Literal["m", "rad", "N", "N m", "-"]
+CommandUnit = Literal["m", "rad", "N", "N m", "Pa", "-"]
 EARLIER_COMMANDS, EARLIER_MOVED = "earlier commands", "earlier moved"
 """Parts of an observation that show more than the last action; see `Earlier`."""
 PEAK_TENSION = "peak_tension_n"
@@ -50,7 +50,8 @@ class PolicyLayout:
         period_s: time from one action to the next [s].
         observation: parts of the observation, in order.
         channels: command channels that it moves, in order.
-        unit: unit of the commands: "m" of cable, "rad" of a motor, "N" of tension; of a black box also "N m" or "-".
+        unit: unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "Pa" of pressure; of a black box
+            also "N m" or "-".
         kind: "discrete" actions are rows of ``moves``; a "continuous" action is a number from -1 to 1 for every
             channel.
         moves: change of the commands by an action [unit]: (action, channel) if discrete; if continuous, one row, the
@@ -121,7 +122,7 @@ class PolicyLayout:
             chosen = np.asarray(action)
             if not np.issubdtype(chosen.dtype, np.integer) or chosen.min() < 0 or chosen.max() >= len(moves):
                 raise InputError(
-                    f"{_brief(chosen)} is no action",
+                    f"{_brief(chosen)} is not an action",
                     where=self.task,
                     remedy=f"use whole numbers from 0 to {len(moves) - 1}",
                 )

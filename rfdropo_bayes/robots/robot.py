@@ -1,4 +1,4 @@
-"""A robot: body, mount, cables, commands, markers, parameters and, for pushing, an object on a plate."""
+"""A robot: body, mount, cables, chambers, commands, markers, parameters and, for pushing, an object on a plate."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rfdropo_bayes.groups import Patterns, group_of, whole
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
+from rfdropo_bayes.robots.chamber import Chamber
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.outline import RobotOutline, not_given, outlined_tables
@@ -39,6 +40,8 @@ ZEROS = "initial_displacement"
 """Parameter of every cable that is driven by a displacement."""
 
 
+DRIVEN = {"m": "m", "rad": "m", "N": "N", "N m": "N", "Pa": ("Pa",), "-": ("N", "Pa")}
+"""Units of the drives of cables and chambers, by the unit of the commands."""
 USUAL_SHARE = 0.4
 """Usual commands over the largest command: recordings seldom use the whole travel."""
 
@@ -46,9 +49,10 @@ USUAL_SHARE = 0.4
 class CommandTiming(RobotTable):
     """Timing of commands."""
 
-    unit: Literal["m", "rad", "N", "N m", "-"] = Field(
-        description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, or "-" of '
-        "drives that are sent volts or a share of their supply; channels.gain has the newtons of the last two",
+    unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = Field(
+        description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, "Pa" of '
+        'pressure, or "-" of drives that are sent volts or a share of their supply; channels.gain has the newtons of '
+        "torques, and the newtons or pascals of such drives",
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
@@ -108,15 +112,16 @@ class Robot(RobotTable):
     time_step_s: Positive = Field(description="time step of the simulation")
     integrator: Literal["euler", "sdirk2"] = Field(
         default="sdirk2",
-        description='scheme of a time step: "sdirk2", of order 2 (1.6 with taut cables), takes two solves a step, and '
-        'its error is about a tenth of the error of "euler", which takes one, as SOFA does',
+        description='scheme of a time step: "sdirk2" has order 2 (1.6 with taut cables) and two solves a step; '
+        '"euler", the scheme of SOFA, has one solve and about ten times the error',
     )
     initial_state: Literal["rest", "equilibrium"] = Field(
         description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',
     )
     command: CommandTiming = Field(description="unit and timing of commands")
-    channels: Channels = Field(description="map from commands to cable displacements")
-    cables: tuple[Cable, ...] = Field(min_length=1, description="the cables")
+    channels: Channels = Field(description="map from commands to the drives of cables and chambers")
+    cables: tuple[Cable, ...] = Field(default=(), description="the cables")
+    chambers: tuple[Chamber, ...] = Field(default=(), description="the chambers under pressure")
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
     markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
     orientations: tuple[OrientedSection, ...] = Field(default=(), description="sections whose orientation is measured")
@@ -132,15 +137,18 @@ class Robot(RobotTable):
 
     @model_validator(mode="after")
     def _consistent(self) -> Robot:
-        named = {"cable": self.cable_names, "marker": self.marker_names, "section": self.section_names}
-        for kind, names in named.items():
+        kinds = "cables and chambers" if self.chambers else "cables"
+        driven = tuple(each.name for each in self.actuators)
+        for named, names in ((kinds, driven), ("markers", self.marker_names), ("sections", self.section_names)):
             if len(set(names)) != len(names):
-                raise ValueError(f"two of its {kind}s share a name")
-        if len(self.channels.gain) != len(self.cables):
-            raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.cables)} cables")
-        for cable in self.cables:
-            if cable.unit != ("m" if self.command.unit in ("m", "rad") else "N"):
-                raise ValueError(f"{cable.name} is driven in {cable.unit}, and commands are in {self.command.unit}")
+                raise ValueError(f"two of its {named} share a name")
+        if not self.actuators:
+            raise ValueError("the robot has neither cables nor chambers")
+        if len(self.channels.gain) != len(self.actuators):
+            raise ValueError(f"channels.gain has {len(self.channels.gain)} rows for {len(self.actuators)} {kinds}")
+        for each in self.actuators:
+            if each.unit not in DRIVEN[self.command.unit]:
+                raise ValueError(f"{each.name} is driven in {each.unit}, and commands are in {self.command.unit}")
         if (self.command.unit == "rad") != (self.channels.radius_parameter is not None):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and allowed only for them")
         masses = [mass.parameter for mass in self.body.point_masses]
@@ -184,6 +192,7 @@ class Robot(RobotTable):
         station = np.array(self.body.station_m)
         half = np.array(self.body.half_width_m)
         points = {f"guide of {cable.name}": cable.guides() for cable in self.cables}
+        points |= {f"end of {each.name}": each.ends() for each in self.chambers}
         points |= {f"section {each.name}": np.array([[0.0, 0.0, each.z_m]]) for each in self.orientations}
         points |= {f"marker {marker.name}": np.array([marker.point_m]) for marker in self.markers}
         for name, place in points.items():
@@ -233,9 +242,8 @@ class Robot(RobotTable):
                 from ``segment_azimuths`` [deg] on (``azimuth_evidence`` and ``size_evidence``: reasons for these, and
                 for the sizes), at ``cable_radius`` from the axis at the base; with ``pairs`` opposite cables share a
                 motor. ``command_unit``: "m" of cable, "rad" or "N m" of a motor with ``spool_radius``, "N" of tension,
-                or "-" of other drives; ``usual_command``: the size of usual commands. ``gravity``: its direction, "+z"
-                for a robot that hangs. ``mass`` [kg], silicone by
-                default; ``young_modulus`` [Pa].
+                "Pa" of chambers, or "-" of other drives; ``usual_command``: the size of usual commands. ``gravity``:
+                its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone by default; ``young_modulus`` [Pa].
 
         Raises:
             InputError: an unknown answer, a missing answer, or answers that make no robot.
@@ -248,7 +256,9 @@ class Robot(RobotTable):
         long = 1e3 * self.length
         commands = f"{len(self.channel_names)} commands [{self.command_unit}] ({', '.join(self.channel_names)})"
         markers = f"markers {', '.join(marker.name for marker in self.markers)}"
-        return f"<Robot {self.name}: {long:.4g} mm long, {len(self.cables)} cables, {commands}, {markers}>"
+        kinds = (("cable", self.cables), ("chamber", self.chambers))
+        drives = ", ".join(f"{len(each)} {kind}{'s' if len(each) > 1 else ''}" for kind, each in kinds if each)
+        return f"<Robot {self.name}: {long:.4g} mm long, {drives}, {commands}, {markers}>"
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""
@@ -288,7 +298,7 @@ class Robot(RobotTable):
 
     @property
     def command_unit(self) -> str:
-        """Unit of the recorded commands, "m" or "rad"."""
+        """Unit of the commands."""
         return self.command.unit
 
     @property
@@ -303,7 +313,7 @@ class Robot(RobotTable):
 
     @property
     def held_by_force(self) -> bool:
-        """Whether the drives hold tensions of cables, and not their lengths."""
+        """Whether the drives hold tensions of cables or pressures, and not lengths."""
         return self.command_unit not in ("m", "rad")
 
     @property
@@ -336,7 +346,7 @@ class Robot(RobotTable):
 
     def anchors(self) -> Float[np.ndarray, "cable 3"]:
         """Points fixed to the base from which the cables start [m]."""
-        return np.stack([cable.anchor() for cable in self.cables])
+        return np.array([cable.anchor() for cable in self.cables]).reshape(-1, 3)
 
     def guides(self) -> list[Float[np.ndarray, "guide 3"]]:
         """Guide points of each cable in the undeformed body [m]; cables may have different numbers of them."""
@@ -347,9 +357,15 @@ class Robot(RobotTable):
         """Length of the body along its axis [m]."""
         return float(self.body.station_m[-1] - self.body.station_m[0])
 
-    def drive_limits(self) -> Float[np.ndarray, "cable 2"]:
-        """Least and greatest drive of each cable: displacement [m], pull > 0, or tension [N]."""
-        return np.array([cable.limit for cable in self.cables])
+    @property
+    def actuators(self) -> tuple[Cable | Chamber, ...]:
+        """The cables, then the chambers."""
+        return self.cables + self.chambers
+
+    def drive_limits(self) -> Float[np.ndarray, "drive 2"]:
+        """Least and greatest drive of each cable, a displacement [m], pull > 0, or a tension [N], and then of each
+        chamber, a pressure [Pa]."""
+        return np.array([each.limit for each in self.actuators])
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
         """Least and greatest command of each channel [m or rad] at nominal parameters.
@@ -380,7 +396,7 @@ class Robot(RobotTable):
         return tuple(dict.fromkeys(int(np.argmin(np.abs(own - wanted))) for wanted in heights))
 
     def channel_matrix(self, parameters: Mapping[str, Any]) -> Any:
-        """Matrix (cable, channel) from commands to cable displacements [m], for these parameter values.
+        """Matrix (drive, channel) from commands to the drives of cables and chambers, for these parameter values.
 
         Values may be JAX tracers: the matrix is then one too.
         """

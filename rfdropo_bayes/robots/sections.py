@@ -79,7 +79,7 @@ class Cone(RobotTable):
     shape: Literal["cone"] = Field(default="cone", description="form of the section")
     length_m: Positive = Field(description="length along z")
     layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
-    radius_m: Radii = Field(description="radius at the end towards the base, and at that towards the tip")
+    radius_m: Radii = Field(description="radius at the base end, and at the tip end")
 
     def profile(self) -> Profile:
         """Sections of its layers."""

@@ -10,12 +10,13 @@ from rfdropo_bayes.robots.robot import Robot
 
 
 def robot_shape(robot: Robot) -> dict[str, Any]:
-    """Section widths along the axis, cables from anchor to last guide, markers, and the direction of gravity.
+    """Section widths along the axis, cables from anchor to last guide, chambers from end to end, markers, and gravity.
 
-    All in metres and the base frame: ``station`` and ``half_width`` (x, y) of the body, ``cables`` and ``markers`` as
-    points by name, ``gravity`` in m/s2.
+    All in metres and the base frame: ``station`` and ``half_width`` (x, y) of the body, ``cables``, with
+    the chambers, and ``markers`` as points by name, ``gravity`` in m/s2.
     """
     cables = {cable.name: np.vstack([cable.anchor()[None], cable.guides()]).tolist() for cable in robot.cables}
+    cables |= {chamber.name: chamber.ends().tolist() for chamber in robot.chambers}
     return {
         "station": list(robot.body.station_m),
         "half_width": np.asarray(robot.body.half_width_m).tolist(),

@@ -29,7 +29,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import nearest, parse_table
 
-STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "-": 1.0}
+STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "Pa": 1e4, "-": 1.0}
 """Units of commands, and the size that perturbations of a command are relative to."""
 SMALLEST_SHARE = 1e-3  # of its range: least size that perturbations of a parameter are relative to
 PROBED_ROWS = 3
@@ -61,7 +61,7 @@ class BlackBox:
             ``nominal`` the middle and ``prior`` uniform between the bounds by default.
         markers, channels, cables: names of the markers, of the command channels, and of the cables with a tension.
         time_step: time between rows of the command [s].
-        command_unit: "m" of cable, "rad" of a motor, "N", "N m", or "-" for a unit of its own.
+        command_unit: "m" of cable, "rad" of a motor, "N", "N m", "Pa", or "-" for a unit of its own.
         name: name of the simulator in reports.
         batched: whether the function takes many parameter sets at once.
         lanes: number of parameter sets per call.

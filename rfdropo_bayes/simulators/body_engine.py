@@ -66,7 +66,7 @@ EFFECT_SIZES = BodyEffects(
 QUASI_STATIC: Literal["quasi-static"] = "quasi-static"
 """Motion of a body that is at rest in every row."""
 FAR_WOUND = 10.0
-"""[m] Beyond the displacement of any cable."""
+"""[m] Beyond the displacement of any cable: a drive that goes farther winds a soft spring, or is a pressure."""
 CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
 FRICTION = 0.1
@@ -116,21 +116,21 @@ class Inputs(NamedTuple):
     """Inputs of a rollout."""
 
     material: Material | TetrahedralMaterial
-    start: Float[Array, " cable"]  # displacements before the first step [m]
-    displacement: Float[Array, "step cable"]  # at the end of every step [m]
+    start: Float[Array, " drive"]  # before the first step: displacements of cables [m], pressures of chambers [Pa]
+    drive: Float[Array, "step drive"]  # at the end of every step
     cube: CubeInputs | None = None
     loads: BodySignals | None = None
 
 
 @dataclass(frozen=True)
 class Engine:
-    """The motion of a body under given cable displacements, with or without a cube.
+    """The motion of a body, with or without a cube, under given displacements of cables and pressures of chambers.
 
     Attributes:
         body: the moving body.
         time_step: time step of the simulation [s].
         backend: backend of the arithmetic.
-        from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of a rod.
+        from_equilibrium: start in the static equilibrium of the initial drives, else undeformed; of a rod.
         scene: geometry on which the body pushes a cube; None for a body that touches nothing.
         integrator: scheme of a time step, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
             row, an equilibrium found from the row before.
@@ -208,8 +208,8 @@ class Engine:
     def motion(
         self,
         material: Material | TetrahedralMaterial,
-        start: Float[Array, " cable"],
-        displacement: Float[Array, "step cable"],
+        start: Float[Array, " drive"],
+        drive: Float[Array, "step drive"],
         steps: Int[Array, ""] | None = None,
         cube: CubeInputs | None = None,
         loads: BodySignals | None = None,
@@ -223,17 +223,17 @@ class Engine:
             InputError: a cube without a scene, or a scene without a cube; loads on another body than a rod alone.
         """
         if (cube is None) != (self.scene is None):
-            raise InputError("a cube without a scene, or a scene without a cube", where="engine")
+            raise InputError("a scene and a cube must be given together", where="engine")
         if loads is not None and not self.carries_loads:
             raise InputError(
                 "signals on the body act on a rod without a cube only",
                 where="engine",
                 remedy='set body = "rod" under [simulator], and leave the cube out',
             )
-        inputs = Inputs(material, start, displacement, cube, loads)
+        inputs = Inputs(material, start, drive, cube, loads)
         if self.backend.name == "jax":
             return self._reference(inputs, steps)
-        limit = jnp.asarray(displacement.shape[0] if steps is None else steps, jnp.float64)
+        limit = jnp.asarray(drive.shape[0] if steps is None else steps, jnp.float64)
         return self._differentiable(inputs, limit)
 
     def section_loads(self, loads: BodySignals | None) -> SectionLoads | None:
@@ -241,7 +241,7 @@ class Engine:
         return None if loads is None else SectionLoads(*loads, station=self.load_stations)
 
     def initial(
-        self, material: Material, start: Float[Array, " cable"], loads: BodySignals | None = None
+        self, material: Material, start: Float[Array, " drive"], loads: BodySignals | None = None
     ) -> tuple[Prepared, State, Float[Array, ""]]:
         """A rod in JAX before its first step, and the relative force out of balance."""
         system: Any = self.body.system
@@ -258,7 +258,7 @@ class Engine:
         return prepared, state, residual
 
     def _reference(self, inputs: Inputs, steps: Int[Array, ""] | None) -> Motion:
-        markers, rows = self.body.markers, inputs.displacement[:, None, :]
+        markers, rows = self.body.markers, inputs.drive[:, None, :]
         cube, system, material = inputs.cube, cast("System", self.body.system), cast("Material", inputs.material)
         around: dict[str, Any] = {} if cube is None else {"scene": self.scene, "cube": cube.cube}
         prepared, state, imbalance = self.initial(material, inputs.start, inputs.loads)
@@ -295,7 +295,8 @@ class Engine:
         return with_differences(self._call, input_sizes, self.backend.precision)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
-        rows, cables = inputs.displacement.shape[0] + 1, inputs.displacement.shape[1]
+        system, rows = self.body.system, inputs.drive.shape[0] + 1
+        cables = len(system.cables.anchor) if isinstance(system, System) else inputs.drive.shape[1]
 
         def numbers(*shape: int) -> jax.ShapeDtypeStruct:
             return jax.ShapeDtypeStruct(shape, jnp.float64)
@@ -312,9 +313,9 @@ class Engine:
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
             options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": self.section_loads(inputs.loads)}
-            found = self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
+            found = self.native.rollout(inputs.material, inputs.drive, **begin, **options)
             return found._replace(solves=None)
-        commands = inputs.displacement[:, :steps]
+        commands = inputs.drive[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 
 
@@ -327,7 +328,7 @@ def cube_arrays(cube: CubeInputs) -> tuple[Float[np.ndarray, "batch 13"], Float[
 
 def input_sizes(inputs: Inputs) -> Inputs:
     """Sizes that perturbations of the inputs are relative to."""
-    material, start, displacement, cube, loads = inputs
+    material, start, drive, cube, loads = inputs
     changes: dict[str, Any] = {
         "gravity": jnp.full_like(material.gravity, ACCELERATION),
         "rayleigh_mass": jnp.abs(material.rayleigh_mass) + MASS_DAMPING,
@@ -351,10 +352,6 @@ def input_sizes(inputs: Inputs) -> Inputs:
         cube = CubeInputs(solid._replace(friction=jnp.abs(cube.cube.friction) + FRICTION), place)
     if loads is not None:
         loads = jax.tree.map(lambda part, size: jnp.full_like(part, size), loads, BODY_SIGNALS)
-    return Inputs(magnitudes, _length_of(start), _length_of(displacement), cube, loads)
-
-
-def _length_of(displacement: Float[Array, "*row cable"]) -> Float[Array, "*row cable"]:
-    """Size of a displacement: its own if it winds a soft spring, which is far more than a cable's length."""
-    size = jnp.abs(displacement)
-    return jnp.where(size > FAR_WOUND, size, LENGTH)
+    largest = jnp.maximum(jnp.abs(start), jnp.max(jnp.abs(drive), axis=0, initial=0.0))
+    size = jnp.where(largest > FAR_WOUND, largest, LENGTH)
+    return Inputs(magnitudes, size, jnp.broadcast_to(size, drive.shape), cube, loads)

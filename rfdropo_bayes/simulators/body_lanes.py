@@ -172,7 +172,7 @@ class ReferenceLanes:
         if self._lanes is None:
             self._lanes = fresh
         elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):
-            raise InputError("a lane whose body has other effects than the lanes before", where="reset")
+            raise InputError("a lane has other effects of the body than earlier lanes", where="reset")
         self._lanes = jax.tree.map(lambda new, old: old.at[rows].set(new[rows]), fresh, self._lanes)
         return Motion(*(None if part is None else part[rows] for part in self._shown(self._lanes.state.tension)))
 

@@ -83,7 +83,7 @@ class Session:
         self.steps = round(period / simulator.time_step)
         if self.steps < 1 or abs(self.steps - period / simulator.time_step) > WHOLE:
             raise InputError(
-                f"a control period of {period:g} s is no whole number of time steps",
+                f"a control period of {period:g} s is not a whole number of time steps",
                 remedy=f"give a multiple of {simulator.time_step:g} s",
             )
         self._check_mechanisms(simulator.mechanisms)

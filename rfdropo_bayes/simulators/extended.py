@@ -32,7 +32,7 @@ from rfdropo_bayes.simulators.protocol import Result
 class Wound(NamedTuple):
     """Drives between two steps."""
 
-    level: Float[Array, " cable"]  # displacement of the cables at their drives, without pretension [m]
+    level: Float[Array, " drive"]  # of cables at their drives, without pretension [m] or [N]; of chambers [Pa]
     sent: Float[Array, " channel"]  # last command that reached them [m or rad]
 
 

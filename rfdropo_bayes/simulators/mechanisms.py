@@ -264,12 +264,19 @@ def motions_of(mechanism: Mechanism | type) -> tuple[str, ...]:
     return tuple(getattr(mechanism, "motions", MOTIONS))
 
 
-def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0]) -> str | None:
-    """Why a mechanism does not run on a body, on an engine or in a motion; None if it runs."""
+def needs_cables(mechanism: Mechanism | type) -> bool:
+    """Whether a mechanism acts on cables in the body."""
+    return bool(getattr(mechanism, "needs_cables", False))
+
+
+def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0], cables: bool = True) -> str | None:
+    """Why a mechanism does not run on a body with or without cables, on an engine or in a motion; None if it runs."""
     if body == BLACK_BOX:
         return None if mechanism.stage in ("actuation", "sensing") else f"it acts on the {mechanism.stage}, inside"
     if body not in bodies_of(mechanism):
         return f"it acts on {' and '.join(bodies_of(mechanism))} bodies only"
+    if needs_cables(mechanism) and not cables:
+        return "it acts on cables, and the robot has none"
     if engine not in engines_of(mechanism):
         return f"it runs on the engine {' or '.join(engines_of(mechanism))} only"
     if motion not in motions_of(mechanism):

@@ -48,7 +48,7 @@ class TetrahedraTable(BaseModel):
 
     mesh: str = Field(description="mesh file (VTK, Gmsh), in the folders of recordings")
     unit: Literal["m", "cm", "mm"] = Field(description="unit of its coordinates, in the frame of the robot's base")
-    clamp_height: float = Field(description="nodes at or below this height are held [m]")
+    clamp_height: float = Field(description="height [m] at or below which nodes are fixed")
     frames: Literal["polar", "edges"] = Field(
         default="polar",
         description="frame of an element: the rotation nearest to its deformation, or axes along its edges "
@@ -60,8 +60,8 @@ class TetrahedraTable(BaseModel):
     )
     drives: Literal["robot", "sofa"] = Field(
         default="robot",
-        description='"robot" follows the robot\'s ramp, lag and end stops; "sofa" hands a command over in equal '
-        "updates, as an animation of SOFA's STLIB does, to cables that SOFA's CableConstraint limits",
+        description='"robot" follows the robot\'s ramp, lag and end stops; "sofa" applies a command in equal updates, '
+        "as an animation of SOFA's STLIB does, and limits cables as SOFA's CableConstraint does",
     )
     drive_rate: Annotated[float, Field(gt=0.0)] | None = Field(
         default=None,

@@ -1,4 +1,4 @@
-"""Common base of simulators of a cable-driven robot with any body: parameters, drives and measurement."""
+"""Common base of simulators of a robot with cables or chambers, with any body: parameters, drives and measurement."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     check_mechanisms,
     code_of,
     motions_of,
+    needs_cables,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.port_signals import BodySignals
@@ -342,12 +343,15 @@ class RobotSimulator(ExtendedSimulator):
             stiffness_scale=stiffness_scale,
             point_mass=point_mass,
         )
-        if self.robot.held_by_force:
+        if self.robot.held_by_force and self.robot.cables:
             material = material._replace(effects=material.effects._replace(cable_compliance=jnp.asarray(SOFT)))
         for mechanism in self.mechanisms:
             if self.at_rest and QUASI_STATIC not in motions_of(mechanism):
                 words = f"the mechanism {mechanism.name!r} acts on a body in motion"
                 raise InputError(words, where="[model] mechanisms", remedy=f"remove it, or {DYNAMIC}")
+            if needs_cables(mechanism) and not self.robot.cables:
+                words = f"the mechanism {mechanism.name!r} acts on cables, and the robot has none"
+                raise InputError(words, where="[model] mechanisms", remedy="remove it")
             if isinstance(mechanism, BodyMechanism):
                 material = mechanism.embody(values, material, body)
                 if not self.engine.is_rod and "tetrahedra" not in bodies_of(mechanism):
@@ -403,15 +407,17 @@ class RobotSimulator(ExtendedSimulator):
         """Cable displacements at zero command [m]."""
         return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
 
-    def exerted(self, values: Values, level: Float[Array, " cable"]) -> Float[Array, " cable"]:
-        """Displacements of the cables [m] at levels of their drives [m or N]: a drive that holds a tension winds a
+    def exerted(self, values: Values, level: Float[Array, " drive"]) -> Float[Array, " drive"]:
+        """Drives of the engine at levels of the robot's drives [m, N or Pa]: a drive that holds a tension winds a
         spring that is so soft that the cable's own length does not count."""
-        return SOFT * level if self.robot.held_by_force else level + self.pretension(values)
+        if self.robot.held_by_force:
+            return level * np.array([SOFT if each.unit == "N" else 1.0 for each in self.robot.actuators])
+        return level + self.pretension(values)
 
     def wound(
         self, values: Values, commands: Commands, time_step: float
-    ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
-        """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
+    ) -> tuple[Float[Array, " drive"], Float[Array, "step drive"]]:
+        """Drives of the engine before the first step and at the end of every step, with their end stops."""
         initial, command = self.actuated(values, commands, time_step)
         start = self.unwound(values, initial)
         levels = jax.lax.scan(lambda drives, sent: self.wind(values, drives, sent), start, command)[1]
@@ -425,8 +431,8 @@ class RobotSimulator(ExtendedSimulator):
 
     def wind(
         self, values: Values, drives: Wound, sent: Float[Array, " channel"]
-    ) -> tuple[Wound, Float[Array, " cable"]]:
-        """The drives at the end of a step, and the cables' displacements [m], given the command that reached them."""
+    ) -> tuple[Wound, Float[Array, " drive"]]:
+        """The drives at the end of a step, and the engine's drives, given the command that reached them."""
         limits = jnp.asarray(self.robot.drive_limits())
         move = jnp.asarray(self.robot.channel_matrix(values)) @ (sent - drives.sent)
         # A drive at its limit ignores further pulls, and answers the first release at once.

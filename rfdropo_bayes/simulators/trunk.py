@@ -10,7 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem import Material, PointMap, System, attach, cable_layout, profile_rod, refined
+from rfdropo_bayes.fem import (
+    Material,
+    PointMap,
+    Rod,
+    System,
+    attach,
+    cable_layout,
+    chamber_layout,
+    profile_rod,
+    refined,
+)
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.stage_balance import stepped_balance
 from rfdropo_bayes.robots import Robot
@@ -41,9 +51,18 @@ def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
     """Cut the robot's body into elements and attach cables and markers to it."""
     cuts = discretisation.refine * np.array(robot.body.cuts())
     body = refined(profile_rod(**robot.rod_arrays()), cuts)
-    system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
+    system = System(body, cable_layout(body, robot.anchors(), robot.guides()), chambers=_chambers(robot, body))
     station_of = np.append(0, np.cumsum(cuts))
     return Assembly(system, attach(body, np.concatenate([robot.marker_points(), section_points(robot)])), station_of)
+
+
+def _chambers(robot: Robot, body: Rod) -> np.ndarray | None:
+    """Layout of a robot's chambers; None without chambers."""
+    if not robot.chambers:
+        return None
+    middle = np.array([chamber.middle() for chamber in robot.chambers])
+    ends = np.array([chamber.z_m for chamber in robot.chambers])
+    return chamber_layout(body, middle, ends, [chamber.area_m2 for chamber in robot.chambers])
 
 
 ARM = 0.01
@@ -94,6 +113,7 @@ class TrunkSimulator(RobotSimulator):
         system, engine = self.assembly.system, self.engine
         material, start, displacement = inputs
         prepared, state, _ = engine.initial(material, start)
+        state = state._replace(commanded=start)
         around = () if cube is None else (engine.scene, cube.cube)
         if cube is not None:
             state = state._replace(cube=cube.start)

@@ -121,7 +121,7 @@ def adapt(
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
         found = run(folder, (folder / CONFIG).read_text(encoding="utf-8"))
-        say_step("the day is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
+        say_step("the session is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
         found.save(folder)
     return found
 
@@ -163,7 +163,7 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     check = checks.get(asked.rest)
     if check and check["adapted"]["error_mm"] > check["from_first_row"]["error_mm"]:
         cautions.append(_kept_caution(check))
-        say_step("the rest of the recording is predicted worse: fitting the day to the first row alone", show=show)
+        say_step("the rest of the recording is predicted worse: fitting the session to the first row alone", show=show)
         adapted = _fitted(asked._replace(head=_first_row(asked.head)), draws, fit_key, show)
         checks = _checks(before, adapted.predictions)
     found = adapted.found
@@ -246,7 +246,7 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
     noise = replace(noise, scale=found.excess * noise.scale)
     program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
     problem = CalibrationProblem(program, chunk=simulator.lanes)
-    say_step(f"the day is fitted: predicting {_named([head, *asked.tested])}", show=show)
+    say_step(f"the session is fitted: predicting {_named([head, *asked.tested])}", show=show)
     predictions = predict_fitted(problem, found.values, fitted_key)
     cautions = _cautions(found)
     slow = _error_beyond(fit.record, predictions[0])
@@ -328,11 +328,11 @@ def _own_of_day(fit: PosteriorRecord, scopes: Scopes, recording: str, day: str) 
         raise InputError(
             f"{recording} belongs to {day}, which was fitted",
             where="adapt",
-            remedy="predict it as it is, or give its day a new --group",
+            remedy="predict it as it is, or give its session a new --group",
         )
     if not own:
         raise InputError(
-            "nothing of the model differs between days",
+            "no parameter of the model differs between sessions",
             where="[model.per_group]",
             remedy=(
                 "name the parameters that do, e.g. --set model.per_group.initial_displacement=0.002, and a new --group"
@@ -454,14 +454,14 @@ def _cautions(found: DayFit) -> list[Caution]:
     cautions = []
     if found.excess > MUCH_WORSE:
         sentence = (
-            f"the day is fitted {found.excess:.2g} times worse than the fitted days: most of its squared error is of a "
-            "kind that the fitted days lack and that no parameter of the day explains; see that the recording and "
-            "its commands are right, name more in [model.per_group], or calibrate with it"
+            f"the session is fitted {found.excess:.2g} times worse than the fitted sessions, and no parameter of the "
+            "session explains most of its squared error; check the recording and its commands, name more parameters in "
+            "[model.per_group], or calibrate with the recording"
         )
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
     if found.unconverged:
         sentence = (
-            f"the day's parameters did not converge in {MOST_STEPS} steps under {found.unconverged} of "
+            f"the session's parameters did not converge in {MOST_STEPS} steps under {found.unconverged} of "
             f"{len(found.chosen)} draws of the body; these count as far as they explain the recording"
         )
         cautions.append(Caution(Code.DAY_UNMATCHED, sentence, grave=found.unconverged > len(found.chosen) // 2))

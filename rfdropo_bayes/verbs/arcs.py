@@ -1,4 +1,4 @@
-"""A robot as a chain of circular arcs under cables that only pull: its marker positions, for many guesses at once.
+"""A robot as a chain of circular arcs under cables that only pull, or chambers: marker positions, for many guesses.
 
 Between the heights at which cables end, the body is an arc that bends and shortens. A cable that is pulled in by
 :math:`d` requires :math:`r\\,\\beta` and the shortening of all arcs below its end to add up to it, or is slack. The
@@ -14,12 +14,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.cable import Cable
+from rfdropo_bayes.robots.chamber import Chamber
 
 ITERATIONS = 30
 LOOKED, STILL = 5, 1e-2
 """Iterations between convergence checks, and the limit of a change as a share of the largest tension."""
 SOFTENED = 1e-3
 """Softness of a cable as a share of its own compliance: redundant cables then share the load."""
+LEAST_RADIUS = 1e-6
+"""[m] A chamber on the axis, which bends nothing, counts as beside it by this distance."""
 STIFFEST = 10.0
 """Stiffness against shortening over that against bending, at the cables: more would slow the iterations down, and is
 felt only by cables that pull against each other."""
@@ -151,11 +155,25 @@ def _arc(
     return way, row
 
 
+def _as_cable(each: Cable | Chamber) -> tuple[Cable, float]:
+    """A cable, and its force per unit of its drive; for a chamber a cable on the other side of the axis, which bends
+    the body the same way."""
+    if isinstance(each, Cable):
+        return each, 1.0
+    radius = max(each.radius_m, LEAST_RADIUS)
+    cable = Cable(
+        name=each.name, azimuth_deg=each.azimuth_deg + 180.0, anchor_z_m=each.z_m[0], anchor_radius_m=radius,
+        guide_z_m=each.z_m[1:], guide_radius_m=(radius,), drive="tension", tension_limit_n=(0.0, 1.0),
+    )  # fmt: skip
+    return cable, each.area_m2
+
+
 def arcs_of(robot: Robot, markers: tuple[str, ...]) -> tuple[Arcs, list[Kind], list[tuple[int, float]]]:
     """The chain of a robot; the kinds of its channels; and of each channel its kind and azimuth [rad]."""
     station = np.array(robot.body.station_m)
-    ends = sorted({round(cable.guide_z_m[-1], 9) for cable in robot.cables})
-    base = min(cable.anchor_z_m for cable in robot.cables)
+    cables, forces = zip(*(_as_cable(each) for each in robot.actuators), strict=True)
+    ends = sorted({round(cable.end_m, 9) for cable in cables})
+    base = min(cable.anchor_z_m for cable in cables)
     tip = max([*ends, *(marker.point_m[2] for marker in robot.markers)])
     cuts = np.array([base, *ends, *([tip] if tip > ends[-1] + 1e-9 else [])])
     length = np.diff(cuts)
@@ -164,25 +182,25 @@ def arcs_of(robot: Robot, markers: tuple[str, ...]) -> tuple[Arcs, list[Kind], l
     area = np.array(robot.body.axial_area_m2)
     modulus = robot.nominal()["young_modulus"]
     bending = layer @ (1.0 / moment) / modulus
-    radius = float(np.mean([r for cable in robot.cables for r in cable.guide_radius_m]))
+    radius = float(np.mean([r for cable in cables for r in cable.guide_radius_m]))
     axial = np.maximum(bending * radius**2 / STIFFEST, layer @ (1.0 / area) / modulus)
     shown = [next(m for m in robot.markers if m.name == name) for name in markers]
     height = np.array([marker.point_m[2] for marker in shown])
     at = np.clip(np.searchsorted(cuts, height - 1e-9) - 1, 0, len(length) - 1)
     share = np.clip((height - cuts[at]) / length[at], 0.0, 1.0)
     offset = np.array([marker.point_m[:2] for marker in shown]).reshape(-1, 2)
-    chain = Arcs(length, bending, axial, at, share, offset, robot.cables[0].unit == "m")
+    chain = Arcs(length, bending, axial, at, share, offset, not robot.held_by_force)
     kinds, channels = [], []
-    matrix = np.asarray(robot.channel_matrix(robot.nominal()), float)
+    matrix = np.array(forces)[:, None] * np.asarray(robot.channel_matrix(robot.nominal()), float)
     for column in matrix.T:
         moved = np.flatnonzero(column)
-        moved = moved[np.argsort([-ends.index(round(robot.cables[c].guide_z_m[-1], 9)) for c in moved], kind="stable")]
-        first = np.radians(robot.cables[moved[0]].azimuth_deg)
+        moved = moved[np.argsort([-ends.index(round(cables[c].end_m, 9)) for c in moved], kind="stable")]
+        first = np.radians(cables[moved[0]].azimuth_deg)
         kind = Kind(
             tuple(float(f"{column[c]:.9g}") for c in moved),
-            tuple(float(f"{np.mean(robot.cables[c].guide_radius_m):.9g}") for c in moved),
-            tuple(round(float((np.radians(robot.cables[c].azimuth_deg) - first) % (2 * np.pi)), 6) for c in moved),
-            tuple(ends.index(round(robot.cables[c].guide_z_m[-1], 9)) for c in moved),
+            tuple(float(f"{np.mean(cables[c].guide_radius_m):.9g}") for c in moved),
+            tuple(round(float((np.radians(cables[c].azimuth_deg) - first) % (2 * np.pi)), 6) for c in moved),
+            tuple(ends.index(round(cables[c].end_m, 9)) for c in moved),
         )
         if kind not in kinds:
             kinds.append(kind)

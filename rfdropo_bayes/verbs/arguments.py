@@ -28,7 +28,7 @@ def given_model(given: Any, where: str) -> Model:
     remedy = (
         'rb.Model("my_arm.toml", priors=...) makes one of a robot, rb.Model.read("experiment.toml") of an experiment'
     )
-    raise InputError(f"{named} is no model", where=where, remedy=remedy)
+    raise InputError(f"{named} is not a model", where=where, remedy=remedy)
 
 
 def given_fit(given: Any, where: str) -> Calibration:
@@ -42,4 +42,4 @@ def given_fit(given: Any, where: str) -> Calibration:
         return given
     named = f"{str(given)!r}" if isinstance(given, str | Path) else f"a {type(given).__name__}"
     remedy = "rb.calibrate returns one, rb.load(folder) reads the calibration of an earlier run"
-    raise InputError(f"{named} is no calibration", where=where, remedy=remedy)
+    raise InputError(f"{named} is not a calibration", where=where, remedy=remedy)

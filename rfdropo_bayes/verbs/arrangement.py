@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.cable import Cable
 
 
 class Arrangement(NamedTuple):
@@ -47,42 +46,37 @@ def as_written(channels: int, sections: int) -> Arrangement:
 
 
 class Sections(NamedTuple):
-    """The sections of a robot: groups of cables with equal end height.
+    """The sections of a robot: groups of cables and chambers with equal end height.
 
     Attributes:
-        of_cable: number of the section of each cable, base to tip.
-        of_channel: highest section with a cable of each channel.
+        of_drive: number of the section of each cable, then of each chamber, base to tip.
+        of_channel: highest section that each channel drives.
     """
 
-    of_cable: tuple[int, ...]
+    of_drive: tuple[int, ...]
     of_channel: tuple[int, ...]
 
     @property
     def number(self) -> int:
         """Number of sections."""
-        return 1 + max(self.of_cable)
+        return 1 + max(self.of_drive)
 
 
 def sections_of(robot: Robot) -> Sections:
-    """Sections by the heights at which cables end."""
-    ends = [round(cable.guide_z_m[-1], 6) for cable in robot.cables]
+    """Sections by the heights at which cables and chambers end."""
+    ends = [round(each.end_m, 6) for each in robot.actuators]
     number = {end: k for k, end in enumerate(sorted(set(ends)))}
-    of_cable = tuple(number[end] for end in ends)
+    of_drive = tuple(number[end] for end in ends)
     gain = np.array(robot.channels.gain) != 0.0
-    return Sections(of_cable, tuple(int(max(np.array(of_cable)[moved])) for moved in gain.T))
+    return Sections(of_drive, tuple(int(max(np.array(of_drive)[moved])) for moved in gain.T))
 
 
-def turned_cables(robot: Robot, turns: Sequence[float]) -> list[Cable]:
-    """The cables with each section turned about +z [rad]."""
-    of_cable = sections_of(robot).of_cable
-    return [_turned(cable, float(np.degrees(turns[k]))) for cable, k in zip(robot.cables, of_cable, strict=True)]
-
-
-def _turned(cable: Cable, angle: float) -> Cable:
-    anchor = cable.anchor_azimuth_deg
-    changes = {"azimuth_deg": cable.azimuth_deg + angle}
-    changes |= {} if anchor is None else {"anchor_azimuth_deg": anchor + angle}
-    return cable.model_copy(update=changes)
+def turned_robot(robot: Robot, turns: Sequence[float]) -> Robot:
+    """The robot with the cables and chambers of each section turned about +z [rad]."""
+    angles = np.degrees(np.asarray(turns, dtype=float))[list(sections_of(robot).of_drive)]
+    turned = [each.turned(float(angle)) for each, angle in zip(robot.actuators, angles, strict=True)]
+    cables = len(robot.cables)
+    return robot.with_changes(cables=tuple(turned[:cables]), chambers=tuple(turned[cables:]))
 
 
 class Moved(NamedTuple):

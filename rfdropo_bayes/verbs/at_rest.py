@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rfdropo_bayes.data import Trajectory, shared_markers
 from rfdropo_bayes.model.assembly import build_robot_simulator, expand_groups
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots.cable import Cable
+from rfdropo_bayes.robots.robot import Robot
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SensingMechanism, motions_of
@@ -117,10 +117,9 @@ class RestingRobot:
         """The same robot with predictions of these markers alone."""
         return RestingRobot(self.simulator, tuple(markers), self.held)
 
-    def with_cables(self, cables: Sequence[Cable]) -> RestingRobot:
-        """The same body, parameters and drives, with other cables; nothing is recompiled."""
+    def as_robot(self, robot: Robot) -> RestingRobot:
+        """The same body, parameters and drives, with cables and chambers of another robot; nothing is recompiled."""
         own = self.simulator
-        robot = own.robot.with_changes(cables=tuple(cables))
         assembly = assemble(robot, own.discretisation)
         changed = replace(own, robot=robot, assembly=assembly, engine=replace(own.engine, body=assembly))
         found = RestingRobot(changed, self.shown, self.held)

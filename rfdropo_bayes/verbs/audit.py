@@ -14,6 +14,7 @@ from pydantic import field_validator
 
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
+from rfdropo_bayes.bayes.lanes import Lanes, RoutedLanes
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
@@ -28,7 +29,6 @@ from rfdropo_bayes.discrepancy.differences import Groups, with_differences
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Rules
 from rfdropo_bayes.discrepancy.fit import widening
 from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, with_fixed_quantities
-from rfdropo_bayes.discrepancy.forward import Lanes, RoutedLanes
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.law_words import law_tables
 from rfdropo_bayes.discrepancy.pipeline import Answer
@@ -348,7 +348,8 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
     for name in names:
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
         body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
-        why = obstacle(mechanism, body, engine, spec.simulator.motion)
+        cables = not isinstance(spec.robot, Robot) or bool(spec.robot.cables)
+        why = obstacle(mechanism, body, engine, spec.simulator.motion, cables)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:

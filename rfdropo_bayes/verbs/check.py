@@ -49,7 +49,7 @@ from rfdropo_bayes.verbs.motion_check import measure_motion
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
-from rfdropo_bayes.verbs.recording_doubts import asked_pulls, cables_beyond, recording_cautions, shortened
+from rfdropo_bayes.verbs.recording_doubts import asked_pulls, drives_beyond, recording_cautions, shortened
 from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
@@ -344,8 +344,8 @@ def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterato
     if travel is not None:
         yield from _travel(travel, robot)
     asked = asked_pulls(robot, trajectory)
-    doubted = asked is None or (robot.cables[0].unit == "m" and asked.max() > robot.length)
-    beyond = "" if asked is None or doubted else cables_beyond(robot, asked)
+    doubted = asked is None or (not robot.held_by_force and asked.max() > robot.length)
+    beyond = "" if asked is None or doubted else drives_beyond(robot, asked)
     if beyond:
         held = "drives are held at the limits of the robot file if commands ask for more"
         found.notes.append(f"{trajectory.name}: {held}: {beyond}")

@@ -26,10 +26,16 @@ FOREIGN = {
     "%": re.compile(r"%|(?<![a-z])(percent|percentage|pct|duty|pwm)(?![a-z])", re.IGNORECASE),
     "V": re.compile(r"volt|[_ .\[(]m?V[\])]?$|^m?V$"),
     "A": re.compile(r"(?<![a-z])amps?(?![a-z])|[_ .\[(]m?A[\])]?$|^m?A$"),
-    "bar": re.compile(r"(?<![a-z])(m?bar|psi|[km]?pa|pressure)(?![a-z])", re.IGNORECASE),
+    **{
+        unit: re.compile(rf"(?<![a-z]){unit}(?![a-z])", re.IGNORECASE)
+        for unit in ("mbar", "bar", "psi", "kPa", "MPa", "Pa")
+    },
     "N": re.compile(r"newton|[_ .\[(]N[\])]?$|^N$"),
 }
 """Units of commands that are neither a length of cable nor an angle of a motor."""
+PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
+PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0
+"""Largest pressures in chambers of soft robots in kPa, and in bar."""
 ANGLES = ("rad", "deg", named_columns.COUNTS)
 ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
 TIME_UNITS = {
@@ -159,6 +165,9 @@ def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) ->
     if all(ANGLE.search(name) for name in names):
         return angle_unit(values, names)
     largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
+    if all(PRESSURE.search(name) for name in names):
+        unit = "Pa" if largest > PASCALS_ABOVE else "kPa" if largest > KILOPASCALS_ABOVE else "bar"
+        return Unit(unit, evidence=f"{_span(names)} reach {largest:.3g}")
     whole = all(pd.api.types.is_integer_dtype(values[name]) for name in names)
     evidence = f"{_span(names)} reach {largest:.3g}" + (" in whole numbers, as counts do" if whole else "")
     return Unit("mm" if largest > METRES_UP_TO else "m", evidence=evidence)

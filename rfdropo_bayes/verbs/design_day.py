@@ -171,7 +171,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     own = [p for p in scopes.parameters if p.name not in body]
     if not own:
         raise InputError(
-            "nothing of the model differs between days",
+            "no parameter of the model differs between sessions",
             where="[model.per_group]",
             remedy="name the parameters that vary between sessions, and calibrate",
         )

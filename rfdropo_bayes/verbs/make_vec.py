@@ -182,7 +182,7 @@ def randomisation_of(
     both = sorted(set(parts[0].names) & {name for part in parts[1:] for name in part.names})
     if both:
         raise InputError(
-            f"{both[0]} has a fixed value, and randomisation = {parts[-1].kind!r} gives it others",
+            f"{both[0]} is fixed, but randomisation = {parts[-1].kind!r} varies it",
             where="[model.fixed]",
             remedy="leave one of them out",
         )

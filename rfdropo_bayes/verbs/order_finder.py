@@ -21,7 +21,7 @@ from rfdropo_bayes.verbs.arrangement import (
     motion_of,
     neighbours,
     sections_of,
-    turned_cables,
+    turned_robot,
 )
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, spread_rows
 
@@ -191,7 +191,7 @@ def arranged(resting: RestingRobot, arrangement: Arrangement) -> RestingRobot:
     """The robot with its sections turned."""
     if not any(arrangement.turns):
         return resting
-    return resting.with_cables(turned_cables(resting.simulator.robot, arrangement.turns))
+    return resting.as_robot(turned_robot(resting.simulator.robot, arrangement.turns))
 
 
 def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key: str) -> list[str]:
@@ -213,8 +213,7 @@ def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key:
         lines.append(f"gain = [{rows}] in [channels] of the robot file")
     if any(abs(turn) > SAME_TURN for turn in arrangement.turns):
         told = [
-            f"{cable.name} {(cable.azimuth_deg + float(np.degrees(arrangement.turns[k]))) % 360.0:.0f}"
-            for cable, k in zip(robot.cables, sections_of(robot).of_cable, strict=True)
+            f"{each.name} {each.azimuth_deg % 360.0:.0f}" for each in turned_robot(robot, arrangement.turns).actuators
         ]
-        lines.append(f"azimuth_deg of the cables in the robot file: {', '.join(told)}")
+        lines.append(f"azimuth_deg in the robot file: {', '.join(told)}")
     return lines

@@ -77,8 +77,8 @@ def predict(
         fit: a calibration, with its model.
         commands: a recording, of which only the commands and the first row are used; the name of a file in the format
             of the model's experiment; or a pair of times [s] and commands (time, channel), in the robot's unit.
-        start: positions of the markers in the first row [m], (marker, 3), for such a pair; for a file, the file of
-            observations, if it is another file (see `load_unseen`); unknown by default.
+        start: positions of the markers in the first row [m], (marker, 3), if commands are a pair; if commands are a
+            file without observations, the file that has them (see `load_unseen`); unknown by default.
         episode: number of the episode, if the file is a LeRobotDataset.
         draws: number of posterior draws to simulate.
         seed: seed of random numbers; by default from the model's experiment.

@@ -373,7 +373,7 @@ class _Whitening:
         return np.concatenate(parts, axis=-1)
 
     def tensions(self, slope: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Over a relative noise of the tensions."""
+        """Derivatives of tensions, divided by their noise, which is a share of the typical tension."""
         typical = np.sqrt(np.mean(level**2, axis=(1, 2), keepdims=True))[:, None]
         error = TENSION_ERROR * np.where(typical > 0.0, typical, np.inf)
         parts = [(slope / error)[:, :, index, :rows] for index, rows in enumerate(self.rows)]

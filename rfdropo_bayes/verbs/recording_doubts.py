@@ -147,12 +147,12 @@ def _unasked(recording: Trajectory, robot: Robot) -> list[Caution]:
     return [Caution(Code.RECORDING_DOUBTFUL, sentence)]
 
 
-SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N")}
-"""Factor and unit in which the drive of a cable is shown."""
+SHOWN = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
+"""Factor and unit in which the drive of a cable or chamber is shown."""
 
 
-def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows cable"] | None:
-    """Demand on each cable, in SI units of its drive; None for commands that do not fit the robot."""
+def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows drive"] | None:
+    """Demand on each cable and chamber, in SI units of its drive; None for commands that do not fit the robot."""
     if len(recording.cable_names) != len(robot.channel_names) or recording.command_unit != robot.command_unit:
         return None
     try:
@@ -163,32 +163,27 @@ def asked_pulls(robot: Robot, recording: Trajectory) -> Float[np.ndarray, "rows 
     return np.asarray(command @ np.asarray(robot.channel_matrix({})).T)
 
 
-def cables_beyond(robot: Robot, asked: Float[np.ndarray, "rows cable"]) -> str:
-    """Cables with commands beyond their limits, in words; empty if there are none."""
+def drives_beyond(robot: Robot, asked: Float[np.ndarray, "rows drive"]) -> str:
+    """Cables and chambers with commands beyond their limits, in words; empty if there are none."""
     low, high = asked.min(axis=0), asked.max(axis=0)
     least, most = np.array(robot.drive_limits()).T
-    factor, unit = SHOWN[robot.cables[0].unit]
-    return ", ".join(
-        f"{robot.cable_names[k]} {factor * low[k]:.3g} to {factor * high[k]:.3g} {unit} "
-        f"(limits {factor * least[k]:.3g} to {factor * most[k]:.3g})"
-        for k in np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9))
-    )
+    words = []
+    for k in np.flatnonzero((low < least - 1e-9) | (high > most + 1e-9)):
+        factor, unit = SHOWN[robot.actuators[k].unit]
+        asks, limits = (f"{factor * a[k]:.3g} to {factor * b[k]:.3g}" for a, b in ((low, high), (least, most)))
+        words.append(f"{robot.actuators[k].name} {asks} {unit} (limits {limits})")
+    return ", ".join(words)
 
 
 def _beyond_the_body(recording: Trajectory, robot: Robot) -> list[Caution]:
     """Cables with commands longer than the body."""
     asked = asked_pulls(robot, recording)
     length = robot.length
-    if (
-        robot.cables[0].unit != "m"
-        or asked is None
-        or asked.max(initial=0.0) <= length
-        or not cables_beyond(robot, asked)
-    ):
+    if robot.held_by_force or asked is None or asked.max(initial=0.0) <= length or not drives_beyond(robot, asked):
         return []
     sentence = (
         f"{recording.name}: cables are asked for pulls that no body of {MILLIMETRES * length:.3g} mm has: "
-        f"{cables_beyond(robot, asked)}: look at command_unit, at counts_per_turn, and at spool_radius and gain of the "
+        f"{drives_beyond(robot, asked)}: look at command_unit, at counts_per_turn, and at spool_radius and gain of the "
         "robot file"
     )
     return [Caution(Code.UNIT_DOUBTFUL, sentence)]

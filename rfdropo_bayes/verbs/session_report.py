@@ -33,7 +33,7 @@ def write_session_page(folder: Path) -> Path:
         config = (folder / CONFIG).read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         raise InputError(
-            f"is no whole session ({error})", where=str(folder), remedy="give a folder that rfdropo deploy wrote"
+            f"is not a complete session ({error})", where=str(folder), remedy="give a folder that rfdropo deploy wrote"
         ) from None
     recording = Trajectory.load(folder / SESSION) if (folder / SESSION).is_file() else None
     goal = tomllib.loads(config).get("goal", {})

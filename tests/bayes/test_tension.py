@@ -161,7 +161,7 @@ def test_what_cannot_be_used_is_refused():
         WeighedParts((Weighed(("maas",), 0.1, 0.01),)).named([ParameterInfo("mass", "kg")])
     other = HangingMass()
     other.cable_names = ("push",)
-    with pytest.raises(InputError, match="no cables of the robot"):
+    with pytest.raises(InputError, match="not cables of the robot"):
         Tension.gather(other, [recording()], 15)
 
 

@@ -283,5 +283,5 @@ def test_tables_of_other_libraries_are_taken():
     frame = pd.DataFrame({"t": [0.0, 0.5, 1.0], "u": [1.0, 2.0, 2.0], "x": [9.0, 8.0, 7.0], "y": 0.0, "z": 100.0})
     found = Trajectory.from_pandas(pa.Table.from_pandas(frame), columns)
     np.testing.assert_array_equal(found.position, Trajectory.from_pandas(frame, columns).position)
-    with pytest.raises(InputError, match="a dict is no table; give a DataFrame"):
+    with pytest.raises(InputError, match="a dict is not a table; give a DataFrame"):
         Trajectory.from_pandas({"t": [0.0]}, columns)

@@ -264,7 +264,7 @@ def test_the_recorders_times_may_be_asked_for(tmp_path):
     rosbag(MOTION, tmp_path / "run")
     (recording,) = load(tmp_path, "rosbag", "run", bag_columns(time="log"))
     np.testing.assert_allclose(recording.command_time, MOTION.command_time - LATENCY, atol=1e-6)
-    with fails("time = 't' is no clock of a bag"):
+    with fails("time = 't' is not a clock of a bag"):
         load(tmp_path, "rosbag", "run", bag_columns(time="t"))
 
 

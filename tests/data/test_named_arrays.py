@@ -68,5 +68,5 @@ def test_the_fields_of_a_structure_follow_a_full_stop(tmp_path):
 def test_a_damaged_file_is_said(tmp_path, file):
     (savemat if file.endswith("mat") else lambda path, arrays: np.savez(path, **arrays))(tmp_path / file, ARRAYS)
     (tmp_path / file).write_bytes((tmp_path / file).read_bytes()[:300])
-    with pytest.raises(InputError, match="is no file of arrays that can be read"):
+    with pytest.raises(InputError, match="is not a readable file of arrays"):
         read_arrays(tmp_path / file)

@@ -49,8 +49,8 @@ def test_what_a_drive_does_after_a_quick_stop_is_told_once(states, words) -> Non
     for state in states[1:]:
         drive.state = state
         after.look()
-    assert len(after.found) == len(words)
-    assert all(word in line for word, line in zip(words, after.found, strict=True))
+    assert len(after.events) == len(words)
+    assert all(word in line for word, line in zip(words, after.events, strict=True))
 
 
 def test_a_drive_may_let_go_if_its_owner_bears_that() -> None:

@@ -151,7 +151,7 @@ def test_an_axis_of_another_profile_is_refused(rigs) -> None:
     """Inputs and outputs (CiA 401) in the place of the second axis."""
     drives = rigs(TWO_BY_TWO, values={(of_axis(Object.PROFILE, 2), 0): 401}).drives(GUARDS)
     drives.all[0].check(Identity())
-    with pytest.raises(InputError, match="is no CiA 402 drive"):
+    with pytest.raises(InputError, match="is not a CiA 402 drive"):
         drives.all[1].check(Identity())
 
 

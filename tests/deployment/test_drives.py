@@ -160,7 +160,7 @@ def test_a_data_sheet_of_another_drive_is_refused(rig, tmp_path: Path, old: str,
 
 
 def test_no_data_sheet_and_no_answer_are_told_apart(rig, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no readable data sheet"):
+    with pytest.raises(InputError, match="not a readable data sheet"):
         rig.drives(eds=str(tmp_path / "none.eds"))
     rig.simulated.nodes[3].crashed = True
     with pytest.raises(InputError, match=r"'down' \(node 3\), object 0x1000:0: cannot be read"):

@@ -81,7 +81,7 @@ def test_a_hub_that_has_gone_is_an_error_not_a_silence(tmp_path) -> None:
 
 @pytest.mark.parametrize("channel", ["nowhere", "host:", "host:port", ":80"])
 def test_bad_channels_are_refused(channel: str) -> None:
-    with pytest.raises(InputError, match="no channel of a hub"):
+    with pytest.raises(InputError, match="not a channel of a hub"):
         address_of(channel)
 
 

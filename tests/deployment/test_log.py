@@ -157,10 +157,10 @@ def test_a_folder_is_used_once(robot: Robot, tmp_path: Path) -> None:
 
 
 def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no journal"):
+    with pytest.raises(InputError, match="not a journal"):
         read_journal(tmp_path)
     (tmp_path / JOURNAL).write_bytes(b"12 years a slave")
-    with pytest.raises(InputError, match="no journal"):
+    with pytest.raises(InputError, match="not a journal"):
         read_journal(tmp_path)
 
 

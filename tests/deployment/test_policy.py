@@ -116,9 +116,9 @@ def test_outputs_that_cannot_be_meant_end_the_session(robot: Robot, tmp_path: Pa
         ({"unit": "rad"}, "acts in rad"),
         ({"channels": ("a", "b", "c", "d")}, "drives a, b, c, d"),
         ({"channels": ("right", "down", "left", "up")}, "drives right, down, left, up"),
-        ({"observation": (ObservationPart("commands", 16, "m"),)}, "wants 16 numbers of 'commands'"),
-        ({"observation": (ObservationPart("markers", 16, "m"),)}, "wants 16 numbers of 'markers'; here there are 12"),
-        ({"observation": (ObservationPart("wind", 16, "m"),)}, "wants 'wind', which nothing here measures"),
+        ({"observation": (ObservationPart("commands", 16, "m"),)}, "needs 16 numbers of 'commands'"),
+        ({"observation": (ObservationPart("markers", 16, "m"),)}, "needs 16 numbers of 'markers'; there are 12"),
+        ({"observation": (ObservationPart("wind", 16, "m"),)}, "needs 'wind', which no sensor measures"),
         ({"observation": (ObservationPart("goal", 3, "m"),)}, "wants a goal"),
         ({"observation": (ObservationPart("commands", 4, "m"),)}, "takes .* of width 16, its layout 4"),
     ],
@@ -148,7 +148,7 @@ def test_files_that_are_no_policies_are_refused(robot: Robot, tmp_path: Path) ->
     with pytest.raises(InputError, match="cannot be read"):
         OnnxPolicy(path, robot, {})
     path.write_bytes(b"not a model")
-    with pytest.raises(InputError, match="is no ONNX model"):
+    with pytest.raises(InputError, match="is not an ONNX model"):
         OnnxPolicy(path, robot, {})
     linear_policy(path, robot, matrix(robot), np.zeros(4), card=False)
     with pytest.raises(InputError, match="no layout"):

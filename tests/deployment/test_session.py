@@ -224,10 +224,10 @@ def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"date": "2020-01-01T00:00:00Z"}, "h old, valid for"),
+        ({"date": "2020-01-01T00:00:00Z"}, "h old; the limit is"),
         ({"date": "2020-01-01T00:00:00"}, "timezone"),  # written by hand
-        ({"robot": "other"}, "is of robot 'other'"),
-        ({"homes": []}, "other channels"),
+        ({"robot": "other"}, "belongs to robot 'other'"),
+        ({"homes": []}, "channels differ"),
     ],
 )
 def test_a_homing_that_does_not_hold_is_refused(robot: Robot, tmp_path: Path, change: dict, message: str) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.lanes import Lanes, RoutedLanes
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
@@ -28,7 +29,6 @@ from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits, Rules
 from rfdropo_bayes.discrepancy.fit import climb
-from rfdropo_bayes.discrepancy.forward import Lanes, RoutedLanes
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements

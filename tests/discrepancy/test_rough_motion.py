@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.discrepancy import held_out, pipeline
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
-from rfdropo_bayes.discrepancy.forward import Lanes
 from rfdropo_bayes.discrepancy.pipeline import audit
 from rfdropo_bayes.errors import NoLikelihoodError
 from rfdropo_bayes.report.audit_page import render_audit, shown

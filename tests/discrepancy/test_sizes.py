@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
-from rfdropo_bayes.discrepancy.forward import Lanes
 
 from .toys import WIDE, Toy, problem, with_prior
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
+from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import mean_of, spread
 from rfdropo_bayes.bayes.scopes import build_scopes
@@ -21,7 +22,6 @@ from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import Rules
-from rfdropo_bayes.discrepancy.forward import Lanes
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.simulators.commands import commands_on_grid
 from rfdropo_bayes.simulators.parameters import ParameterSpec

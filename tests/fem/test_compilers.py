@@ -43,7 +43,7 @@ def test_numba_compiles_on_request() -> None:
 
 
 def test_an_unknown_compiler_is_refused() -> None:
-    with pytest.raises(InputError, match="'gcc' is no compiler"):
+    with pytest.raises(InputError, match="'gcc' is not a compiler"):
         chosen_compilers("gcc", numba.__version__)
 
 

@@ -322,16 +322,16 @@ def test_cables_that_share_a_route():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"displacement": np.zeros((STEPS, 2))}, "3 cables"),
-        ({"start": np.zeros(4)}, "3 cables"),
-        ({"displacement": np.zeros((3, STEPS, 3))}, "batch axes"),
+        ({"drive": np.zeros((STEPS, 2))}, "3 drives"),
+        ({"start": np.zeros(4)}, "3 drives"),
+        ({"drive": np.zeros((3, STEPS, 3))}, "batch axes"),
         ({"density": np.zeros((2, 2))}, "density"),
     ],
 )
 def test_bad_shapes_are_named(change, message):
     """What does not fit is said in one line."""
     material = materials(15, 2)
-    arguments = {"displacement": np.zeros((STEPS, 3))} | change
+    arguments = {"drive": np.zeros((STEPS, 3))} | change
     if "density" in change:
         material = material._replace(density=arguments.pop("density"))
     with pytest.raises(InputError, match=message):

@@ -85,11 +85,11 @@ def test_what_does_not_fit_is_refused():
     session.reset(np.arange(BATCH), material)
     with pytest.raises(InputError, match="other effects"):
         session.reset(np.arange(BATCH), material._replace(effects=all_effects(7)))
-    with pytest.raises(InputError, match="displacement has shape"):
+    with pytest.raises(InputError, match="drive has shape"):
         session.advance(displacement[:2])
     with pytest.raises(InputError, match="values in float32"):
         session.restore(np.arange(1), session.save()[:1].astype(np.float32))
-    with pytest.raises(InputError, match="0 lanes"):
+    with pytest.raises(InputError, match="the number of lanes is 0"):
         RodSession(engine(), 0)
 
 

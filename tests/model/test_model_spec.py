@@ -68,7 +68,7 @@ def test_mechanisms_and_robots_made_in_python_stay_the_objects_that_they_are():
             ),
             "nine",
         ),
-        (lambda: ModelSpec("smooth_arm"), "str is no robot"),
+        (lambda: ModelSpec("smooth_arm"), "str is not a robot"),
         (lambda: changed(SimulatorTable(), where="[simulator]", refine=99), "refine = 99"),
         (lambda: changed(SimulatorTable(), where="[simulator]", refin=2), "did you mean 'refine'"),
         (lambda: Robot.load("smooth_arm").with_changes(initial_state="asleep"), "initial_state"),

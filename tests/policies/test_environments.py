@@ -218,7 +218,7 @@ def test_a_wider_posterior_keeps_its_middle_and_its_correlations(width) -> None:
 def test_a_wider_posterior_ends_at_hard_bounds_and_a_point_has_no_width() -> None:
     draws = Draws(("trunk_mass",), np.array([[1e-3], [9.0]]), "x")
     assert np.array_equal(spread_out(draws, 5.0, SPECS).rows, [[1e-4], [10.0]])
-    with pytest.raises(InputError, match=r"width = 2 beside a randomisation that is no posterior"):
+    with pytest.raises(InputError, match=r"width = 2 applies only to a posterior"):
         spread_out(Point({}), 2.0, SPECS)
 
 

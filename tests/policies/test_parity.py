@@ -169,11 +169,11 @@ def test_the_check_leaves_a_training_as_it_was(tmp_path, monkeypatch, algorithm)
 @pytest.mark.parametrize(
     ("algorithm", "options", "words"),
     [
-        ("PPO", {"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "no file can hold"),
+        ("PPO", {"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "cannot be stored in a file"),
         ("PPO", {"policy_kwargs": {"squash_output": True}}, "only available when using gSDE"),
         ("PPO", {"policy_kwargs": {"activation_fn": "gelu"}}, "PPO cannot be made"),
         ("PPO", {"policy_kwargs": {"n_critics": 3}}, "unexpected keyword argument 'n_critics'"),
-        ("PPO", {"policy_kwargs": [1]}, "policy_kwargs is no table"),
+        ("PPO", {"policy_kwargs": [1]}, "policy_kwargs is not a table"),
         ("SAC", SMALL | {"net_arch": {"pi": [8]}}, "no key 'qf'"),
         ("TD3", SMALL | {"action_noise": 0.1}, "action_noise is an object of Python"),
         ("DDPG", SMALL | {"buffer_size": 10**13}, "Unable to allocate"),

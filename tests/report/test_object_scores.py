@@ -35,7 +35,7 @@ def test_energy_score_prefers_the_right_distribution_to_a_sharper_and_a_wider_on
         for scale in (0.3, 1.0, 3.0)
     }
     assert scores[1.0] < min(scores[0.3], scores[3.0])
-    with pytest.raises(InputError, match="one draw"):
+    with pytest.raises(InputError, match="single draw"):
         energy_score(np.zeros((1, 2)), np.zeros(2))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from rfdropo_bayes.inference.result import stage_cautions
 from rfdropo_bayes.posteriors import ParameterInfo
-from rfdropo_bayes.report.randomisation_safety import judge
+from rfdropo_bayes.report.randomisation_safety import rate_safety
 from rfdropo_bayes.report.summary import bound_reached, build_summary
 
 CORRELATED = {"all": {"correlated": True, "narrowing": 2.4}}
@@ -50,7 +50,7 @@ def said(stages):
 
 
 def test_without_grounds_against_it_is_safe(run, summary):
-    safety = judge(run.record, clean(summary))
+    safety = rate_safety(run.record, clean(summary))
     assert safety.verdict == "safe"
     assert safety.reasons == []
 
@@ -76,7 +76,7 @@ def test_without_grounds_against_it_is_safe(run, summary):
 def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
     changed = clean(summary)
     change(changed)
-    safety = judge(run.record, changed)
+    safety = rate_safety(run.record, changed)
     assert safety.verdict == "unsafe"
     assert words in safety.sentence
 
@@ -92,7 +92,7 @@ def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
 def test_errors_that_no_noise_explains_ask_for_care(run, summary, change, words):
     changed = clean(summary)
     change(changed)
-    safety = judge(run.record, changed)
+    safety = rate_safety(run.record, changed)
     assert safety.verdict == "with care"
     assert words in safety.sentence
 
@@ -102,14 +102,14 @@ def test_without_repeats_an_error_that_lasts_is_held_against_the_best_baseline(r
     changed = clean(summary)
     changed["noise_floor_mm"] = None
     changed["error_correlation"]["test"] = {"middle": 0.0, "tip": 0.0}
-    assert judge(run.record, changed).verdict == "safe"
+    assert rate_safety(run.record, changed).verdict == "safe"
     changed["error_correlation"]["test"]["tip"] = 0.4
-    assert "at the tip" in judge(run.record, changed).sentence
+    assert "at the tip" in rate_safety(run.record, changed).sentence
 
 
 def test_a_prior_that_excludes_the_data_is_said(run, summary):
     prior = {**run.record.prior, "sigma": run.record.prior["sigma"] * 1e-3}
-    safety = judge(replace(run.record, prior=prior), clean(summary))
+    safety = rate_safety(replace(run.record, prior=prior), clean(summary))
     assert safety.verdict == "unsafe"
     assert "outermost 1 % of the prior" in safety.sentence
     assert "sigma" in safety.sentence

@@ -1,11 +1,13 @@
-"""Cables driven by a tension: what a robot file says of them, and what does not hold together."""
+"""Cables driven by a tension, and chambers: what a robot file says of them, and what does not hold together."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.shape import robot_shape
 
 ARM = Robot.load("smooth_arm")
 LIMITS = {"displacement_limit_m": None, "drive": "tension", "tension_limit_n": (0.0, 5.0)}
@@ -33,6 +35,26 @@ def test_tensions_have_limits_and_no_zeros():
     assert robot.stroke == 5.0
 
 
+CHAMBER = {
+    "name": "front", "azimuth_deg": 90.0, "radius_m": 0.005, "z_m": (0.05, 0.15), "area_m2": 2e-5,
+    "pressure_limit_pa": (0.0, 5e4),
+}  # fmt: skip
+
+
+def inflated(**changes):
+    given = {"cables": (), "chambers": ({**CHAMBER, **changes},), "parameters": without_zeros()}
+    channels = {"names": ("air",), "gain": ((1.0,),)}
+    return ARM.with_changes(**given, channels=channels, command={"unit": "Pa", "ramp_s": 0.0, "dead_time_s": 0.0})
+
+
+def test_a_chamber_lies_beside_the_axis():
+    robot = inflated()
+    assert robot.cable_names == robot.initial_displacement_names == ()
+    np.testing.assert_allclose(robot.chambers[0].ends(), [[0.0, 0.005, 0.05], [0.0, 0.005, 0.15]], atol=1e-12)
+    assert (robot.stroke, robot.held_by_force) == (5e4, True)
+    assert robot_shape(robot)["cables"] == {"front": robot.chambers[0].ends().tolist()}
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -41,6 +63,13 @@ def test_tensions_have_limits_and_no_zeros():
             "driven in N, and commands are in m",
         ),
         (lambda: pulled(parameters=ARM.parameters), r"nothing uses the table \[parameters.initial_displacement\]"),
+        (
+            lambda: ARM.with_changes(cables=(), channels={"names": ("a",), "gain": ((1.0,),)}),
+            "neither cables nor chambers",
+        ),
+        (lambda: inflated(z_m=(0.15, 0.05)), "does not begin with the end towards the base"),
+        (lambda: inflated(z_m=(0.05, 0.25)), "end of front lies outside the body"),
+        (lambda: inflated(pressure_limit_pa=(1.0, 2.0)), "does not enclose zero"),
     ],
 )
 def test_drives_that_do_not_fit_are_refused(make, message):

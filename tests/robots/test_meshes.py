@@ -52,7 +52,7 @@ def test_refuses_surfaces_unknown_units_and_unreadable_files(tmp_path):
     meshio.write(surface, meshio.Mesh(POINTS, [("triangle", np.array([[0, 1, 2]]))]))
     with pytest.raises(InputError, match="only triangle"):
         read_tetrahedra(surface, "m")
-    with pytest.raises(InputError, match="length unit 'inch'"):
+    with pytest.raises(InputError, match="unknown length unit 'inch'"):
         read_tetrahedra(write(tmp_path / "a.vtk"), "inch")
     with pytest.raises(InputError, match="no such file"):
         read_tetrahedra(tmp_path / "absent.vtk", "m")

@@ -23,7 +23,7 @@ def test_the_answers_are_shown_and_a_mistyped_one_is_named():
         Robot.outline(name="arm", length=0.3, radius=0.015)
     with pytest.raises(InputError, match="unknown keyword 'length_mm'; did you mean 'length'"):
         Robot.outline(**ARM, length_mm=300.0)
-    with pytest.raises(InputError, match="command_unit = 'deg' is no unit of a robot"):
+    with pytest.raises(InputError, match="command_unit = 'deg' is not a unit of a robot"):
         Robot.outline(**ARM, command_unit="deg")
 
 
@@ -95,7 +95,7 @@ def test_what_was_assumed_is_marked_and_has_a_wide_prior(tmp_path):
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        ({"gravity": "down"}, "is no direction; one of"),
+        ({"gravity": "down"}, "is not a direction; use one of"),
         ({"shape": "box"}, "unknown shape 'box'"),
         ({"length": -1.0}, "length = -1 is not positive"),
         ({"cables": 3, "pairs": True}, "make no pairs"),

@@ -293,7 +293,7 @@ def test_a_session_goes_on_as_the_rollout_does(spring):
         assert seen.status.tolist() == [Result.OK, Result.OK]
     session.reset(np.array([1]), {"k": 45.0})
     np.testing.assert_allclose(session.time, [1.0, 0.0])
-    with pytest.raises(InputError, match="no whole number"):
+    with pytest.raises(InputError, match="not a whole number"):
         simulator.session(2, 0.0105)
 
 

@@ -56,6 +56,33 @@ def test_a_tension_beside_the_axis_bends_a_light_bar_to_an_arc():
     np.testing.assert_allclose(found.tension[:, 0], pull, atol=1e-4)
 
 
+INFLATED = rb.Robot.outline(name="arm", length=LENGTH, radius=RADIUS, markers={"tip": LENGTH}, cables=1,
+                            command_unit="Pa", usual_command=5e4, gravity="+z")  # fmt: skip
+
+
+def test_a_pressure_beside_the_axis_bends_a_light_bar_away_to_an_arc():
+    """Curvature p A e / E I and stretch p A / E A, at rest and where a motion has died out, and in a session."""
+    light = INFLATED.with_changes(gravity_m_s2=(0.0, 0.0, 0.0))
+    pressure, area = np.array([0.0, 1e5, 2e5]), light.chambers[0].area_m2
+    modulus = light.nominal()["young_modulus"]
+    angle = np.maximum(LENGTH * pressure * area * ARM / (modulus * np.pi * RADIUS**4 / 4.0), 1e-12)
+    arc = LENGTH * (1.0 + pressure * area / (modulus * np.pi * RADIUS**2))
+    expected = np.stack([-arc * (1.0 - np.cos(angle)) / angle, 0.0 * angle, arc * np.sin(angle) / angle], axis=1)
+    still = simulated(light)
+    np.testing.assert_allclose(rows(still, pressure).position[:, 0], expected, atol=1e-4 * LENGTH)
+    damped = {"rayleigh_stiffness": 0.1, "rayleigh_mass": 5.0}
+    moved = rows(simulated(light, "dynamic"), pressure, interval=8.0, values=damped).position[:, 0]
+    np.testing.assert_allclose(moved, expected, atol=1e-4 * LENGTH)
+    session = Session(still, 1, 0.1)
+    session.reset(np.arange(1), {})
+    np.testing.assert_allclose(session.act(pressure[:1, None] + 1e5).position[0, 0], expected[1], atol=1e-4 * LENGTH)
+
+
+def test_friction_of_cables_needs_cables():
+    with pytest.raises(InputError, match="acts on cables, and the robot has none"):
+        rows(simulated(INFLATED, mechanisms=("coulomb_friction",)), [0.0, 1e4])
+
+
 def test_rows_are_where_a_motion_comes_to_rest():
     command = np.array([0.0, 0.004, 0.008, 0.002])
     still = rows(simulated(LINE), command).position[:, 0]
@@ -72,7 +99,7 @@ def test_a_body_at_rest_has_no_damping_and_says_so():
     assert simulator.description["integrator"] == "quasi-static"
     with pytest.raises(InputError, match="acts on a body in motion"):
         rows(simulated(LINE, mechanisms=("viscoelasticity",)), [0.0, 0.001])
-    with pytest.raises(InputError, match="time_step beside motion"):
+    with pytest.raises(InputError, match="does not allow time_step"):
         rb.Model("smooth_arm", simulator={"motion": "quasi-static", "time_step": 0.01})
 
 

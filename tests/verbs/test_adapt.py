@@ -272,7 +272,7 @@ def test_a_day_that_the_model_cannot_fit_has_a_caution(known, zeros):
     drift = 10.0 * SIGMA * np.sqrt(3.0) * np.sin(40.0 * run.time)
     off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + xr.DataArray(drift, dims="time")))
     said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.DAY_UNMATCHED]
-    times = float(said[0].sentence.removeprefix("the day is fitted ").partition(" ")[0])
+    times = float(said[0].sentence.removeprefix("the session is fitted ").partition(" ")[0])
     assert times == pytest.approx(np.sqrt(1.0 + 10.0**2 * 3.0 / 2.0), rel=0.25)
     assert not [c for c in rb.adapt(known, run, show=False).cautions if "times worse" in c.sentence]
 
@@ -302,9 +302,9 @@ def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros, ca
     assert said == [
         "adapting to today: 26 rows of b",
         "predicting from first rows alone, to compare: b",
-        "the day is fitted: predicting b",
-        "the rest of the recording is predicted worse: fitting the day to the first row alone",
-        "the day is fitted: predicting b",
+        "the session is fitted: predicting b",
+        "the rest of the recording is predicted worse: fitting the session to the first row alone",
+        "the session is fitted: predicting b",
     ]
     check = found.content["details"]["checks"]["b"]
     assert check["adapted"]["error_mm"] < check["from_first_row"]["error_mm"] + 1e3 * SIGMA
@@ -439,7 +439,7 @@ def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
     draws = {info.name: record.posterior[info.name] for info in shared}
     run = recorded(["b"], zeros[1:2], 51)[0]
     same = replace(known, model=rb.Model(BOX, noise="white", priors=PRIORS))
-    with pytest.raises(rb.InputError, match="nothing of the model differs between days"):
+    with pytest.raises(rb.InputError, match="no parameter of the model differs between sessions"):
         rb.adapt(replace(same, record=replace(record, parameters=shared, posterior=draws)), run, show=False)
     silent = {**record.attrs, MODEL_ERROR: None}
     with pytest.raises(rb.InputError, match="has no residuals of the fitted recordings"):

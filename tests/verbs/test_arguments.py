@@ -29,7 +29,7 @@ MODEL = rb.Model("smooth_arm", priors={"young_modulus": {}})
     ids=["calibrate", "audit", "design", "check", "simulate", "make_vec"],
 )
 def test_the_path_of_an_experiment_is_no_model(call):
-    with pytest.raises(rb.InputError, match=r"'own\.toml' is no model; .*rb\.Model\.read\("):
+    with pytest.raises(rb.InputError, match=r"'own\.toml' is not a model; .*rb\.Model\.read\("):
         call("own.toml")
 
 
@@ -40,10 +40,10 @@ def test_the_path_of_an_experiment_is_no_model(call):
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ("run.csv", r"runs: 'run\.csv' is no list of recordings; read files with rb\.read"),
-        (["run.csv"], r"runs: 'run\.csv' is no recording; read files with rb\.read"),
-        (np.zeros((3, 2)), r"runs: a ndarray is no recording; .*rb\.Trajectory\.from_arrays"),
-        (3, r"runs: 3 is no list of recordings"),
+        ("run.csv", r"runs: 'run\.csv' is not a list of recordings; read files with rb\.read"),
+        (["run.csv"], r"runs: 'run\.csv' is not a recording; read files with rb\.read"),
+        (np.zeros((3, 2)), r"runs: a ndarray is not a recording; .*rb\.Trajectory\.from_arrays"),
+        (3, r"runs: 3 is not a list of recordings"),
         ([], r"runs: the list of recordings is empty; give at least one"),
     ],
 )
@@ -60,15 +60,15 @@ def test_one_recording_is_a_list_of_one():
 
 @pytest.mark.parametrize("call", [rb.predict, rb.adapt, rb.design_day], ids=["predict", "adapt", "design_day"])
 def test_the_folder_of_a_run_is_no_calibration(call):
-    with pytest.raises(rb.InputError, match=r"'runs/arm' is no calibration; .*rb\.load\(folder\)"):
+    with pytest.raises(rb.InputError, match=r"'runs/arm' is not a calibration; .*rb\.load\(folder\)"):
         call("runs/arm", RUN)
 
 
 @pytest.mark.parametrize(
     ("commands", "message"),
     [
-        ([RUN], "predict: a list of 1 is no recording; give one of them"),
-        ((RUN, RUN), "predict: a list of 2 is no recording"),
+        ([RUN], "predict: a list of 1 is not a recording; give one of them"),
+        ((RUN, RUN), "predict: a list of 2 is not a recording"),
     ],
 )
 def test_a_prediction_takes_one_recording(fitted, commands, message):
@@ -87,7 +87,7 @@ def fitted() -> rb.Calibration:
 
 
 def test_a_method_by_name_is_answered_with_the_calls_that_make_one():
-    with pytest.raises(rb.InputError, match=r"'laplace' is no method; give one of rb\.SMC\(\), .*rb\.Laplace\(\)"):
+    with pytest.raises(rb.InputError, match=r"'laplace' is not a method; give one of rb\.SMC\(\), .*rb\.Laplace\(\)"):
         rb.calibrate(MODEL, [RUN], "laplace")
 
 

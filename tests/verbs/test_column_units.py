@@ -94,11 +94,14 @@ def test_columns_may_be_in_several_units_of_one_kind():
         (("duty_1", "duty_2"), "%"),
         (("u1_V", "u2_V"), "V"),
         (("voltage1", "voltage2"), "V"),
-        (("p1 (kPa)", "p2 (kPa)"), "bar"),
+        (("p1 (kPa)", "p2 (kPa)"), "kPa"),
+        (("valve1_bar", "valve2_bar"), "bar"),
+        (("p_mbar", "q_mbar"), "mbar"),
+        (("pressure_1", "pressure_2"), "bar"),
         (("c1", "c2"), "mm"),
     ],
 )
-def test_percents_and_volts_are_no_lengths(names, unit):
+def test_percents_volts_and_pressures_are_no_lengths(names, unit):
     whole = named(*names)
     assert command_unit(whole, whole.frame, names).unit == unit
 

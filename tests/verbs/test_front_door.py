@@ -125,7 +125,7 @@ def test_what_is_no_model_is_told_so():
         rb.Model("smooth_arm", noize="white")
     with pytest.raises(rb.InputError, match="Gamma cannot be a prior"):
         rb.Model("smooth_arm", priors={"young_modulus": dist.Gamma(1.0)})
-    with pytest.raises(rb.InputError, match="dict is no robot"):
+    with pytest.raises(rb.InputError, match="dict is not a robot"):
         rb.Model({})
     with pytest.raises(rb.InputError, match="holds neither a calibration nor an audit"):
         rb.load(REPOSITORY / "docs")

@@ -147,10 +147,10 @@ def test_init_writes_files_that_read_the_recordings(tmp_path, monkeypatch, capsy
     ("words", "message"),
     [
         (("--recording", "none_*.csv"), "matches no file"),
-        (("--recording", "run.csv", "--segments", "3"), "4 commands (u1, u2, u3, u4) for 3 segments"),
-        (("--recording", "run.csv", "--markers", "a=1,b=2,c=3"), "3 markers for 2 in the recording (low, tip)"),
+        (("--recording", "run.csv", "--segments", "3"), "4 commands (u1, u2, u3, u4) do not fit 3 segments"),
+        (("--recording", "run.csv", "--markers", "a=1,b=2,c=3"), "3 markers are named; the recording has 2 (low, tip)"),
         (("--markers", "tip"), "'tip' is not NAME=HEIGHT"),
-        (("--command-unit", "turns"), "commands in 'turns'"),
+        (("--command-unit", "turns"), "the unit 'turns' is unknown"),
     ],
 )
 def test_what_does_not_fit_is_said_in_one_line(tmp_path, monkeypatch, capsys, words, message):
@@ -358,7 +358,7 @@ def test_what_was_guessed_is_marked_with_its_evidence(tmp_path, monkeypatch, cap
 
 
 def test_commands_that_are_no_travel_pull_by_a_force_of_unknown_size(tmp_path, monkeypatch, capsys):
-    """Shares of a supply: one unit pulls with a force that is assumed, and said so; pressures pull no cable."""
+    """Shares of a supply: one unit pulls with a force that is assumed, and said so."""
     table("t", "{marker}_{axis}", "valve{0}_pct").to_csv(tmp_path / "run.csv", index=False)
     monkeypatch.chdir(tmp_path)
     assert init(monkeypatch, capsys, "arm", "--recording", "run.csv", "--length-mm", "200")[0] == 0
@@ -368,10 +368,21 @@ def test_commands_that_are_no_travel_pull_by_a_force_of_unknown_size(tmp_path, m
     assert "ASSUMED: the usual command bends the body" in (tmp_path / "arm" / "arm.toml").read_text()
     experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
     assert load_recordings(experiment.data, tmp_path / "arm")[0].command_unit == "-"
+
+
+def test_pressures_make_chambers(tmp_path, monkeypatch, capsys):
     table("t", "{marker}_{axis}", "valve{0}_bar").to_csv(tmp_path / "air.csv", index=False)
-    status, told = init(monkeypatch, capsys, "b", "--recording", "air.csv")
-    assert status == 2
-    assert "commands are in 'bar' (valve1_bar, valve2_bar, valve3_bar, valve4_bar), which no drive of a cable" in told
+    monkeypatch.chdir(tmp_path)
+    assert init(monkeypatch, capsys, "b", "--recording", "air.csv")[0] == 0
+    robot = Robot.load(tmp_path / "b" / "b.toml")
+    assert (robot.command_unit, robot.cables, len(robot.chambers)) == ("Pa", (), 4)
+    assert "ASSUMED: their area" in (tmp_path / "b" / "b.toml").read_text()
+    experiment, _ = load_experiment(tmp_path / "b" / "experiment.toml")
+    (recording,) = load_recordings(experiment.data, tmp_path / "b")
+    assert (recording.command_unit, robot.usual_command) == (
+        "Pa",
+        pytest.approx(np.abs(recording.command).max(), rel=0.01),
+    )
 
 
 def test_disks_that_nobody_counted_share_out_over_the_segments(tmp_path, monkeypatch, capsys):

@@ -179,9 +179,9 @@ def test_a_fit_without_the_group_is_one_without_the_parameter(runs):
         ({"only_in": {"command_delay": "apirl"}}, "unknown group 'apirl'.*april"),
         ({"only_in": {"command_dely": "april"}}, "command_dely"),
         ({"only_in": {"observation_noise": "april"}}, "unknown parameter 'observation_noise'"),
-        ({"per_group": {"command_delay": 0.1}}, "command_delay is in .model.per_group., too"),
-        ({"per_recording": {"command_delay": "all"}}, "command_delay is in .model.per_recording., too"),
-        ({"fixed": {"command_delay": 0.1}}, "command_delay is in .model.fixed., too"),
+        ({"per_group": {"command_delay": 0.1}}, "command_delay is also in .model.per_group."),
+        ({"per_recording": {"command_delay": "all"}}, "command_delay is also in .model.per_recording."),
+        ({"fixed": {"command_delay": 0.1}}, "command_delay is also in .model.fixed."),
     ],
 )
 def test_what_contradicts_it_is_refused(runs, change, words):

@@ -186,7 +186,7 @@ def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
         (["training.ranges={young_modulus = [1.0, 2.0]}"], "outside its hard bounds"),
         (['training.algorithm="SACK"'], "did you mean 'SAC'"),
         (["training.options={learning_rat = 1e-3}"], "did you mean 'learning_rate'"),
-        (["training.period=0.013"], "no whole number of time steps"),
+        (["training.period=0.013"], "not a whole number of time steps"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None:
@@ -311,7 +311,7 @@ def test_a_fixed_value_of_what_is_randomised_is_refused(given) -> None:
     ranges = {"ranges": {"young_modulus": [1e6, 3e6]}} if given == "uniform" else {}
     model = rb.Model("trunk_sofa", fixed={"young_modulus": 4e6})
     table, _, simulator = training_of(with_training(model, {"task": "TrunkReach-v0", "randomisation": given, **ranges}))
-    with pytest.raises(InputError, match=f"young_modulus has a fixed value, and randomisation = '{given}'"):
+    with pytest.raises(InputError, match=f"young_modulus is fixed, but randomisation = '{given}'"):
         randomisation_of(table, model.spec, simulator, fit if given == "posterior" else None)
 
 

@@ -76,7 +76,7 @@ class Tension(WhiteSeries):
             unknown = [name for name in trajectory.cable_names if name not in names]
             if unknown:
                 raise InputError(
-                    f"its tensions are of {', '.join(unknown)}, which are no cables of the robot ({', '.join(names)})",
+                    f"its tensions are of {', '.join(unknown)}, which are not cables of the robot ({', '.join(names)})",
                     where=trajectory.name,
                     remedy="name the columns after the robot's cables",
                 )

@@ -94,4 +94,4 @@ def _found(name: str, inferred: Sequence[ParameterInfo]) -> str:
     if name in names or len(pieces) == 1:
         return name if name in names else pieces[0]
     what = f"several pieces of {name!r} are fitted" if pieces else f"{name!r} was weighed but is not inferred"
-    raise InputError(what, where="[[model.weighed]]", remedy=f"one of {', '.join(pieces or names)}")
+    raise InputError(what, where="[[model.weighed]]", remedy=f"use one of {', '.join(pieces or names)}")

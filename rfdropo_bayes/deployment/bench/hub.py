@@ -59,7 +59,9 @@ def address_of(channel: str) -> tuple[int, Any]:
         return socket.AF_UNIX, channel
     host, _, port = channel.rpartition(":")
     if not host or not port.isdigit():
-        raise InputError(f"{channel!r} is no channel of a hub", where="bus.channel", remedy="give HOST:PORT or a path")
+        raise InputError(
+            f"{channel!r} is not a channel of a hub", where="bus.channel", remedy="give HOST:PORT or a path"
+        )
     return socket.AF_INET, (host, int(port))
 
 
@@ -93,9 +95,9 @@ class HubBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         end = None if timeout is None else time.monotonic() + timeout
         while len(self._received) < FRAME.size:
-            left = None if end is None else max(0.0, end - time.monotonic())
+            remaining = None if end is None else max(0.0, end - time.monotonic())
             try:
-                if not select.select([self._socket], [], [], left)[0]:
+                if not select.select([self._socket], [], [], remaining)[0]:
                     return None, False
                 data = self._socket.recv(65536)
             except (OSError, ValueError) as error:  # ValueError: closed by another thread

@@ -95,7 +95,7 @@ def build_plant(name: str, robot: Robot, settings: Mapping[str, Any] | None = No
         return getattr(importlib.import_module(module), attribute)(robot, **(settings or {}))
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise InputError(
-            f"no plant {name!r} ({error})", where="plant", remedy="give springs, or MODULE:CALLABLE"
+            f"cannot load the plant {name!r} ({error})", where="plant", remedy="give springs, or MODULE:CALLABLE"
         ) from None
 
 
@@ -121,7 +121,7 @@ class PlantHere:
 
 
 class PlantProcess:
-    """A plant in a process of its own, which drives never wait for: they get the newest state that it has sent.
+    """A plant in its own process, which drives never wait for: they get the newest state that it has sent.
 
     A plant slower than real time lags behind; ``late`` is the delay.
 

@@ -1,4 +1,4 @@
-"""Simulated drives of a robot in a process of their own, with a plant behind them, and the hub that they share."""
+"""Simulated drives of a robot in their own process, with a plant behind them, and the hub that they share."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SimulationTable(NamedTuple):
         robot: name or path of a robot with motors.
         bus: the bus that the drives are on.
         plant, settings: see `build_plant`.
-        own_process: whether the plant runs in a process of its own.
+        own_process: whether the plant runs in its own process.
         markers: "HOST:PORT" that markers are sent to; empty for none.
         encoder_offset: counts that every encoder shows at length zero, less the motor's own offset.
         start_length_m: cable on every drum at power-on.
@@ -169,7 +169,9 @@ def _marker_socket(address: str) -> socket.socket | None:
         return None
     host, _, port = address.rpartition(":")
     if not port.isdigit():
-        raise InputError(f"{address!r} is no HOST:PORT", where="markers", remedy="give one, 127.0.0.1:5100")
+        raise InputError(
+            f"{address!r} is not of the form HOST:PORT", where="markers", remedy="give one, 127.0.0.1:5100"
+        )
     connection = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     connection.connect((host or "127.0.0.1", int(port)))
     connection.setblocking(False)
@@ -238,7 +240,7 @@ def run_hub(channel: str) -> None:
 
 @contextlib.contextmanager
 def simulated_drives(table: SimulationTable, patience: float = START) -> Iterator[BusTable]:
-    """The drives in a process of their own; yields the bus to find them on.
+    """The drives in their own process; yields the bus to find them on.
 
     Raises:
         InputError: if they do not start; includes their output.

@@ -48,7 +48,7 @@ def chosen_compilers(wanted: str | None, version: str) -> Compilers:
         InputError: another word, or "ours" if they do not fit.
     """
     if wanted not in (None, "", OURS, NUMBA):
-        raise InputError(f"{wanted!r} is no compiler", where=VARIABLE, remedy=f"use {OURS} or {NUMBA}, or unset it")
+        raise InputError(f"{wanted!r} is not a compiler", where=VARIABLE, remedy=f"use {OURS} or {NUMBA}, or unset it")
     if wanted == NUMBA:
         return PLAIN
     tested = tuple(int(part) for part in re.findall(r"\d+", version)[:2]) in TESTED

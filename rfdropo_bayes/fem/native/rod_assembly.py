@@ -144,7 +144,8 @@ def _entry(i):
 
 @kernel
 def place_stress(tables, samples, factors, element, work, token):
-    """Elastic and viscous stresses of an element that was measured; its section's tangent is left in ``SLOPE``."""
+    """Stresses of an element that was measured, elastic, viscous and of chambers; its section's tangent is left in
+    ``SLOPE``."""
     rows, section = work.element, SECTION * element
     force, rate = load(factors.strain, 0, token), load(factors.strain_rate, 0, token)
     _measure_rates(element, work, token)
@@ -160,6 +161,12 @@ def place_stress(tables, samples, factors, element, work, token):
         place_law_stress(tables, samples, element, force, rate, work, token)
     if samples.present[BRANCH]:
         add_branch(samples, factors, element, work, token)
+    for c in range(tables.chambers):
+        t, pressure = 3 * (c * (tables.stations - 1) + element), load(work.commanded, tables.cables + c, token)
+        pressure = pressure * load(factors.force, 0, token)
+        for i in range(3):
+            row = STRESS + 2 + i
+            store(rows, row, fnma(pressure, fill(tables.blown[t + i], rows, token), load(rows, row, token)))
 
 
 @inlined

@@ -86,7 +86,7 @@ class Run(NamedTuple):
         """Whether all commands are finite: a cable with a displacement of NaN would count as slack."""
         batch, schedule = self.batch, self.schedule
         known = np.ones(batch.count, dtype=bool)
-        moved = batch.displacement[: batch.count, : schedule.steps * batch.start.shape[1]]
+        moved = batch.drive[: batch.count, : schedule.steps * batch.start.shape[1]]
         for part in (moved,) if schedule.resumed else (moved, batch.start):
             known &= np.isfinite(part.sum(axis=1))
         return known
@@ -141,9 +141,11 @@ class NativeRod:
         integrator: Integrator = "euler",
     ) -> None:
         if precision not in _NUMERICS:
-            raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
+            raise InputError(f"unknown precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
         if threads is not None and threads < 1:
-            raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
+            raise InputError(
+                f"threads = {threads} is less than 1", remedy="use at least one, or None for all processors"
+            )
         self.system, self.time_step, self.integrator = system, float(time_step), integrator
         self.precision, self.dtype = precision, np.dtype(precision)
         self.threads = threads or available_processors()
@@ -153,7 +155,7 @@ class NativeRod:
         self._runs = runs_of(system.cables)
         self._steps: Integrator = "euler" if integrator == "quasi-static" else integrator
         if scene is not None and integrator == "quasi-static":
-            raise InputError("a body that touches a cube and is always at rest", remedy="use another integrator")
+            raise InputError("quasi-static motion does not allow a cube", remedy="use another integrator")
         self._scene = None if scene is None else rod_scene(scene, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
@@ -161,10 +163,10 @@ class NativeRod:
     def rollout(
         self,
         material: Material,
-        displacement: Float[np.ndarray, "*batch steps cables"],
+        drive: Float[np.ndarray, "*batch steps drives"],
         *,
-        start: Float[np.ndarray, "*batch cables"] | None = None,
-        before: Float[np.ndarray, "*batch cables"] | None = None,
+        start: Float[np.ndarray, "*batch drives"] | None = None,
+        before: Float[np.ndarray, "*batch drives"] | None = None,
         steps: int | None = None,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
@@ -174,10 +176,11 @@ class NativeRod:
 
         Args:
             material: fields with a leading batch axis; a field without this axis serves the whole batch.
-            displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
-            start: cable displacements [m] whose static equilibrium is the initial state, as in
+            drive: displacements of cables [m] and pressures of chambers [Pa] at the end of every step, one sequence for
+                all or one per rollout.
+            start: drives whose static equilibrium is the initial state, as in
                 ``fem.static_equilibrium``; None starts undeformed.
-            before: cable displacements [m] before the first step of a body that starts undeformed; zero by default.
+            before: drives before the first step of a body that starts undeformed; zero by default.
                 Stages within the step interpolate to its end.
             steps: number of steps to compute; all by default.
             stride: number of steps between recorded states.
@@ -188,7 +191,7 @@ class NativeRod:
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
-        run = self.run_of(material, displacement, start, before, steps, stride, cube, loads)
+        run = self.run_of(material, drive, start, before, steps, stride, cube, loads)
         rubs = material.effects.rubs
         in_blocks(
             lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
@@ -221,7 +224,7 @@ class NativeRod:
     def run_of(
         self,
         material: Material,
-        displacement: np.ndarray,
+        drive: np.ndarray,
         start: np.ndarray | None,
         before: np.ndarray | None,
         steps: int | None,
@@ -230,25 +233,25 @@ class NativeRod:
         loads: SectionLoads | None = None,
     ) -> Run:
         """Inputs and outputs of the kernels; arguments as `rollout`."""
-        displacement = np.asarray(displacement, dtype=float)
-        cables = self.tables.cables
-        if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
-            raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
+        drive = np.asarray(drive, dtype=float)
+        drives = self.tables.drives
+        if drive.ndim not in (2, 3) or drive.shape[-1] != drives:
+            raise InputError(f"drive has shape {drive.shape} for {drives} drives", where="rollout")
         given = before if start is None else start
-        begin = np.zeros(cables) if given is None else np.asarray(given, dtype=float)
-        if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
-            raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
-        moves = displacement[None] if displacement.ndim == 2 else displacement
-        moves = moves.reshape(len(moves), moves.shape[1] * cables)
+        begin = np.zeros(drives) if given is None else np.asarray(given, dtype=float)
+        if begin.ndim not in (1, 2) or begin.shape[-1] != drives:
+            raise InputError(f"start has shape {begin.shape} for {drives} drives", where="rollout")
+        moves = drive[None] if drive.ndim == 2 else drive
+        moves = moves.reshape(len(moves), moves.shape[1] * drives)
         pushed, place = load_rows(loads)
-        batch = self._batch(material, {"start": np.atleast_2d(begin), "displacement": moves, "loads": pushed})
+        batch = self._batch(material, {"start": np.atleast_2d(begin), "drive": moves, "loads": pushed})
         if loads is not None:
             present = batch.present.copy()
             present[LOADED] = 1
             batch = batch._replace(present=present, place=place, places=len(place))
-        steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
+        steps = drive.shape[-2] if steps is None else min(int(steps), drive.shape[-2])
         if (cube is None) != (self._scene is None):
-            raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
+            raise InputError("a scene and a cube must be given together", where="rollout")
         cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
         settling = 0 if start is None else ITERATIONS
         still, stages = self.integrator == "quasi-static", timed_stages(self._steps, self.time_step)

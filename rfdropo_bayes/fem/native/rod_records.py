@@ -93,9 +93,9 @@ class RodWork(NamedTuple):
     course: Float[np.ndarray, "guides lanes"]  # length of the way [m]
     inverse: Float[np.ndarray, "guides lanes"]  # its second derivative is inverse - sharp * direction direction' [1/m]
     sharp: Float[np.ndarray, "guides lanes"]
-    slack: Float[np.ndarray, "cables lanes"]
+    slack: Float[np.ndarray, "drives lanes"]  # of the cables
     tension: Float[np.ndarray, "cables lanes"]
-    commanded: Float[np.ndarray, "cables lanes"]
+    commanded: Float[np.ndarray, "drives lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]  # 1 if the impulses of the last step were not found
     accepted: Float[np.ndarray, "1 lanes"]  # 1 if the last step was accepted
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken

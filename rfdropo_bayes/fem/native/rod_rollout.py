@@ -45,14 +45,14 @@ class Batch(NamedTuple):
     law: Float[np.ndarray, "batch element_rows"]
     effects: Float[np.ndarray, "batch rows"]
     present: Int[np.ndarray, " flags"]
-    start: Float[np.ndarray, "rows cables"]  # displacements before the first step, of the initial equilibrium
-    displacement: Float[np.ndarray, "rows steps cables"]
+    start: Float[np.ndarray, "rows drives"]  # before the first step, of the initial equilibrium
+    drive: Float[np.ndarray, "rows steps drives"]  # displacements of cables [m], pressures of chambers [Pa]
     loads: Float[np.ndarray, "rows values"]  # forces at the places, two factors and gravity, of each step
     place: Int[np.ndarray, " places"]  # stations that forces act on
     places: int
     count: int
     start_pitch: int  # from one row to the next, 0 if a single row serves all
-    displacement_pitch: int
+    drive_pitch: int
     loads_pitch: int
 
 
@@ -110,8 +110,8 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
         border=PANEL * panels * stations, condensed=9 * panels**2, weight=3 * panels, element=ELEMENT,
         lever=3 * len(tables.guide_station), offset=3 * guides, direction=3 * guides,
-        course=guides, inverse=guides, sharp=guides, slack=cables, tension=cables,
-        commanded=cables, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state,
+        course=guides, inverse=guides, sharp=guides, slack=tables.drives, tension=cables,
+        commanded=tables.drives, points=3 * tables.points, pushed=3 * stations, given=3 * stations, **state,
         **dict.fromkeys(once, 1),
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
@@ -197,14 +197,14 @@ def _follow_branches(tables, factors, work, token):
 @kernel
 def _take_commands(tables, batch, work, step, share, first, token):
     """Commands at the end of a stage: interpolated between the previous and the present step."""
-    pitch, offset, cables = batch.displacement_pitch, step * tables.cables, tables.cables
+    pitch, offset, drives = batch.drive_pitch, step * tables.drives, tables.drives
     if share < 1.0:
-        fill_lanes(batch.displacement, pitch, offset, cables, first, batch.count, work.slack, token)
-        for c in range(cables):
+        fill_lanes(batch.drive, pitch, offset, drives, first, batch.count, work.slack, token)
+        for c in range(drives):
             before = load(work.commanded, c, token)
             store(work.commanded, c, fma(load(work.slack, c, token) - before, share, before))
     else:
-        fill_lanes(batch.displacement, pitch, offset, cables, first, batch.count, work.commanded, token)
+        fill_lanes(batch.drive, pitch, offset, drives, first, batch.count, work.commanded, token)
 
 
 @kernel
@@ -255,7 +255,7 @@ def settle(tables, runs, batch, samples, factors, work, friction, rows, p, sched
     """Parameters and initial state of a block's rollouts: as given, or in equilibrium; unchanged if they continue."""
     start_rollouts(tables, batch, samples, work, first, token)
     take_loads(batch, samples, work, 0, first, token)
-    fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
+    fill_lanes(batch.start, batch.start_pitch, 0, tables.drives, first, batch.count, work.commanded, token)
     if schedule.static_iterations > 0:
         most, bound = schedule.static_iterations, schedule.at_start
         come_to_rest(tables, runs, samples, factors, work, friction, rows, p, 0, most, bound, schedule, token)

@@ -82,7 +82,7 @@ class RodSession:
 
     def __init__(self, engine: NativeRod, count: int) -> None:
         if count < 1:
-            raise InputError(f"{count} lanes", remedy="use at least one")
+            raise InputError(f"the number of lanes is {count}", remedy="use at least one")
         self.engine, self.count = engine, int(count)
         self.memory = np.zeros((0, 0, engine.lanes), engine.dtype)
         self._run: Run | None = None  # of the lane that was started first
@@ -96,8 +96,8 @@ class RodSession:
         rows: Int[np.ndarray, " row"],
         material: Material,
         *,
-        start: Float[np.ndarray, "row cables"] | None = None,
-        before: Float[np.ndarray, "row cables"] | None = None,
+        start: Float[np.ndarray, "row drives"] | None = None,
+        before: Float[np.ndarray, "row drives"] | None = None,
         cube: tuple[Float[np.ndarray, "row 13"], Float[np.ndarray, "row 4"]] | None = None,
         loads: SectionLoads | None = None,
     ) -> Motion:
@@ -106,7 +106,7 @@ class RodSession:
         Args:
             rows: lanes.
             material: fields with one entry per row.
-            start: cable displacements [m] whose static equilibrium is the initial state; None starts undeformed. An
+            start: drives whose static equilibrium is the initial state; None starts undeformed. An
                 equilibrium that was found before is not computed again.
             before: see `NativeRod.rollout`.
             cube: for an engine with a scene, see `NativeRod.rollout`.
@@ -119,7 +119,7 @@ class RodSession:
             InputError: shapes that do not fit, or effects that other lanes of the session do not have.
         """
         rows = np.asarray(rows, dtype=np.intp)
-        still = np.zeros((len(rows), 1, self.engine.tables.cables))
+        still = np.zeros((len(rows), 1, self.engine.tables.drives))
         run = self.engine.run_of(material, still, start, before, 0, 1, cube, loads)
         self._admit(run, material.effects.rubs)
         settles = run.schedule.static_iterations > 0
@@ -139,36 +139,36 @@ class RodSession:
 
     def advance(
         self,
-        displacement: Float[np.ndarray, "lane steps cables"],
+        drive: Float[np.ndarray, "lane steps drives"],
         *,
         stride: int = 1,
         loads: SectionLoads | None = None,
     ) -> Motion:
-        """Take steps to the cable displacements [m] at their ends, under the loads of each step; recorded before the
+        """Take steps to the drives at their ends, under the loads of each step; recorded before the
         first, and every ``stride``.
 
         Raises:
-            InputError: a session that was not started, displacements of another shape, or loads in some calls
+            InputError: a session that was not started, drives of another shape, or loads in some calls
                 only: a session has loads in every call, also in reset, or in none.
         """
         engine = self.engine
         if self._run is None:
-            raise InputError("a session that was not started", remedy="reset all lanes first")
-        if displacement.ndim != 3 or displacement.shape[::2] != (self.count, engine.tables.cables):
-            expected = f"({self.count}, steps, {engine.tables.cables})"
-            raise InputError(f"displacement has shape {displacement.shape}, expected {expected}", where="advance")
-        moves = as_kernel_array(np.asarray(displacement, float).reshape(self.count, -1), engine.dtype.type)
-        batch = self._run.batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
+            raise InputError("the session was not started", remedy="reset all lanes first")
+        if drive.ndim != 3 or drive.shape[::2] != (self.count, engine.tables.drives):
+            expected = f"({self.count}, steps, {engine.tables.drives})"
+            raise InputError(f"drive has shape {drive.shape}, expected {expected}", where="advance")
+        moves = as_kernel_array(np.asarray(drive, float).reshape(self.count, -1), engine.dtype.type)
+        batch = self._run.batch._replace(drive=moves, drive_pitch=moves.shape[1], count=self.count)
         if bool(batch.present[LOADED]) != (loads is not None):
             raise InputError(
                 "loads must be given in every call of a session", where="advance", remedy="also give them to reset"
             )
         if loads is not None:
             rows = load_rows(loads)[0].astype(engine.dtype)
-            acting = np.concatenate([rows[:, : rows.shape[1] // displacement.shape[1]], rows], axis=1)
+            acting = np.concatenate([rows[:, : rows.shape[1] // drive.shape[1]], rows], axis=1)
             gravity = np.ascontiguousarray(self.memory[:, -GRAVITY:].transpose(0, 2, 1)).reshape(-1, GRAVITY)
             batch = batch._replace(loads=acting, loads_pitch=acting.shape[1], gravity=gravity[: self.count])
-        schedule = self._run.schedule._replace(steps=displacement.shape[1], stride=stride, resumed=1)
+        schedule = self._run.schedule._replace(steps=drive.shape[1], stride=stride, resumed=1)
         run = engine.with_output(self._run._replace(batch=batch, schedule=schedule))
 
         def block(first: int) -> None:
@@ -189,7 +189,7 @@ class RodSession:
         """
         if state.shape[1:] != self.memory.shape[1:2] or state.dtype != self.engine.dtype:
             raise InputError(
-                f"a state of {state.shape[1:]} values in {state.dtype}",
+                f"the state has {state.shape[1:]} values in {state.dtype}",
                 where="restore",
                 remedy=f"this session has {self.memory.shape[1]} in {self.engine.dtype}; start it before",
             )
@@ -205,7 +205,7 @@ class RodSession:
             self._run = _taken(run, [0])
         elif rubs != self._rubs or not np.array_equal(run.batch.present, self._run.batch.present):
             raise InputError(
-                "a lane whose body has other effects than the lanes before",
+                "a lane has other effects of the body than earlier lanes",
                 where="reset",
                 remedy="give every lane the same mechanisms; a null value switches one off",
             )

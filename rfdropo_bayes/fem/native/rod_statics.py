@@ -231,6 +231,8 @@ def measure_imbalance(tables, samples, factors, work, token):
             loads = loads + _component(tables, work.field, station, i, token)
     for c in range(tables.cables):
         loads = loads + load(work.tension, c, token)
+    for c in range(tables.chambers):
+        loads = loads + magnitude(load(work.commanded, tables.cables + c, token), zero) * tables.thrust[c]
     if samples.present[SURROUNDED]:
         for station in range(tables.stations):
             add_surroundings(tables, samples, factors, station, False, work, token)

@@ -58,10 +58,14 @@ class RodTables(NamedTuple):
     point_weight: Float[np.ndarray, " entries"]
     reach: float  # a station farther from its rest position has been lost [m]
     total: float  # length of the body [m]
+    blown: Float[np.ndarray, "chambers_elements3"]  # thrust and moments about x and y by 1 Pa in an element
+    thrust: Float[np.ndarray, " chambers"]  # by 1 Pa, where a chamber fills an element [N]
     held: int
     stations: int
     panels: int  # of the border
     cables: int
+    chambers: int
+    drives: int  # cables, then chambers
     points: int
 
 
@@ -158,7 +162,8 @@ def rod_tables(system: Any, points: Any, dtype: type) -> RodTables:
     body: Rod = system.body
     volume, moment = inertia_per_density(body)
     point_first, point_place, point_weight = _frame_sums(points)
-    cables = len(system.cables.anchor)
+    cables, layout = len(system.cables.anchor), system.chambers
+    layout = np.zeros((0, body.elements, SIZE)) if layout is None else layout
     tables = RodTables(
         length=np.diff(body.station),
         area=section_areas(body),
@@ -173,10 +178,14 @@ def rod_tables(system: Any, points: Any, dtype: type) -> RodTables:
         point_weight=point_weight,
         reach=float(LOST * body.length),
         total=body.length,
+        blown=layout[:, :, 2:5].ravel(),
+        thrust=layout[:, :, 2].max(axis=1),
         held=int(system.clamped_stations),
         stations=len(body.station),
         panels=border_panels(cables),
         cables=cables,
+        chambers=len(layout),
+        drives=system.drives,
         points=len(points.station),
     )
     return RodTables(*(as_kernel_array(value, dtype) for value in tables))

@@ -96,7 +96,7 @@ class TetrahedralEngine:
         samples = len(parameters["young_modulus"])
         commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
         if (cube is None) != (self._scene is None):
-            raise InputError("a scene without a cube, or a cube without a scene", where="rollouts")
+            raise InputError("a scene and a cube must be given together", where="rollouts")
         cubes = poses = None
         if cube is not None:
             cubes = cube_rows(*cube, samples, self.dtype)

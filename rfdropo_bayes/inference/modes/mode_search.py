@@ -112,11 +112,11 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
             raise InputError("tolerance and rollouts must be positive", where="[inference]")
         if self.mixture not in MIXTURES:
             raise InputError(
-                f"unknown mixture {self.mixture!r}", where="[inference]", remedy=f"one of {', '.join(MIXTURES)}"
+                f"unknown mixture {self.mixture!r}", where="[inference]", remedy=f"use one of {', '.join(MIXTURES)}"
             )
         if self.jacobian not in JACOBIANS:
             raise InputError(
-                f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"one of {', '.join(JACOBIANS)}"
+                f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"use one of {', '.join(JACOBIANS)}"
             )
 
 

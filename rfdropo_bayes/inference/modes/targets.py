@@ -154,8 +154,8 @@ def prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
 def _make_linearise(
     problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str
 ) -> tuple[Callable, Callable, Callable | None]:
-    """Residuals of a batch of points, not charged; residuals and Jacobian at one point, charged; and
-    `Target.differences`."""
+    """Three functions: residuals of a batch of points, without a charge to the budget; residuals and Jacobian at one
+    point, with a charge; and `Target.differences`."""
 
     def residuals(u: Array) -> Any:
         values = problem.from_unconstrained(u[None])

@@ -48,8 +48,8 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
         levels: rollouts are simulated to one of this many horizons, the shortest sufficient horizon.
-        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion; mended,
-            the observation noise at the prior's medians is added as well.
+        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion. If
+            ``mended``, the observation noise at the prior's medians is also added.
         finalists: number of candidates scored again at the full horizon.
         parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
@@ -75,9 +75,9 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
     def __post_init__(self) -> None:
         where = "[inference]"
         if self.optimiser not in OPTIMISERS:
-            raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"one of {OPTIMISERS}")
+            raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"use one of {OPTIMISERS}")
         if self.horizon not in HORIZONS:
-            raise InputError(f"unknown horizon {self.horizon!r}", where=where, remedy=f"one of {HORIZONS}")
+            raise InputError(f"unknown horizon {self.horizon!r}", where=where, remedy=f"use one of {HORIZONS}")
         least = {"evaluations": 1, "rollouts_per_candidate": 4, "levels": 1, "finalists": 1, "draws": 1}
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
@@ -353,7 +353,7 @@ def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: 
         return CovarianceAdaptation(d, high, sigma * high, population, seed)
     if name == "cem":
         return CrossEntropy(d, high, sigma * high, population, seed)
-    raise InputError(f"unknown optimiser {name!r}", where="[inference]", remedy=f"one of {', '.join(OPTIMISERS)}")
+    raise InputError(f"unknown optimiser {name!r}", where="[inference]", remedy=f"use one of {', '.join(OPTIMISERS)}")
 
 
 class CrossEntropy:

@@ -111,7 +111,7 @@ def search_space(
     for name in (*names, *ranges):
         if name not in problem.names:
             raise InputError(
-                f"unknown parameter {name!r}", where="[inference]", remedy=f"one of {', '.join(problem.names)}"
+                f"unknown parameter {name!r}", where="[inference]", remedy=f"use one of {', '.join(problem.names)}"
             )
     bounds = np.array([problem.bounds[name] for name in names], dtype=float)
     chosen = []

@@ -6,8 +6,8 @@ prior can reach modes that no optimisation found.
 
 Particles move in logarithms of positive parameters. Data that determine a product or a ratio of parameters, such as
 stiffness over mass, leave a thin ridge. In logarithms it is a straight line, which a covariance can describe; in
-coordinates that bend towards the bounds of a prior it is a curve, on which a sampler hardly moves. The price is a wall
-at each bound: there is no density beyond it.
+coordinates that bend towards the bounds of a prior it is a curve, on which a sampler hardly moves. The disadvantage
+is a wall at each bound: there is no density beyond it.
 
 The curvature of the prior at an optimum is a poor guide in directions without information from the likelihood. Along a
 ridge between two bounds the optimum lies at an end, and the density falls off within a short distance of it. Each

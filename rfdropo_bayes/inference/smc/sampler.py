@@ -82,9 +82,11 @@ class SmcConfig(MethodOptions, called="SMC"):
     def __post_init__(self) -> None:
         where = "[inference]"
         if self.start not in STARTS:
-            raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"one of {', '.join(STARTS)}")
+            raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"use one of {', '.join(STARTS)}")
         if self.spacing not in SPACINGS:
-            raise InputError(f"unknown spacing {self.spacing!r}", where=where, remedy=f"one of {', '.join(SPACINGS)}")
+            raise InputError(
+                f"unknown spacing {self.spacing!r}", where=where, remedy=f"use one of {', '.join(SPACINGS)}"
+            )
         if not 0.0 < self.target_ess < 1.0:
             raise InputError(f"target_ess = {self.target_ess} is not between 0 and 1", where=where)
         for name in ("replicates", "blocks", "max_moves", "draws"):

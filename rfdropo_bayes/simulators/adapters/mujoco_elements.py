@@ -235,7 +235,7 @@ def edit_of(model: Any, address: str, *, form: str | None = None) -> tuple[Edit,
     name, _, attribute = rest.rpartition("/")
     if kind not in ATTRIBUTES or not rest or (kind != "option" and not name):
         remedy = nearest(kind, ATTRIBUTES) if kind not in ATTRIBUTES else "write kind/name/attribute"
-        raise InputError("is no address", where=where, remedy=remedy)
+        raise InputError("is not an address", where=where, remedy=remedy)
     known = ATTRIBUTES[kind].get(attribute)
     if known is None:
         remedy = nearest(attribute, ATTRIBUTES[kind])

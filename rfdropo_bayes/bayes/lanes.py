@@ -1,0 +1,222 @@
+"""A simulator behind compiled programs: rollouts and their derivatives, lane by lane, in batches of few sizes."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.batches import in_chunks
+from rfdropo_bayes.bayes.channels.object_pose import Placing
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.runtime import available_processors
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.protocol import Simulator
+
+# Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
+# with few different lanes are the most frequent.
+WIDTH = 8 * max(available_processors(), 2)
+# Step of a derivative of a compiled engine in prior deviations, one-sided; a larger step is taken to both sides. The
+# rounding of 1e-13 m then errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
+STEP = 1e-4
+COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
+
+Thetas = Float[np.ndarray, "lane physical"]
+Fields = dict[str, np.ndarray]
+"""Parts of an `Observation` by name, with a leading axis over lanes, or over points and recordings."""
+
+
+def _no_limit() -> None:
+    """No check of the time."""
+
+
+class Lanes:
+    """A simulator behind compiled functions of lanes, each with its own parameters and commands.
+
+    Args:
+        simulator: the simulator, mechanisms included.
+        marker_index: indices of its measured markers.
+        width: lanes per call, with the last call of a batch padded.
+        fields: parts of an observation that are data; if the pose of an object is included, its start is an input.
+        costly: parameters of which rollouts take longer than others.
+        physical: parameters that lanes are given; all of the simulator's by default. The others are nominal.
+
+    Attributes:
+        difference: step of derivatives in prior deviations, see `STEP`; None if derivatives are exact.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        marker_index: np.ndarray,
+        width: int = WIDTH,
+        fields: Sequence[str] = ("position",),
+        costly: Sequence[str] = (),
+        physical: Sequence[str] | None = None,
+    ) -> None:
+        self.simulator = simulator
+        self.marker_index = marker_index
+        backend = getattr(getattr(simulator, "engine", None), "backend", None)
+        self.width = width
+        self.fields = tuple(fields)
+        self.costly = tuple(costly)
+        self._size: tuple[int, int] | None = None
+        self.difference: float | None = None
+        if backend is not None and backend.name == "numba":
+            self.difference = STEP if backend.precision == "float64" else COARSE
+        self.physical = tuple(spec.name for spec in simulator.parameters) if physical is None else tuple(physical)
+
+    def serve(self, simulator: Simulator, marker_index: np.ndarray, physical: Sequence[str]) -> bool:
+        """Whether these are the rollouts of a simulator, given some of its parameters."""
+        own = self.simulator is simulator and self.physical == tuple(physical)
+        return own and np.array_equal(self.marker_index, marker_index)
+
+    def _observe(
+        self, theta: jax.Array, start: jax.Array, commands: Commands, steps: jax.Array
+    ) -> tuple[dict[str, jax.Array], jax.Array]:
+        values: Any = dict(zip(self.physical, theta, strict=True))
+        if "object_pose" in self.fields:
+            assert isinstance(self.simulator, Placing)
+            values = self.simulator.with_object_at(values, start)
+        observation = self.simulator.rollout(values, commands, steps)
+        found = observation._replace(position=observation.position[:, self.marker_index])._asdict()
+        lacking = [name for name in self.fields if found[name] is None]
+        if lacking:
+            raise InputError(
+                f"the simulator does not tell its {lacking[0].replace('_', ' ')}",
+                where=f"[model] {lacking[0]}",
+                remedy="leave it out, or let its rollout return it",
+            )
+        status = found.pop("status")
+        return {name: part for name, part in found.items() if part is not None}, status
+
+    @property
+    def slope_rollouts(self) -> int:
+        """Rollouts per derivative, beside those of the value."""
+        if self.difference is None:
+            return 3
+        return 1 if self.difference <= STEP else 2
+
+    @property
+    def later(self) -> float:
+        """Time to compile what only rollouts with candidates need, in times that the first program takes."""
+        return 0.0
+
+    def with_difference(self, step: float) -> Self:
+        """The same with differences over another step."""
+        changed = copy.copy(self)
+        changed.difference = step
+        return changed
+
+    @cached_property
+    def _rolled(self) -> Any:
+        return jax.jit(jax.vmap(self._observe, in_axes=(0, 0, 0, None)))
+
+    @cached_property
+    def _derived(self) -> Any:
+        def one(theta: jax.Array, tangent: jax.Array, start: jax.Array, commands: Commands) -> dict[str, jax.Array]:
+            def data(theta: jax.Array) -> dict[str, jax.Array]:
+                found, _ = self._observe(theta, start, commands, jnp.asarray(commands.step.shape[0]))
+                return {name: found[name] for name in self.fields}
+
+            return jax.jvp(data, (theta,), (tangent,))[1]
+
+        return jax.jit(jax.vmap(one))
+
+    def roll(
+        self,
+        theta: Thetas,
+        start: np.ndarray | None,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+        steps: int | None = None,
+        width: int | None = None,
+    ) -> tuple[Fields, np.ndarray]:
+        """Observations of each parameter set under the commands of its lane, and result codes.
+
+        ``start`` (lane, 7) are initial poses of an object. ``check`` is called before every batch, and may raise. After
+        ``steps`` time steps, all by default, rows are meaningless. ``width`` are the lanes of a call, if others.
+        """
+        limit, rows = jnp.asarray(commands.step.shape[1] if steps is None else steps), commands.sample_step.shape[1]
+        lanes = (theta, start, self._as_long(commands))
+        found, status = in_chunks(lambda own: self._rolled(*own, limit), lanes, (width or self.width,), before=check)
+        return {name: part[:, :rows] for name, part in found.items()}, status
+
+    def _as_long(self, commands: Commands) -> Commands:
+        """Commands with steps and rows that are not computed, as many as in the first call: of shorter recordings, the
+        program is not compiled again.
+        """
+        given = commands.step.shape[1], commands.sample_step.shape[1]
+        self._size = self._size or given
+        steps, rows = (most - own for most, own in zip(self._size, given, strict=True))
+        if commands.signals is not None or min(steps, rows) < 0 or steps == rows == 0:
+            return commands
+        return commands._replace(
+            step=np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
+            sample_step=np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
+            sample_fraction=np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
+        )
+
+    def differentiate(
+        self,
+        theta: Thetas,
+        tangent: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+    ) -> Fields:
+        """Derivatives along tangents of the parts of an observation that are data."""
+        lanes = (theta, tangent, start, commands)
+        return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
+
+
+class RoutedLanes(Lanes):
+    """Two compiled simulators of one model: a fast one for all that it can do, another for rollouts with further
+    candidates.
+
+    Args:
+        fast: lanes of the simulator without these candidates.
+        slow: lanes of the simulator with all.
+        null: physical values at which the further candidates do nothing.
+    """
+
+    def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
+        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.fields, slow.costly)
+        self.fast, self.slow = fast, slow
+        self._kept = np.array([self.physical.index(name) for name in fast.physical])
+        self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
+        self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    @property
+    def later(self) -> float:
+        """See `Lanes.later`: a program takes time as its mechanisms do, counted by their parameters."""
+        return len(self.slow.physical) / len(self.fast.physical) * (1.0 + self.slow.later)
+
+    def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
+        return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
+
+    def roll(
+        self,
+        theta: Thetas,
+        start: np.ndarray | None,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+        steps: int | None = None,
+        width: int | None = None,
+    ) -> tuple[Fields, np.ndarray]:
+        """See `Lanes.roll`."""
+        slow = self._needs_slow(theta)
+        routes: list[tuple[np.ndarray, Lanes, Any]] = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
+        order, found = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []
+        for mask, lanes, kept in routes:
+            if mask.any():
+                chosen = np.flatnonzero(mask)
+                own = None if start is None else start[chosen]
+                found.append(lanes.roll(theta[chosen][:, kept], own, commands.of(chosen), check, steps, width))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *found)
