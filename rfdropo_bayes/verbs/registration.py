@@ -128,7 +128,7 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
     rows = rows_of([recording], recording.marker_names, best_delay([recording]))
     rows = rows.of(spread_rows(rows, ROWS))
     fewer = rows.of(spread_rows(rows, SEARCHED))
-    tensions = own.drives[0].unit != "m"
+    tensions = own.actuators[0].unit != "m"
 
     def sight(arrangement: Arrangement, of: Rows) -> _Sight | None:
         """The best frame and bend of an arrangement; None if the rod finds no equilibria."""
