@@ -235,7 +235,9 @@ class RobotOutline:
             tip = None if sized.tip_radius is None else _rounded(wider * sized.tip_radius)
             return replace(sized, radius=_rounded(wider * sized.radius), tip_radius=tip)
         if self.sets_bend == "young_modulus":
-            before, after = (o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized))
+            before, after = (
+                o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized)
+            )
             return replace(sized, young_modulus=_rounded(self.young_modulus / bend * before / after))
         return sized
 
