@@ -36,8 +36,7 @@ import numpy as np
 import peers
 
 from rfdropo_bayes import fem
-from rfdropo_bayes.model.assembly import build_robot_simulator
-from rfdropo_bayes.model.compute_backend import backend
+from rfdropo_bayes.model.assembly import backend, build_robot_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot

@@ -35,7 +35,7 @@ from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
-from rfdropo_bayes.verbs.random_commands import random_walk
+from rfdropo_bayes.verbs.simulate import random_walk
 
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
 TENSION_NOISE = 0.02  # of a tension reading

@@ -17,7 +17,7 @@ from rfdropo_bayes.model.experiment import CommandsTable, SimulatorTable
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.verbs.random_commands import random_walk
+from rfdropo_bayes.verbs.simulate import random_walk
 
 POSITION_NOISE, CORRELATION, TENSION_NOISE = 5e-4, 0.3, 0.01  # m; from row to row; share of the reading
 TURN_NOISE = 0.02  # rad, of a cube seen by markers some 25 mm from its centre

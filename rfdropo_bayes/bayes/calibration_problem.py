@@ -325,12 +325,8 @@ class CalibrationProblem:
     def predict_scene(self, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Int[np.ndarray, " n"]]:
         """As `predict`, with the poses of the object (n, recording, time, 7) in the robot's frame: position [m] and
         unit quaternion (x, y, z, w); None if the scene has none."""
-        seen = self.observe(values)
-        return (
-            np.asarray(seen.position),
-            None if seen.object_pose is None else np.asarray(seen.object_pose),
-            seen.status,
-        )
+        position, _, pose, status, *_ = self.observe(values)
+        return np.asarray(position), None if pose is None else np.asarray(pose), np.asarray(status)
 
     def observe(self, values: Batch) -> Observation:
         """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),

@@ -157,11 +157,12 @@ class Lanes:
         steps, rows = (most - own for most, own in zip(self._size, given, strict=True))
         if commands.signals is not None or min(steps, rows) < 0 or steps == rows == 0:
             return commands
-        return commands._replace(
-            step=np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
-            sample_step=np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
-            sample_fraction=np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
-        )
+        longer: dict[str, Any] = {
+            "step": np.pad(commands.step, [(0, 0), (0, steps), (0, 0)], mode="edge"),
+            "sample_step": np.pad(commands.sample_step, [(0, 0), (0, rows)], constant_values=self._size[0]),
+            "sample_fraction": np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
+        }
+        return commands._replace(**longer)
 
     def differentiate(
         self,

@@ -50,7 +50,7 @@ class TrajectoryModel:
     lanes: Lanes = field(default=cast(Lanes, None), repr=False)
 
     def __post_init__(self) -> None:
-        zeros, first = dict.fromkeys(self.scopes.names, 0.0), self.recordings.names[0]
+        zeros, first = dict.fromkeys(self.scopes.names, jnp.zeros(())), self.recordings.names[0]
         given = jax.eval_shape(lambda: self.rollout_values(zeros, first))
         physical = [spec.name for spec in self.simulator.parameters if spec.name in given]
         if self.lanes is None or not self.lanes.serve(self.simulator, self.recordings.marker_index, physical):

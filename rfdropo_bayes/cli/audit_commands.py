@@ -13,9 +13,7 @@ from rfdropo_bayes.cli.options import (
     OutFolder,
     Overrides,
     Overwrite,
-    Quiet,
     Resume,
-    Seed,
     folder_for,
     same_command,
     see_calibration,
@@ -36,10 +34,8 @@ def audit(
         tuple[str, str] | None,
         typer.Option("--between", metavar="GROUP GROUP", help="name the difference between two of [model.groups]"),
     ] = None,
-    seed: Seed = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -55,15 +51,14 @@ def audit(
         out=folder,
         fit=fit,
         between=between,
-        seed=seed,
         resume=resume,
         overwrite=overwrite,
-        show=not quiet,
+        show=True,
     )
-    show_audit(result.content, folder, quiet=quiet, as_json=as_json)
+    show_audit(result.content, folder, as_json=as_json)
     if result.content["stopped"] == INTERRUPT:
         raise Interrupted(str(folder), "--resume")
-    if result.content["stopped"] and not (quiet or as_json):
+    if result.content["stopped"] and not as_json:
         minutes = 2.0 * result.content["minutes"]
         typer.echo(f"to go on: {same_command('rfdropo', '--resume', '--set', f'audit.minutes={minutes:g}')}")
 
@@ -83,9 +78,7 @@ def design(
             help="with --adapt: group whose limits of the drives hold in the new session; by default the last group",
         ),
     ] = None,
-    seed: Seed = None,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -101,11 +94,11 @@ def design(
     from rfdropo_bayes.verbs.design_day import design_day
 
     model = Model.read(experiment, overrides)
-    options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "show": not quiet}
+    options: dict[str, Any] = {"out": folder, "overwrite": overwrite, "show": True}
     if adapt and fit is not None:
         result = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
     else:
         result = propose(model, fit=fit, **options)
     commands = folder / COMMANDS
     content = {**result.content, "commands": str(commands)}
-    say(content, result.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)
+    say(content, result.sentence, f"commands: {commands}", as_json=as_json)

@@ -16,11 +16,9 @@ from rfdropo_bayes.cli import (
     init_command,
     listing_commands,
     motor_commands,
-    picture_commands,
     policy_commands,
-    posterior_commands,
     prediction_commands,
-    report_command,
+    result_commands,
 )
 from rfdropo_bayes.cli.options import (
     AsJson,
@@ -28,7 +26,6 @@ from rfdropo_bayes.cli.options import (
     OutFolder,
     Overrides,
     Overwrite,
-    Quiet,
     Resume,
     folder_for,
     same_command,
@@ -71,7 +68,6 @@ def calibrate(
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     fit: Annotated[
         Path | None,
@@ -85,17 +81,15 @@ def calibrate(
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.calibrate import calibrate as run_fit
 
-    shown = False if quiet else None
     model = Model.read(experiment, overrides)
-    result = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite, show=shown)
-    show_calibration(result, experiment, quiet=quiet, as_json=as_json)
+    result = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite)
+    show_calibration(result, experiment, as_json=as_json)
 
 
 def simulate(
     experiment: ExperimentFile,
     out: OutFolder = None,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -105,9 +99,9 @@ def simulate(
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.simulate import simulate_all
 
-    say_step(f"simulating the recordings of {experiment}", show=False if quiet or as_json else None)
+    say_step(f"simulating the recordings of {experiment}", show=False if as_json else None)
     content = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
-    show_simulation(content, quiet=quiet, as_json=as_json)
+    show_simulation(content, as_json=as_json)
 
 
 # In the order in which they are used, which --help shows.
@@ -115,14 +109,14 @@ for command in (
     init_command.init,
     check_command.check,
     simulate,
-    picture_commands.view,
+    result_commands.view,
     calibrate,
-    report_command.report,
+    result_commands.report,
     audit_commands.audit,
     audit_commands.design,
     prediction_commands.predict,
     prediction_commands.adapt,
-    posterior_commands.export,
+    result_commands.export,
     policy_commands.train,
     policy_commands.evaluate,
 ):

@@ -86,7 +86,6 @@ def drives(
     interface: Interface = "hub",
     channel: Channel = "127.0.0.1:29536",
     plant: Annotated[str, typer.Option(help="springs, or MODULE:CALLABLE")] = "springs",
-    own_process: Annotated[bool, typer.Option("--own-process", help="run the plant in its own process")] = False,
     markers: Annotated[str, typer.Option(help="HOST:PORT to send markers to")] = "",
 ) -> None:
     """Simulate the drives of a robot and their bus. Runs until Ctrl-C."""
@@ -95,7 +94,7 @@ def drives(
 
     table = BusTable(interface=interface, channel=channel)
     typer.echo(f"drives of {robot} on {interface} {channel}; interrupt to end", err=True)
-    serve(SimulationTable(robot, table, plant, own_process=own_process, markers=markers))
+    serve(SimulationTable(robot, table, plant, markers=markers))
 
 
 def doctor(

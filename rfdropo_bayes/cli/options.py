@@ -31,11 +31,9 @@ Overrides = Annotated[
         help="value of a parameter in SI units, or table.key=value of the experiment file; may be repeated",
     ),
 ]
-Seed = Annotated[int | None, typer.Option(help="seed; by default from the experiment file")]
 Resume = Annotated[bool, typer.Option("--resume", help="go on from the checkpoint of an interrupted run")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="start anew, whatever the folder holds")]
 WRITTEN = ("experiment", "config", "extended")  # names of the experiment files that init, runs and audits write
-Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as JSON, and nothing else")]
 
 

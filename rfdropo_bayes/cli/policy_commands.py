@@ -14,7 +14,6 @@ from rfdropo_bayes.cli.options import (
     OutFolder,
     Overrides,
     Overwrite,
-    Quiet,
     Resume,
     folder_for,
     see_calibration,
@@ -38,7 +37,6 @@ def train(
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -63,7 +61,7 @@ def train(
     done = f"after {summary['steps']} steps in {summary['seconds']:.0f} s: {learnt(summary)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
-    say(summary, *lines, quiet=quiet, as_json=as_json)
+    say(summary, *lines, as_json=as_json)
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
@@ -95,7 +93,6 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="number of episodes of each policy, the same for all")] = 200,
     seed: Annotated[int, typer.Option(help="seed of the parameters and goals of the episodes")] = 0,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -107,7 +104,7 @@ def evaluate(
 
     model = Model.read(experiment, overrides)
     evaluation = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
-    say(evaluation, evaluation_table(evaluation), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
+    say(evaluation, evaluation_table(evaluation), f"table: {folder / TABLE}", as_json=as_json)
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rfdropo_bayes.cli.options import AsJson, Overrides, Overwrite, Quiet, see_calibration
+from rfdropo_bayes.cli.options import AsJson, Overrides, Overwrite, see_calibration
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import look_through
@@ -37,10 +37,8 @@ def predict(
         str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
     ] = None,
     episode: Episode = None,
-    seed: Annotated[int | None, typer.Option(help="seed of the draws; by default from the experiment")] = None,
     group: PredictedGroup = None,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -57,19 +55,18 @@ def predict(
     from rfdropo_bayes.results.calibrated import Calibration
     from rfdropo_bayes.verbs.predict import predict as predict_motion
 
-    say_step(f"predicting {commands} with draws of {fit}", show=False if quiet or as_json else None)
+    say_step(f"predicting {commands} with draws of {fit}", show=False if as_json else None)
     prediction = predict_motion(
         Calibration.of_posterior(fit, Model.read(experiment, overrides)),
         _from_here(commands),
         out=out,
         start=None if start is None else _from_here(start),
         episode=episode,
-        seed=seed,
         group=group,
         overwrite=overwrite,
     )
     files = [str(out / f"prediction.{ending}") for ending in ("nc", "csv")]
-    show_prediction({**prediction.content, "files": files}, quiet=quiet, as_json=as_json)
+    show_prediction({**prediction.content, "files": files}, as_json=as_json)
 
 
 def adapt(
@@ -82,9 +79,7 @@ def adapt(
     episode: Episode = None,
     seconds: Annotated[float | None, typer.Option(help="seconds from the start that are used; all by default")] = None,
     group: Group = None,
-    seed: Annotated[int | None, typer.Option(help="seed; by default from the experiment")] = None,
     overwrite: Overwrite = False,
-    quiet: Quiet = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
@@ -109,11 +104,9 @@ def adapt(
         out=out,
         seconds=seconds,
         group=group,
-        seed=seed,
         overwrite=overwrite,
-        show=False if quiet else None,
     )
-    show_calibration(result, quiet=quiet, as_json=as_json)
+    show_calibration(result, as_json=as_json)
 
 
 def _from_here(name: str) -> str:

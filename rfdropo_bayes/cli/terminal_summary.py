@@ -33,24 +33,24 @@ AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment", "cautio
 MOST_ROWS = 20
 
 
-def say(content: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> None:
-    """Print a result as JSON, or lines of words about it, or nothing."""
+def say(content: Mapping[str, Any], *lines: str, as_json: bool) -> None:
+    """Print a result as JSON, or lines of words about it."""
     if as_json:
         typer.echo(json.dumps(content, indent=2))
-    elif not quiet:
+    else:
         for line in lines:
             typer.echo(line)
 
 
-def show_calibration(calibration: Calibration, experiment: Path | None = None, *, quiet: bool, as_json: bool) -> None:
+def show_calibration(calibration: Calibration, experiment: Path | None = None, *, as_json: bool) -> None:
     """Print the result of a finished calibration: headline, table of parameters, cautions, next command, and path of
     the report. The next command is an audit of ``experiment`` if there are cautions.
     """
     summary, folder = calibration.content, calibration.folder or Path()
     report = folder / "report.html"
-    if as_json or quiet:
+    if as_json:
         chosen = {key: summary[key] for key in CALIBRATED if key in summary}
-        say({**chosen, "folder": str(folder), "report": str(report)}, quiet=quiet, as_json=as_json)
+        say({**chosen, "folder": str(folder), "report": str(report)}, as_json=as_json)
         return
     console = _console()
     for sentence in summary["headline"]:
@@ -78,11 +78,11 @@ def show_calibration(calibration: Calibration, experiment: Path | None = None, *
     console.print(f"report: {report}", soft_wrap=True)
 
 
-def show_audit(content: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: bool) -> None:
+def show_audit(content: Mapping[str, Any], folder: Path, *, as_json: bool) -> None:
     """Print the result of an audit; ``content`` is of audit.json."""
     files = {"folder": str(folder), "report": str(folder / "report.html"), "extended": str(folder / "extended.toml")}
-    if as_json or quiet:
-        say({**{key: content[key] for key in AUDITED if key in content}, **files}, quiet=quiet, as_json=as_json)
+    if as_json:
+        say({**{key: content[key] for key in AUDITED if key in content}, **files}, as_json=as_json)
         return
     from rfdropo_bayes.report.sentences import sentences
 
@@ -108,13 +108,13 @@ def show_audit(content: Mapping[str, Any], folder: Path, *, quiet: bool, as_json
     console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
 
 
-def show_simulation(content: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+def show_simulation(content: Mapping[str, Any], *, as_json: bool) -> None:
     """Print the distance of a simulation from its recordings; ``content`` is of simulation.json."""
     runs = content["recordings"].items()
     lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
     if content["error_mm"] is not None and len(lines) > 1:
         lines.append(f"all of them{_off(content['error_mm'])}")
-    say(content, *lines, quiet=quiet, as_json=as_json)
+    say(content, *lines, as_json=as_json)
 
 
 def _off(error: Mapping[str, float] | None) -> str:
@@ -127,7 +127,7 @@ def _off(error: Mapping[str, float] | None) -> str:
     )
 
 
-def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+def show_prediction(facts: Mapping[str, Any], *, as_json: bool) -> None:
     """Print a description of a prediction; ``facts`` is the content of prediction.json."""
     start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
     lines = [f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}"]
@@ -138,7 +138,7 @@ def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> 
         lines.append(facts["unseen_day"])
     lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
     lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
-    say(facts, *lines, quiet=quiet, as_json=as_json)
+    say(facts, *lines, as_json=as_json)
 
 
 def _console() -> Console:

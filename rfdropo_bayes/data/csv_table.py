@@ -160,7 +160,7 @@ class CsvTable:
             low_memory=False,
             index_col=False,
         )
-        self.frame.columns = _told_apart(header)
+        self.frame.columns = _numbered_names(header)
 
     @classmethod
     def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
@@ -290,7 +290,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
 
 
-def _told_apart(header: Sequence[str]) -> list[str]:
+def _numbered_names(header: Sequence[str]) -> list[str]:
     """Names of columns, with a number for each empty name."""
     return [name or f"Unnamed: {column}" for column, name in enumerate(header)]
 

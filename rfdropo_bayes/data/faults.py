@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.data.identities import Change, changed_names
-from rfdropo_bayes.data.sample_times import check_times, clock_notes, evened
+from rfdropo_bayes.data.sample_times import check_times, clock_notes, evenly_spaced
 from rfdropo_bayes.errors import InputError
 
 NOTES = "notes"  # key of a recording's settings: valid but suspicious facts
@@ -94,7 +94,7 @@ def find_faults(
     missing = nan | zero
     held = find_held(np.where(missing[..., None], 0.0, position)) & ~missing
     jumping = np.zeros_like(missing)
-    breaks, clock = [], evened(time)
+    breaks, clock = [], evenly_spaced(time)
     for marker in range(position.shape[1]):
         rows = np.flatnonzero(~(missing | held)[:, marker])
         wrong, level_changes = _off_path(clock[rows], position[rows, marker], tolerance, max_acceleration, longest_run)

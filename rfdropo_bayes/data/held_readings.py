@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.data.sample_times import evened, sample_time
+from rfdropo_bayes.data.sample_times import evenly_spaced, sample_time
 
 HELD = 1.5  # samples: readings that last longer are held
 
@@ -27,7 +27,7 @@ def present_readings(reading: np.ndarray | None) -> tuple[np.ndarray | None, np.
 def hold_time(time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"]) -> float:
     """Median time for which a reading is repeated [s]; 0 if there are too few changes."""
     changes = np.flatnonzero(_changed(np.asarray(present_readings(reading)[0])))
-    return float(np.median(np.diff(evened(time)[changes]))) if changes.size > 2 else 0.0
+    return float(np.median(np.diff(evenly_spaced(time)[changes]))) if changes.size > 2 else 0.0
 
 
 def new_readings(

@@ -76,8 +76,8 @@ class SentCommands:
         between = 0.5 * (time[:-1] + time[1:])
         return replace(self, command_time=between, command=command[1:], initial_command=command[0])
 
-    def believed(self) -> SentCommands:
-        """The same, of which the largest is to be believed: commands of a simulator or of a controller's own log."""
+    def trusted(self) -> SentCommands:
+        """The same commands of a simulator or a controller's own log, whose largest command is plausible."""
         size = np.abs(np.asarray(self.command, dtype=float))
         return replace(self, largest=float(size.max())) if size.size and np.isfinite(size).all() else self
 

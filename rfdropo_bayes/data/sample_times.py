@@ -173,7 +173,7 @@ def _of_groups(time: np.ndarray, gaps: np.ndarray) -> float:
     return float(time[starts[-1]] - time[0]) / float(starts[-1]) if len(starts) else 0.0
 
 
-def pace(time: Float[np.ndarray, " rows"]) -> float:
+def row_interval(time: Float[np.ndarray, " rows"]) -> float:
     """Time from row to row [s], the median of means over many rows: deliveries and single gaps do not change it."""
     window = _window(time)
     return float(np.median(time[window:] - time[:-window])) / window
@@ -185,7 +185,7 @@ def _window(time: np.ndarray) -> int:
 
 def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
     """Rows that came in one delivery with the row before, if enough rows did to show that stamps are of arrival."""
-    usual, window = pace(time), _window(time)
+    usual, window = row_interval(time), _window(time)
     gaps = np.minimum(np.diff(time), window * usual)  # one gap of hours makes no others short
     means = np.convolve(gaps, np.ones(window) / window, "valid")
     around = np.pad(means, (window // 2, len(gaps) - len(means) - window // 2), "edge")
@@ -193,7 +193,7 @@ def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
     return short if len(short) >= BUNCHED * len(gaps) else short[:0]
 
 
-def evened(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+def evenly_spaced(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
     """Times from which rates can be taken [s]: evenly spaced if stamps are of arrival, else the stamps."""
     short = short_intervals(time)
     return time if not len(short) else time[0] + _between(time, short) * np.arange(len(time))
@@ -201,14 +201,14 @@ def evened(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
 
 def sample_time(*times: Float[np.ndarray, " rows"]) -> float:
     """Median time from row to row [s] of one or more recordings, evenly spaced if stamps are of arrival."""
-    return float(np.median(np.concatenate([np.diff(evened(time)) for time in times])))
+    return float(np.median(np.concatenate([np.diff(evenly_spaced(time)) for time in times])))
 
 
 def _between(time: np.ndarray, short: np.ndarray) -> float:
     """Time from row to row [s] between the first delivery and the last, lost time left out."""
     starts = np.setdiff1d(np.arange(1, len(time)), short)
     if len(starts) < 2:
-        return pace(time)
+        return row_interval(time)
     gaps = np.diff(time)
     longest = JUMP * float(np.median(gaps[starts - 1]))
     within = gaps[starts[0] : starts[-1]]
@@ -235,7 +235,7 @@ def rounded_notes(stamps: Stamps, time: Float[np.ndarray, " rows"]) -> list[str]
 
 def clock_notes(time: Float[np.ndarray, " rows"]) -> list[str]:
     """Notes on valid but suspicious times [s], by row, each with a remedy."""
-    gaps, usual, notes = np.diff(time), pace(time), []
+    gaps, usual, notes = np.diff(time), row_interval(time), []
     short = short_intervals(time)
     if len(short):
         notes.append(

@@ -20,6 +20,7 @@ from rfdropo_bayes.tables import parse_table
 
 _SLACK = 0.7  # of the homing tension: a cable is let out to here before it is pulled, so that all approach from below
 _MEDIAN = 5  # cycles: a torque is noisy, and one reading must not decide
+TORQUE_FACTOR = 2.0  # the torque limit as a multiple of the homing tension
 
 
 class Home(BaseModel):
@@ -89,7 +90,7 @@ def homing_motors(motors: Sequence[Motor], table: HomingTable) -> list[Motor]:
     caps = {"length_limit_m": (-table.travel_m, table.travel_m)}
     return [
         motor.model_copy(
-            update=caps | {"tension_limit_n": (0.0, table.torque_factor * motor.homing_tension_n), "offset_counts": 0}
+            update=caps | {"tension_limit_n": (0.0, TORQUE_FACTOR * motor.homing_tension_n), "offset_counts": 0}
         )
         for motor in motors
     ]

@@ -272,7 +272,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
             command_unit=robot.command_unit,
             cable_names=robot.channel_names,
             initial_command=before,
-        ).believed(),
+        ).trusted(),
         Measured(
             time=rows["time"],
             position=position,

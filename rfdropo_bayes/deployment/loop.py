@@ -29,6 +29,7 @@ from rfdropo_bayes.robots import Robot
 
 _AWAY = 1e-4  # [m]: a braked drive farther than this from its command holds another command
 _ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep
+ENABLE_S = 2.0  # within this time the drives must be enabled
 
 
 class Phase(IntEnum):
@@ -90,7 +91,7 @@ class ControlLoop:
         self.set_points = SetPoints(self.motors, period, np.zeros(channels))
         self.command = np.zeros(channels)  # in force [m]
         self._raw, self._asked = np.zeros(channels), np.zeros(channels)
-        self.watch = Watch(drives, safety.patience())
+        self.watch = Watch(drives, safety)
         self._clock: CycleClock
         self._wanted = DriveState.SWITCH_ON_DISABLED
         self._expected: DriveState | None = None
@@ -218,7 +219,7 @@ class ControlLoop:
                     f"{drive.name} stands at {1e3 * drive.length:.1f} mm, outside its limits: home it",
                 )
         self._wanted = DriveState.OPERATION_ENABLED
-        end = time.monotonic() + self.safety.enable_s
+        end = time.monotonic() + ENABLE_S
         while waiting := [drive for drive in self.drives.all if drive.state is not DriveState.OPERATION_ENABLED]:
             if time.monotonic() > end:
                 state = waiting[0].state
@@ -336,7 +337,7 @@ class ControlLoop:
     def _release(self) -> None:
         """Switch the drives off, one state down at a time."""
         self._wanted, self._expected = DriveState.SWITCH_ON_DISABLED, None
-        end = time.monotonic() + self.safety.enable_s
+        end = time.monotonic() + ENABLE_S
         while any(drive.state is not DriveState.SWITCH_ON_DISABLED for drive in self.drives.all):
             self.cycle(Phase.HOLDING)
             if time.monotonic() > end:

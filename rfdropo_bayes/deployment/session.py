@@ -17,6 +17,8 @@ import can
 import numpy as np
 import tomli_w
 from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
 
 from rfdropo_bayes import __version__
 from rfdropo_bayes.data import GOAL_AXES, Trajectory
@@ -24,12 +26,11 @@ from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simula
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
-from rfdropo_bayes.deployment.display import session_table
 from rfdropo_bayes.deployment.drives import Drives, drives_of
 from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals, file_hook
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
-from rfdropo_bayes.deployment.loop import ControlLoop, Phase
+from rfdropo_bayes.deployment.loop import ControlLoop, Phase, Snapshot
 from rfdropo_bayes.deployment.policy import (
     CommandSource,
     OnnxPolicy,
@@ -384,3 +385,33 @@ def _figures(loop: ControlLoop, period: float) -> dict[str, Any]:
 
 def _at(values: np.ndarray, percent: float) -> float:
     return float(np.percentile(values, percent))
+
+
+def session_table(snapshot: Snapshot, mode: str) -> Table:
+    """Cycle time, states, set-points, tensions, misses and time left."""
+    phase = "-" if snapshot.phase is None else snapshot.phase.name.lower()
+    title = (
+        f"{mode}: {phase}, {snapshot.left:.1f} s left, late {1e3 * snapshot.lateness:.2f} ms, "
+        f"missed {snapshot.missed}, policy {1e3 * snapshot.act_time:.2f} ms. Any of space, Enter, Esc, q stops."
+    )
+    table = Table(title=title, title_justify="left")
+    for column in ("channel", "node", "state", "set-point [mm]", "actual [mm]", "tension [N]"):
+        table.add_column(column, justify="left" if column in ("channel", "state") else "right")
+    for drive, length in zip(snapshot.drives, snapshot.set_point, strict=True):
+        axis = f" axis {drive.motor.axis}" if drive.motor.axis > 1 else ""
+        node = f"{drive.motor.node}{axis}"
+        if drive.reading is None:
+            table.add_row(escape(drive.motor.channel), node, "silent", "", "", "")
+            continue
+        state = drive.state
+        limit = drive.motor.tension_limit_n[1]
+        tension = f"{drive.tension:.2f}"
+        table.add_row(
+            escape(drive.motor.channel),
+            node,
+            "unknown" if state is None else state.words,
+            f"{1e3 * length:.2f}",
+            f"{1e3 * drive.length:.2f}",
+            f"[red]{tension}[/red]" if drive.tension > 0.8 * limit else tension,
+        )
+    return table

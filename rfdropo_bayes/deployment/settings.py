@@ -14,7 +14,6 @@ from rfdropo_bayes.deployment.drives import Guards, Identity
 from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.sensors import SensorTable
 from rfdropo_bayes.deployment.vendors import WITHOUT, AccelerationUnit, SpeedUnit, TorqueUnit, Units
-from rfdropo_bayes.deployment.watch import Patience
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest, parse_assignment, parse_table, read_toml, set_entry
 
@@ -97,12 +96,10 @@ class SafetyTable(_Table):
     """Fault tolerances, and the start and end of a session.
 
     Attributes:
-        misses, misses_within_s: the session ends after this number of deadlines missed by more than a cycle within this
-            time.
+        misses: the session ends after this number of deadlines missed by more than a cycle within a second.
         stale_cycles: largest number of cycles without a drive's status.
         heartbeat_s: drives and master stop if the other's heartbeat is missing for this long.
         following_error_m, following_time_s: a drive faults if it lags behind by this length for this time.
-        enable_s: within this time the drives must be enabled.
         start_rate_m_s: rate of the ramp to the start pose; a fifth of each motor's own limit by default.
         settle_s: rest in the start pose before the policy begins.
         hold_s: time for which the drives are watched after a stop.
@@ -112,29 +109,16 @@ class SafetyTable(_Table):
     """
 
     misses: int = Field(default=3, ge=1)
-    misses_within_s: float = Field(default=1.0, gt=0.0)
     stale_cycles: int = Field(default=3, ge=1)
     heartbeat_s: float = Field(default=0.06, ge=0.02)
     following_error_m: float = Field(default=0.005, gt=0.0)
     following_time_s: float = Field(default=0.05, gt=0.0)
-    enable_s: float = Field(default=2.0, gt=0.0)
     start_rate_m_s: float | None = Field(default=None, gt=0.0)
     settle_s: float = Field(default=1.0, ge=0.0)
     hold_s: float = Field(default=0.3, ge=0.1)
     after: Literal["hold", "release"] = "hold"
     button_file: str | None = None
     button_pressed: str = "0"
-
-    def patience(self) -> Patience:
-        """For the watch."""
-        return Patience(
-            self.misses,
-            self.misses_within_s,
-            self.stale_cycles,
-            self.heartbeat_s,
-            self.following_error_m,
-            self.following_time_s,
-        )
 
     def guards(self, nodes: Collection[int]) -> Guards:
         """For the drives of these ``nodes``: the master takes the highest free number."""
@@ -155,7 +139,6 @@ class HomingTable(_Table):
         rate_m_s: cable speed of the search.
         travel_m: longest travel of each cable.
         time_s: longest search for each cable.
-        torque_factor: the torque limit as a multiple of the homing tension.
         rounds: number of passes over all cables: pulling a cable changes the others.
         valid_h: age above which a result is refused.
     """
@@ -164,7 +147,6 @@ class HomingTable(_Table):
     rate_m_s: float = Field(default=0.002, gt=0.0)
     travel_m: float = Field(default=0.03, gt=0.0)
     time_s: float = Field(default=30.0, gt=0.0)
-    torque_factor: float = Field(default=2.0, gt=1.0)
     rounds: int = Field(default=2, ge=1)
     valid_h: float = Field(default=24.0, gt=0.0)
 

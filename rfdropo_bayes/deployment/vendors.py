@@ -49,7 +49,7 @@ _TOLD_TURNS = {
 _TOLD_COUNTS = {(0xB5, 0x03), (0xB5, 0x57)}
 
 
-def told_counts(word: int, counts_per_turn: float) -> float | None:
+def reported_counts(word: int, counts_per_turn: float) -> float | None:
     """Counts in one unit of an object 0x60A9 or 0x60AA; None for an unknown unit.
 
     The word is, from its highest byte: a power of ten, numerator, denominator, 0 (CiA 402-2; codes of CiA 303-2, as
@@ -77,8 +77,8 @@ def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, wh
     rpm = counts_of("rpm", counts_per_turn)
     if stated is not None:
         return counts_of(stated, counts_per_turn)
-    told = told_counts(word, counts_per_turn) if word else rpm
-    if told is None or not math.isclose(told, rpm):
+    reported = reported_counts(word, counts_per_turn) if word else rpm
+    if reported is None or not math.isclose(reported, rpm):
         raise InputError(
             f"its velocities are not in rpm (0x60A9 is 0x{word:08X}), and its greatest speed 0x6080 need not be",
             where=where,
@@ -99,19 +99,19 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
     Raises:
         InputError: if the drive has another unit than the stated unit, or an unknown unit without a stated unit.
     """
-    told = told_counts(word, counts_per_turn) if word else None
+    reported = reported_counts(word, counts_per_turn) if word else None
     if stated is None and not word:
         return counts_of("counts/s2", counts_per_turn)
     if stated is None:
-        if told is None:
+        if reported is None:
             raise InputError(
                 f"has an unknown unit of accelerations (0x60AA is 0x{word:08X})",
                 where=where,
                 remedy='look into its manual, and state [drives] acceleration_unit, "counts/s2" or "rpm/s"',
             )
-        return told
+        return reported
     counts = counts_of(stated, counts_per_turn)
-    if told is not None and not math.isclose(told, counts):
+    if reported is not None and not math.isclose(reported, counts):
         raise InputError(
             f"has another unit of accelerations (0x60AA is 0x{word:08X}) than {stated}",
             where=where,

@@ -4,32 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import NamedTuple
 
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.cia402 import DriveState, Status
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drive, Drives
 from rfdropo_bayes.deployment.objects import NmtState, Object
+from rfdropo_bayes.deployment.settings import SafetyTable
 
-
-class Patience(NamedTuple):
-    """Fault tolerances.
-
-    Attributes:
-        misses: number of deadlines missed by more than a cycle within ``misses_within_s`` that ends the session.
-        misses_within_s: see above [s].
-        stale_cycles: largest number of cycles without a TPDO of some drive.
-        heartbeat_s: time without a drive's heartbeat [s].
-        following_error_m, following_time_s: lag behind a set-point [m], and for how long [s].
-    """
-
-    misses: int = 3
-    misses_within_s: float = 1.0
-    stale_cycles: int = 3
-    heartbeat_s: float = 0.06
-    following_error_m: float = 0.005
-    following_time_s: float = 0.05
+MISSES_WITHIN_S = 1.0  # the time in which so many missed deadlines end a session
 
 
 class Watch:
@@ -37,11 +20,11 @@ class Watch:
 
     Args:
         drives: drives to check.
-        patience: fault tolerances.
+        safety: fault tolerances.
     """
 
-    def __init__(self, drives: Drives, patience: Patience) -> None:
-        self._drives, self._patience = drives, patience
+    def __init__(self, drives: Drives, safety: SafetyTable) -> None:
+        self._drives, self._safety = drives, safety
         self._misses: deque[float] = deque()
         self.missed = 0
         self.begin()
@@ -91,9 +74,9 @@ class Watch:
         quiet = now - max(drive.node.heartbeat, self._started)
         if drive.node.nmt not in (None, NmtState.OPERATIONAL):
             raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat reports {drive.node.nmt})")
-        if quiet > self._patience.heartbeat_s:
+        if quiet > self._safety.heartbeat_s:
             raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
-        if drive.unanswered > self._patience.stale_cycles:
+        if drive.unanswered > self._safety.stale_cycles:
             raise Stop(Cause.STALE_STATUS, f"{drive.name}: no status for {drive.unanswered} cycles")
 
     def _check_state(self, drive: Drive, expected: DriveState | None) -> None:
@@ -113,20 +96,19 @@ class Watch:
         if drive.reading is None:
             return
         lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre
-        if lag <= self._patience.following_error_m:
+        if lag <= self._safety.following_error_m:
             self._lagging.pop(drive, None)
-        elif now - self._lagging.setdefault(drive, now) > self._patience.following_time_s:
+        elif now - self._lagging.setdefault(drive, now) > self._safety.following_time_s:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} is {1e3 * lag:.1f} mm behind its set-point")
 
     def _check_deadlines(self, tick: Tick) -> None:
         if tick.missed:
             self.missed += tick.missed
             self._misses.extend([tick.time] * tick.missed)
-        while self._misses and self._misses[0] < tick.time - self._patience.misses_within_s:
+        while self._misses and self._misses[0] < tick.time - MISSES_WITHIN_S:
             self._misses.popleft()
-        if len(self._misses) >= self._patience.misses:
-            seconds = self._patience.misses_within_s
-            raise Stop(Cause.DEADLINES, f"{len(self._misses)} deadlines missed within {seconds:g} s")
+        if len(self._misses) >= self._safety.misses:
+            raise Stop(Cause.DEADLINES, f"{len(self._misses)} deadlines missed within {MISSES_WITHIN_S:g} s")
 
 
 class AfterStop:

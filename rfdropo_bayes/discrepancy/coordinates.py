@@ -8,7 +8,7 @@ coordinate is infinite. A parameter without effect at null (a time constant) is 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -28,6 +28,8 @@ PRIOR_DRAWS = 4000
 FAR = 8.0
 STEP = 1e-3  # of differences of log priors, in these coordinates
 
+Moved = Callable[[Float[Any, "n moved"]], tuple[Float[Any, "n moved"], Float[Any, "n moved"]]]
+
 
 @dataclass(frozen=True)
 class Coordinates:
@@ -40,12 +42,16 @@ class Coordinates:
             deviation is clipped to their hard bounds.
         widening: factor by which prior and unit of each coordinate are wider than its parameter's prior; empty for
             none.
+        draws: draws of each parameter's prior, and ``moved``, values and derivatives of the parameters that move in
+            unconstrained coordinates, compiled. Copies share both: computing them takes as long as a refit's rollouts.
     """
 
     space: Scopes
     base: int
     physical: tuple[str, ...]
     widening: tuple[float, ...] = ()
+    draws: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+    moved: Moved | None = field(default=None, repr=False, compare=False)
 
     @property
     def nominal(self) -> dict[str, float]:
@@ -58,22 +64,16 @@ class Coordinates:
         return self.space.names
 
     def with_further(self, added: Scopes) -> Coordinates:
-        """The same with parameters after all others, which are measured from their null values.
-
-        Cached results for the others are kept: recomputing them takes as long as a refit's rollouts.
-        """
-        found = replace(self, space=self.space.with_further(added.parameters))
-        assert found.affine[len(self.names) :].all()
+        """The same with parameters after all others, which are measured from their null values."""
         fresh = added.sample(jax.random.key(len(self.names)), PRIOR_DRAWS)
-        kept = {"_draws": self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}}
-        found.__dict__.update(kept, _moved=self._moved)
+        draws = self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}
+        found = replace(self, space=self.space.with_further(added.parameters), draws=draws, moved=self._moved)
+        assert found.affine[len(self.names) :].all()
         return found
 
     def widened(self, factors: Float[np.ndarray, " d"]) -> Coordinates:
         """The same with priors and units of candidates' sizes widened about null by ``factors``."""
-        found = replace(self, widening=tuple(factors.tolist()))
-        found.__dict__.update(_draws=self._draws, _moved=self._moved)
-        return found
+        return replace(self, widening=tuple(factors.tolist()), draws=self._draws, moved=self._moved)
 
     @cached_property
     def affine(self) -> np.ndarray:
@@ -87,6 +87,8 @@ class Coordinates:
 
     @cached_property
     def _draws(self) -> dict[str, np.ndarray]:
+        if self.draws:
+            return dict(self.draws)
         draws = self.space.sample(jax.random.key(0), PRIOR_DRAWS)
         return {name: np.asarray(values, dtype=float) for name, values in draws.items()}
 
@@ -184,8 +186,10 @@ class Coordinates:
         return np.stack(density, axis=1) + np.log(np.abs(slopes))
 
     @cached_property
-    def _moved(self) -> Callable[[Float[Any, "n moved"]], tuple[Float[Any, "n moved"], Float[Any, "n moved"]]]:
+    def _moved(self) -> Moved:
         """Values and derivatives of the parameters that move in unconstrained coordinates."""
+        if self.moved is not None:
+            return self.moved
         transforms = [p.transform for p, affine in zip(self.space.parameters, self.affine, strict=True) if not affine]
 
         def values(u: Float[Array, "n moved"]) -> Float[Array, "n moved"]:

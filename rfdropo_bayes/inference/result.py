@@ -16,7 +16,7 @@ from scipy.stats import skew
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
+from rfdropo_bayes.posteriors import contradiction, contradicts, cut_off_at
 
 SCATTERED = 0.5  # nats
 APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
@@ -89,9 +89,9 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
     found, apart = [], []
     for name, values in draws.items():
         values, (low, high), prior = np.ravel(values), ends[name], np.asarray(drawn[name], dtype=float)
-        side = piled_at(values, low, high)
+        side = cut_off_at(values, low, high)
         if side and _even_in_logarithms(prior):
-            side = piled_at(values, low, high, logarithmic=True)
+            side = cut_off_at(values, low, high, logarithmic=True)
         if side:
             word, end = ("lower", low) if side == "low" else ("upper", high)
             hard = np.isclose(end, problem.bounds[name], rtol=1e-6, atol=0.0).any()

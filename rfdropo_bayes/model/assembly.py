@@ -7,6 +7,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import jax
+
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import (
     Channel,
@@ -43,14 +45,13 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.laws import LawChoice, make_law
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import REGISTRY
-from rfdropo_bayes.model.compute_backend import backend
-from rfdropo_bayes.model.experiment import matching
+from rfdropo_bayes.model.experiment import SimulatorTable, matching
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
 from rfdropo_bayes.posteriors import DrawsByOwner, ParameterInfo
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
-from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Engine
+from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest, specs_of
@@ -439,3 +440,14 @@ def build_problem(model: TrajectoryModel, earlier: DrawsByOwner | None = None) -
     """The model as the inference methods see it, in chunks that suit its engine; ``earlier``: see the problem."""
     lanes = model.simulator.lanes
     return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier or {})
+
+
+def backend(table: SimulatorTable, rod: bool) -> Backend:
+    """The backend that [simulator] asks for.
+
+    "auto" is the compiled backend for meshes, which JAX lacks, and for rods if JAX has only a CPU.
+    """
+    compiled = table.engine == "numba"
+    if table.engine == "auto":
+        compiled = not rod or jax.default_backend() == "cpu"
+    return Backend("numba", table.precision, table.threads) if compiled else Backend("jax")

@@ -248,7 +248,7 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     return randomisation
 
 
-def spread_out(randomisation: Randomisation, width: float, specs: Sequence[ParameterSpec]) -> Randomisation:
+def with_width(randomisation: Randomisation, width: float, specs: Sequence[ParameterSpec]) -> Randomisation:
     """A posterior or phi whose draws are ``width`` times as far from their middle, up to the parameters' hard bounds.
 
     Positive parameters are spread in logarithms.
@@ -258,7 +258,7 @@ def spread_out(randomisation: Randomisation, width: float, specs: Sequence[Param
     """
     if isinstance(randomisation, Layers):
         *before, last = randomisation.parts
-        return replace(randomisation, parts=(*before, spread_out(last, width, specs)))
+        return replace(randomisation, parts=(*before, with_width(last, width, specs)))
     known = {spec.name: spec for spec in specs}
     if isinstance(randomisation, Days):
         spreads = {name: width * column for name, column in randomisation.spreads.items()}

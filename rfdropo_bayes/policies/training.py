@@ -161,7 +161,7 @@ def _begin(
         variance = LEAST_SPREAD**2  # added to variances
         normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=variance) if table.normalise else None
         ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
-        around = _learnt_in(normalisation or venv, table)
+        around = _training_environments(normalisation or venv, table)
         policy, options = _policy_class(around, table, options)
         try:
             return maker(policy, around, **ours, **options), normalisation
@@ -188,11 +188,11 @@ def _load(
 
     normalisation = VecNormalize.load(str(folder / f"{which}normalisation.pkl"), venv) if table.normalise else None
     path = folder / f"{which}model.zip"
-    around = _learnt_in(normalisation or venv, table)
+    around = _training_environments(normalisation or venv, table)
     return maker.load(path, env=around, device="cpu", tensorboard_log=tensorboard), normalisation
 
 
-def _learnt_in(around: Any, table: TrainingTable) -> Any:
+def _training_environments(around: Any, table: TrainingTable) -> Any:
     """Environments for training: the policy's environments, with further observations for the critic."""
     if table.critic == "observation":
         return around

@@ -1,6 +1,6 @@
 """Draws and predictions on disk: the only room that depends on ArviZ."""
 
-from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, piled_at
+from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, cut_off_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import (
     InferenceData,
@@ -27,10 +27,10 @@ __all__ = [
     "central_interval",
     "contradiction",
     "contradicts",
+    "cut_off_at",
     "evaluate_products",
     "label",
     "load_posterior",
-    "piled_at",
     "save_posterior",
     "summarise",
     "to_tree",

@@ -13,7 +13,7 @@ NEIGHBOURS = 5  # prior draws on the denser side, which estimate the density at 
 PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
 
 
-def piled_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarithmic: bool = False) -> str | None:
+def cut_off_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarithmic: bool = False) -> str | None:
     """The end, "low" or "high", at which a distribution is cut off at its mode; None if neither is.
 
     Its outer 5 % quantile then lies within a tenth of a standard deviation of that end.

@@ -98,11 +98,11 @@ def to_tree(
 
 def in_arviz(tree: xr.DataTree) -> InferenceData:
     """ArviZ's type of a posterior: InferenceData, and from 1.0 on the tree itself."""
-    found: Any = tree
+    converted: Any = tree
     if not TREES:
         groups: dict[str, Any] = {name: child.to_dataset() for name, child in tree.children.items()}
-        found = arviz.InferenceData(attrs=dict(tree.attrs), **groups)
-    return found
+        converted = arviz.InferenceData(attrs=dict(tree.attrs), **groups)
+    return converted
 
 
 def variable_key(name: str) -> str:

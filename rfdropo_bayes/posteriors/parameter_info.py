@@ -103,8 +103,8 @@ DrawsByOwner = Mapping[str, Draws]
 
 def by_owner(infos: Iterable[ParameterInfo], draws: Draws) -> dict[str, dict[str, Float[np.ndarray, " n"]]]:
     """Draws that have labels, by parameter and owner."""
-    found: dict[str, dict[str, Float[np.ndarray, " n"]]] = {}
+    owned: dict[str, dict[str, Float[np.ndarray, " n"]]] = {}
     for info in infos:
         if info.name in draws:
-            found.setdefault(info.parameter, {})[info.scope.owner] = np.asarray(draws[info.name])
-    return found
+            owned.setdefault(info.parameter, {})[info.scope.owner] = np.asarray(draws[info.name])
+    return owned

@@ -113,8 +113,8 @@ def physical_of_normal(
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
     """Log evidence of the unperturbed data for every body, from the linearisation at its own optimum."""
-    found = -_least_cost(fit, noise) - 0.5 * np.linalg.slogdet(_curvature(fit))[1]
-    return np.where(np.isfinite(found), found, -np.inf)
+    evidence = -_least_cost(fit, noise) - 0.5 * np.linalg.slogdet(_curvature(fit))[1]
+    return np.where(np.isfinite(evidence), evidence, -np.inf)
 
 
 def _least_cost(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:

@@ -110,19 +110,19 @@ def reach_of(path: Float[np.ndarray, "time marker 3"]) -> Float[np.ndarray, "tim
     return np.maximum.accumulate(np.linalg.norm(path - path[0], axis=-1), axis=0)
 
 
-def prior_day_error(left: ModelError, fitted: Sequence[RecordingPrediction]) -> DayError:
+def prior_day_error(model_error: ModelError, fitted: Sequence[RecordingPrediction]) -> DayError:
     """The slow error of a session if no session was left out of the fit.
 
     Args:
-        left: residuals of the model on the fitted recordings.
+        model_error: residuals of the model on the fitted recordings.
         fitted: their predictions, if known.
     """
-    scale = tuple(np.linalg.norm(np.reshape(left.scale, (-1, 3)), axis=1).tolist())
+    scale = tuple(np.linalg.norm(np.reshape(model_error.scale, (-1, 3)), axis=1).tolist())
     if not fitted:
-        return DayError(left.markers, scale, ())
+        return DayError(model_error.markers, scale, ())
     squares = np.concatenate([reach_of(p.central) ** 2 for p in fitted])
     reach = np.maximum(np.sqrt(squares.mean(axis=0)), SMALLEST_REACH)
-    return DayError(left.markers, scale, tuple(reach.tolist()))
+    return DayError(model_error.markers, scale, tuple(reach.tolist()))
 
 
 def day_error(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]]) -> DayError:
@@ -135,12 +135,12 @@ def day_error(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]]
         prior: without any.
         days: predictions of recordings of each day by a fit without it, their slow error left out, by group.
     """
-    squares = {group: _squared_times(prior, found) for group, found in days.items()}
+    squares = {group: _squared_times(prior, recordings) for group, recordings in days.items()}
     if not squares:
         return prior
     return _with_times(prior, list(squares.values()))._replace(
-        days={group: _tip_error(found) for group, found in days.items()},
-        constant=_constant_share(prior, [p for found in days.values() for p in found]),
+        days={group: _tip_error(recordings) for group, recordings in days.items()},
+        constant=_constant_share(prior, [p for recordings in days.values() for p in recordings]),
         held=_held(prior, days, squares),
     )
 
@@ -150,8 +150,10 @@ def recorded_day_error(record: PosteriorRecord) -> DayError | None:
     given = record.attrs.get(DAY_ERROR)
     if given is not None:
         return DayError.from_dict(given)
-    left = recorded_model_error(record)
-    return None if left is None else prior_day_error(left, [p for p in record.recordings if p.split == "fit"])
+    model_error = recorded_model_error(record)
+    if model_error is None:
+        return None
+    return prior_day_error(model_error, [p for p in record.recordings if p.split == "fit"])
 
 
 def _with_times(prior: DayError, squares: Sequence[float]) -> DayError:
@@ -191,9 +193,9 @@ def _tip_error(predictions: Sequence[RecordingPrediction]) -> float:
 def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]) -> float:
     """Share of the coordinates of left-out sessions in 90 % bands from the other sessions."""
     inside = []
-    for number, (group, found) in enumerate(days.items()):
+    for number, (group, recordings) in enumerate(days.items()):
         other = _with_times(prior, [square for name, square in squares.items() if name != group])
-        for place, p in enumerate(found):
+        for place, p in enumerate(recordings):
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), number), place)
             slow = other.draw(key, len(p.predicted), p.time, other.unit(p.central, p.marker_names))
             low, high = np.quantile(p.predicted + slow, [0.05, 0.95], axis=0)
@@ -203,7 +205,7 @@ def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], sq
 
 def day_sentence(error: DayError) -> str:
     """Sentence on the error in a session without a recording."""
-    begin = "No recording of this day was seen."
+    begin = "No recording of this session was seen."
     if not error.days:
         return (
             f"{begin} This run left no session out of its fit: its bands are widened by {error.times:.2g} "
@@ -218,6 +220,6 @@ def left_out_sentence(error: DayError) -> str:
     if not error.days:
         return missed.lstrip()
     low, high = 1e3 * min(error.days.values()), 1e3 * max(error.days.values())
-    far = f"{low:.2g}" if len(error.days) == 1 else f"{low:.2g} to {high:.2g}"
-    held = "" if error.held is None else f"; its 90 % bands held {100.0 * error.held:.0f} %"
-    return f"On days left out this model was {far} mm off{held}.{missed}"
+    errors = f"{low:.2g}" if len(error.days) == 1 else f"{low:.2g} to {high:.2g}"
+    coverage = "" if error.held is None else f"; its 90 % bands held {100.0 * error.held:.0f} %"
+    return f"In sessions left out of its fit this model was {errors} mm off{coverage}.{missed}"

@@ -38,14 +38,14 @@ def day_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> d
     """
     values = {info.name: record.flat(info.name) for info in record.free}
     known, day = {spec.name for spec in specs} & set(values), record.attrs.get(ADAPTED_TO, "")
-    found: dict[str, DayDeviation] = {}
+    deviations: dict[str, DayDeviation] = {}
     for info in (each for each in record.free if each.scope.added_to in known):
         nothing = np.zeros(len(values[info.name]))
         if info.scope.owner == day:
-            found[info.scope.added_to] = DayDeviation(values[info.name], nothing)
+            deviations[info.scope.added_to] = DayDeviation(values[info.name], nothing)
         else:
-            found.setdefault(info.scope.added_to, DayDeviation(nothing, info.spread_of(values, len(nothing))))
-    return found
+            deviations.setdefault(info.scope.added_to, DayDeviation(nothing, info.spread_of(values, len(nothing))))
+    return deviations
 
 
 def draw_deviation(

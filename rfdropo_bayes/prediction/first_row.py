@@ -1,6 +1,6 @@
 """Conditioning of parameters on the first row of a recording.
 
-`match_first_row` fits the parameters of a recording or a new group to the row. `weighed_by_first_row` resamples draws
+`match_first_row` fits the parameters of a recording or a new group to the row. `resampled_by_first_row` resamples draws
 for recordings of a fitted group: nothing is free, but some draws fit the row better.
 """
 
@@ -38,7 +38,7 @@ def match_first_row(
     values: Batch,
     names: Sequence[str],
     deviations: Sequence[InferredParameter],
-    left: ModelError | None,
+    model_error: ModelError | None,
     key: PRNGKeyArray,
 ) -> tuple[Batch, int]:
     """Condition the parameters of recordings on their first rows: the frame's offset, and deviations of a new group.
@@ -53,7 +53,7 @@ def match_first_row(
         values: draws of all its parameters.
         names: recordings with an unknown offset.
         deviations: deviations drawn from their prior.
-        left: model error of each marker; without it, offsets weight all markers equally, and deviations are unchanged.
+        model_error: error of each marker; without it, offsets weight all markers equally, and deviations are unchanged.
         key: random key of the perturbations.
 
     Returns:
@@ -65,8 +65,8 @@ def match_first_row(
     recordings = problem.model.recordings
     shifted = [p for p in problem.model.scopes.parameters if p.scope.owner in names and p.spec.name in OFFSETS]
     if shifted:
-        values = _with_offsets(problem, values, shifted, left)
-    if left is None or not deviations:
+        values = _with_offsets(problem, values, shifted, model_error)
+    if model_error is None or not deviations:
         return values, 0
     lost = 0
     for number, group in enumerate(dict.fromkeys(p.scope.owner for p in deviations)):
@@ -75,16 +75,16 @@ def match_first_row(
         if seen:
             free = any(p.scope.owner == seen[0] for p in shifted)
             own_key = jax.random.fold_in(key, number)
-            values, unmatched = _with_deviations(problem, values, seen[0], own, left, own_key, shifted=free)
+            values, unmatched = _with_deviations(problem, values, seen[0], own, model_error, own_key, shifted=free)
             lost += unmatched
-    return (_with_offsets(problem, values, shifted, left) if shifted else values), lost
+    return (_with_offsets(problem, values, shifted, model_error) if shifted else values), lost
 
 
-def weighed_by_first_row(
+def resampled_by_first_row(
     recordings: RecordingSet,
     position: Float[np.ndarray, "n recording marker 3"],
     names: Sequence[str],
-    left: ModelError | None,
+    model_error: ModelError | None,
     key: PRNGKeyArray,
 ) -> Int[np.ndarray, "n recording"]:
     """Indices of draws for each recording, resampled by the likelihood of its first row.
@@ -96,15 +96,15 @@ def weighed_by_first_row(
         recordings: recordings to predict.
         position: simulated markers [m] in their first rows.
         names: recordings whose first row `match_first_row` has not used.
-        left: model error of each marker; without it, all draws have equal weight.
+        model_error: error of each marker; without it, all draws have equal weight.
         key: random key of the resampling.
     """
     count = len(position)
     index = np.tile(np.arange(count)[:, None], (1, len(recordings.names)))
-    sd = _errors(recordings.markers, left)[:, None] / np.sqrt(3.0)
+    sd = _errors(recordings.markers, model_error)[:, None] / np.sqrt(3.0)
     for place, name in enumerate(recordings.names):
         valid = recordings.line.valid[place, 0]
-        if left is None or name not in names or not valid.any():
+        if model_error is None or name not in names or not valid.any():
             continue
         error = ((recordings.position[place, 0] - position[:, place]) / sd)[:, valid]
         density = -0.5 * np.sum(error**2, axis=(1, 2))
@@ -113,31 +113,33 @@ def weighed_by_first_row(
     return index
 
 
-def far_first_rows(predictions: Sequence[RecordingPrediction], left: ModelError | None) -> dict[str, float]:
+def first_row_distances(predictions: Sequence[RecordingPrediction], model_error: ModelError | None) -> dict[str, float]:
     """Distance of measured from predicted first rows in units of the model error, if it exceeds chance.
 
     Errors of a row are assumed normal, with the sizes and the number of independent coordinates of the residuals
     (`ModelError.share`).
     """
-    found = {}
+    distances = {}
     for p in predictions:
-        seen = [i for i, name in enumerate(p.marker_names) if p.mask[0, i] and left and name in left.markers]
-        if left is None or not seen:
+        seen = [
+            i for i, name in enumerate(p.marker_names) if p.mask[0, i] and model_error and name in model_error.markers
+        ]
+        if model_error is None or not seen:
             continue
         error = np.linalg.norm(p.observed[0, seen] - p.central[0, seen], axis=1)
-        size = np.sqrt(left.share) * _errors([p.marker_names[i] for i in seen], left)
-        times, count = float(np.sqrt(np.mean((error / size) ** 2))), 3.0 * left.share * len(seen)
+        size = np.sqrt(model_error.share) * _errors([p.marker_names[i] for i in seen], model_error)
+        times, count = float(np.sqrt(np.mean((error / size) ** 2))), 3.0 * model_error.share * len(seen)
         if count * times**2 > chi2.ppf(SURE, count):
-            found[p.name] = times
-    return found
+            distances[p.name] = times
+    return distances
 
 
 def _with_offsets(
-    problem: CalibrationProblem, values: Batch, offsets: Sequence[InferredParameter], left: ModelError | None
+    problem: CalibrationProblem, values: Batch, offsets: Sequence[InferredParameter], model_error: ModelError | None
 ) -> Batch:
     recordings = problem.model.recordings
     position = _first_rows(problem, values)
-    precision = 1.0 / _errors(recordings.markers, left) ** 2
+    precision = 1.0 / _errors(recordings.markers, model_error) ** 2
     shifted = dict(values)
     for index, name in enumerate(recordings.names):
         valid = recordings.line.valid[index, 0]
@@ -160,34 +162,34 @@ def _with_deviations(
     values: Batch,
     recording: str,
     own: Sequence[InferredParameter],
-    left: ModelError | None,
+    model_error: ModelError | None,
     key: PRNGKeyArray,
     *,
     shifted: bool,
 ) -> tuple[Batch, int]:
-    """Each draw of the deviations, in units of their spread, at the optimum for a perturbed first row, and the number
+    """Each draw of the deviations, in units of their scale, at the optimum for a perturbed first row, and the number
     of unconverged draws. With ``shifted`` the frame may shift, and only the row's shape counts.
     """
     recordings = problem.model.recordings
     index = recordings.names.index(recording)
     valid = recordings.line.valid[index, 0]
-    spread = np.stack([p.info.spread_of(values, len(values[p.name])) for p in own], axis=1)
-    drawn = np.stack([values[p.name] for p in own], axis=1) / spread
-    sd = _errors(recordings.markers, left)[valid, None] / np.sqrt(3.0)
+    deviation_scale = np.stack([p.info.spread_of(values, len(values[p.name])) for p in own], axis=1)
+    drawn = np.stack([values[p.name] for p in own], axis=1) / deviation_scale
+    sd = _errors(recordings.markers, model_error)[valid, None] / np.sqrt(3.0)
     noise = np.asarray(jax.random.normal(key, (len(drawn), int(valid.sum()), 3)))
     measured = recordings.position[index, 0, valid] + sd * noise
 
     def residuals(deviation: np.ndarray, draw: np.ndarray) -> np.ndarray:
         given = {name: column[draw] for name, column in values.items()}
-        given |= {p.name: column for p, column in zip(own, (deviation * spread[draw]).T, strict=True)}
+        given |= {p.name: column for p, column in zip(own, (deviation * deviation_scale[draw]).T, strict=True)}
         error = _first_rows(problem, given)[:, index, valid] - measured[draw]
         if shifted:
             error = error - np.average(error, axis=1, weights=1.0 / sd[:, 0] ** 2, keepdims=True)
         return (error / sd).reshape(len(draw), -1)
 
-    found = fit_own(residuals, drawn)
-    matched = zip([p.name for p in own], (found.point * spread).T, strict=True)
-    return {**values, **dict(matched)}, int((~found.converged).sum())
+    optimum = fit_own(residuals, drawn)
+    matched = zip([p.name for p in own], (optimum.point * deviation_scale).T, strict=True)
+    return {**values, **dict(matched)}, int((~optimum.converged).sum())
 
 
 def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray, "n recording marker 3"]:
@@ -197,7 +199,9 @@ def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray,
     return rows.reshape(len(rows), problem.n_recordings, -1, 3)
 
 
-def _errors(markers: Sequence[str], left: ModelError | None) -> Float[np.ndarray, " marker"]:
+def _errors(markers: Sequence[str], model_error: ModelError | None) -> Float[np.ndarray, " marker"]:
     """Error [m] of the model for each marker; a metre for one that was not fitted."""
-    known = () if left is None else left.markers
-    return np.array([max(left.of_marker(name), SMALLEST_ERROR) if left and name in known else 1.0 for name in markers])
+    known = () if model_error is None else model_error.markers
+    return np.array(
+        [max(model_error.of_marker(name), SMALLEST_ERROR) if model_error and name in known else 1.0 for name in markers]
+    )

@@ -72,12 +72,12 @@ class ModelError(NamedTuple):
         rows = min(round(seconds / self.step), len(self.memory)) if self.step else 0
         if rows < FEWEST_ROWS:
             return 0.0
-        memory, found = float(np.exp(-self.step / self.correlation_time)), 0.0
+        memory, constant = float(np.exp(-self.step / self.correlation_time)), 0.0
         seen = _mean_variance(np.array(self.memory[:rows]))
         for _ in range(CONSTANT_ROUNDS):
-            chance = _mean_variance(_fast(memory, found) ** np.arange(rows))
-            found = float(np.clip((seen - chance) / (1.0 - chance), 0.0, min(MOST_CONSTANT, memory)))
-        return found
+            chance = _mean_variance(_fast(memory, constant) ** np.arange(rows))
+            constant = float(np.clip((seen - chance) / (1.0 - chance), 0.0, min(MOST_CONSTANT, memory)))
+        return constant
 
 
 def model_error(
@@ -149,9 +149,9 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     if given is None:
         return model_error(record.recordings)
     lists = {name: tuple(given.get(name, ())) for name in ("markers", "scale", "memory")}
-    found, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
-    if found.memory or not fitted or record.attrs.get(ADAPTED_TO):
-        return found
+    error, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
+    if error.memory or not fitted or record.attrs.get(ADAPTED_TO):
+        return error
     # A record may lack the correlation time. With several rates, one is used rather than an intermediate value.
     step = sample_time(max(fitted, key=lambda p: len(p.time)).time)
-    return found._replace(step=step, memory=error_memory(fitted, step))
+    return error._replace(step=step, memory=error_memory(fitted, step))

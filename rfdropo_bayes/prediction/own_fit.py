@@ -75,7 +75,7 @@ def fit_own(
         going, delivered = todo[promised >= TOLERANCE], np.zeros(count)
         if len(going):
             before, chosen = _cost(value[going], point[going], centre[going]), promised >= TOLERANCE
-            moved, found, damping[going] = _step(
+            moved, moved_value, damping[going] = _step(
                 residuals,
                 point[going],
                 value[going],
@@ -85,9 +85,9 @@ def fit_own(
                 curvature[chosen],
                 going,
             )
-            slope[going] = _corrected(slope[going], moved - point[going], found - value[going])
-            point[going], value[going] = moved, found
-            delivered[going] = before - _cost(found, moved, centre[going])
+            slope[going] = _corrected(slope[going], moved - point[going], moved_value - value[going])
+            point[going], value[going] = moved, moved_value
+            delivered[going] = before - _cost(moved_value, moved, centre[going])
         still = delivered[todo] < TOLERANCE
         # Six decades of damping without gain: the gain predicted by differences is rounding, or the edge of a cliff.
         lost = todo[still & own[todo] & (promised >= CREDIBLE * TOLERANCE) & (damping[todo] >= MOST_DAMPING)]
@@ -95,8 +95,8 @@ def fit_own(
         converged[done] = True
         own[todo[~still]] = False
         kept = delivered[todo] > LEAST_GAIN * np.maximum(promised, TOLERANCE)
-        left = ~np.isin(todo, np.concatenate([done, lost]))
-        todo, kept = todo[left], kept[left]
+        active = ~np.isin(todo, np.concatenate([done, lost]))
+        todo, kept = todo[active], kept[active]
         anew = todo[~kept & ~own[todo]]
         if len(anew):
             slope[anew] = _slopes(residuals, point[anew], anew)
@@ -134,9 +134,9 @@ def _step(
         tried[waiting] = np.maximum(factor * damping[waiting], LEAST_DAMPING)
         damped = curvature[waiting] + tried[waiting, None, None] * diagonal[waiting]
         moved = point[waiting] - _solve(damped, gradient[waiting])
-        found = residuals(moved, draws[waiting])
-        better = _cost(found, moved, centre[waiting]) < before[waiting]
-        point[waiting[better]], value[waiting[better]] = moved[better], found[better]
+        moved_value = residuals(moved, draws[waiting])
+        better = _cost(moved_value, moved, centre[waiting]) < before[waiting]
+        point[waiting[better]], value[waiting[better]] = moved[better], moved_value[better]
         waiting = waiting[~better]
         if not len(waiting):
             break
@@ -147,8 +147,8 @@ def _slopes(residuals: Residuals, point: Float[np.ndarray, "n k"], draws: Int[np
     """Central differences along every coordinate (n, m, k), all draws and directions in one batch."""
     n, k = point.shape
     moved = np.concatenate([point + sign * STEP * row for row in np.eye(k) for sign in (1.0, -1.0)])
-    found = residuals(moved, np.tile(draws, 2 * k)).reshape(k, 2, n, -1)
-    return np.moveaxis((found[:, 0] - found[:, 1]) / (2.0 * STEP), 0, 2)
+    values = residuals(moved, np.tile(draws, 2 * k)).reshape(k, 2, n, -1)
+    return np.moveaxis((values[:, 0] - values[:, 1]) / (2.0 * STEP), 0, 2)
 
 
 def _cost(value: np.ndarray, point: np.ndarray, centre: np.ndarray) -> Float[np.ndarray, " n"]:

@@ -36,7 +36,7 @@ from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.day_error import DayError
 from rfdropo_bayes.prediction.day_spread import draw_deviation
-from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -68,18 +68,18 @@ class NewPredictions(NamedTuple):
     without: list[Caution]
 
 
-def match_cautions(found: NewPredictions) -> list[Caution]:
+def match_cautions(new: NewPredictions) -> list[Caution]:
     """Cautions on draws that did not converge on a first row, on distant first rows, and on groups that lack parameters
     of others.
     """
-    cautions = list(found.without)
-    if found.unmatched:
+    cautions = list(new.without)
+    if new.unmatched:
         sentence = (
-            f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row, and "
-            "count as they are: the prediction may miss its bands; adapt to a recording of that day"
+            f"{new.unmatched} draws of a new group's parameters did not converge in matching its first row, and "
+            "count as they are: the prediction may miss its bands; adapt to a recording of that session"
         )
         cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
-    for name, times in found.far.items():
+    for name, times in new.far.items():
         sentence = (
             f"the first row of {name} is {times:.2g} times as far from the simulated row as the model "
             "error in the fitted recordings: check that frame, units and start match the fitted "
@@ -129,7 +129,7 @@ def predict_new(
     *,
     chunk: int,
     fitted: Sequence[str],
-    left: ModelError | None = None,
+    model_error: ModelError | None = None,
     groups: Patterns | None = None,
     slow: Mapping[str, DayError] | None = None,
 ) -> NewPredictions:
@@ -139,7 +139,7 @@ def predict_new(
     anew for every draw. A parameter of a group takes, for a new group, values from the spread between groups. The
     offset of the measuring frame and the deviations of a new group are then conditioned on the first row
     (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
-    (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
+    (`resampled_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
     A parameter that only some fitted recordings had free, such as a payload, applies to them alone. A parameter that
     only some groups have also applies to their new recordings; an unseen group lacks it. A cube starts at its measured
@@ -147,7 +147,7 @@ def predict_new(
 
     Args:
         fitted: names of the fitted recordings.
-        left: residuals of the model on the fitted recordings, its error in new recordings if its noise is white;
+        model_error: residuals of the model on the fitted recordings, its error in new recordings if its noise is white;
             without it, all markers have equal weight in a first row.
         groups: recordings that belong together, by name or wildcard; by default each is its own group.
         slow: error of the session of each unseen recording, by name.
@@ -158,22 +158,27 @@ def predict_new(
     scopes, extended = extension.scopes, draw_extended(extension, values, names, own_key)
     recordings = gather_recordings(model.simulator, trajectories)
     markers = model.markers.like(recordings)
-    if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
+    if (
+        model_error
+        and markers.known is None
+        and markers.independent
+        and set(recordings.markers) <= set(model_error.markers)
+    ):
         step = sample_time(*(t.time for t in trajectories))
-        noise = noise_of_markers(left.every(step), left.markers, recordings)
+        noise = noise_of_markers(model_error.every(step), model_error.markers, recordings)
         markers = replace(markers, known=noise.at(recordings.steps))
     fresh = replace(model, scopes=scopes, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = model.scopes.recordings_known(fitted)
     drawn = [p for p in scopes.deviating if p.name not in values]
     new = [n for n in names if whole(n) not in own]
-    extended, unmatched = match_first_row(problem, extended, new, drawn, left, row_key)
+    extended, unmatched = match_first_row(problem, extended, new, drawn, model_error, row_key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
     if placed is not fresh:
         problem = CalibrationProblem(placed, chunk=chunk)
     matched = {member for p in drawn for member in p.members}
     unseen = [n for n in new if n not in matched]
-    predictions = _predictions(problem, extended, noise_key, "test", unseen=unseen, left=left)
+    predictions = _predictions(problem, extended, noise_key, "test", unseen=unseen, model_error=model_error)
     keys = jax.random.split(jax.random.fold_in(noise_key, 2), len(predictions))
     predictions = [
         with_day_error(p, slow[p.name], k) if slow and p.name in slow else p
@@ -182,7 +187,7 @@ def predict_new(
     patterns = groups or {}
     known = {*gather_groups(fitted, patterns), *(p.scope.owner for p in model.scopes.parameters if p.scope.group)}
     without = without_cautions(model.scopes, list(gather_groups(names, patterns)), known)
-    return NewPredictions(predictions, unmatched, far_first_rows(predictions, left), without)
+    return NewPredictions(predictions, unmatched, first_row_distances(predictions, model_error), without)
 
 
 def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKeyArray) -> RecordingPrediction:
@@ -222,7 +227,7 @@ def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key
 
     One fitted recording is chosen per draw for all parameters of a new recording: its values belong together.
     """
-    count, found = len(next(iter(values.values()))), {}
+    count, extended = len(next(iter(values.values()))), {}
     chosen = {
         name: np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
         for index, name in enumerate(names)
@@ -231,13 +236,13 @@ def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key
         like = extension.like[parameter.name]
         if not like:
             own_key = jax.random.fold_in(key, len(names) + number)
-            found[parameter.name] = draw_deviation(parameter.info, values, own_key, count)
+            extended[parameter.name] = draw_deviation(parameter.info, values, own_key, count)
         elif len(like) == 1:
-            found[parameter.name] = values[like[0]]
+            extended[parameter.name] = values[like[0]]
         else:
             pool = np.stack([values[name] for name in like])
-            found[parameter.name] = pool[chosen[parameter.scope.owner] % len(like), np.arange(count)]
-    return found
+            extended[parameter.name] = pool[chosen[parameter.scope.owner] % len(like), np.arange(count)]
+    return extended
 
 
 def _predictions(
@@ -248,7 +253,7 @@ def _predictions(
     prior: Batch | None = None,
     *,
     unseen: Sequence[str] = (),
-    left: ModelError | None = None,
+    model_error: ModelError | None = None,
 ) -> list[RecordingPrediction]:
     """Predictions of the recordings of a problem; draws of ``unseen`` recordings are weighted by the first row."""
     recordings = problem.model.recordings
@@ -256,7 +261,7 @@ def _predictions(
     key, choice, again_key = jax.random.split(key, 3)
     if pose is not None:
         pose = measured_objects(problem, pose, fine, jax.random.fold_in(key, 1))
-    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, left, choice)
+    chosen = resampled_by_first_row(recordings, position[:, :, 0], unseen, model_error, choice)
     noisy = position + problem.draw_noise(key, fine)
     before = None
     if prior is not None:

@@ -47,7 +47,7 @@ def render_audit(
         title=title,
         sections=SECTIONS,
         pictures=_pictures(seen, outline),
-        classes=[(c, embed(figures.class_figure(seen.residuals, c), _said(c))) for c in seen.classes],
+        classes=[(c, embed(figures.class_figure(seen.residuals, c), _caption(c))) for c in seen.classes],
         replayed=replay(seen.tracks, outline),
         config=config,
     )
@@ -179,7 +179,7 @@ def _signal(answer: Answer) -> figures.Signal | None:
     return figures.Signal(row.port.words, row.port.unit, names, described.found.centre, row.mean, row.sd)
 
 
-def _said(effect: figures.ClassEffect) -> str:
+def _caption(effect: figures.ClassEffect) -> str:
     return f"Misfit with and without {display_name(effect.names[0])}"
 
 

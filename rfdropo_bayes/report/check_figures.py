@@ -1,4 +1,4 @@
-"""Figures of the run: errors beside the baselines, honesty of the bands, the sampler, when the model failed."""
+"""Figures of the run: errors beside the baselines, coverage of the bands, the sampler, when the model failed."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], key: str, noise_floor: 
 
 
 @style.styled
-def honesty_figure(curves: Mapping[str, TransformCurve], shares: Mapping[str, Mapping[float, float | None]]) -> Figure:
+def coverage_figure(curves: Mapping[str, TransformCurve], shares: Mapping[str, Mapping[float, float | None]]) -> Figure:
     """PIT-ECDF minus the diagonal for each role, and observed against nominal coverage.
 
     Args:

@@ -255,7 +255,7 @@ def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[st
         "forest": embed(posterior_figures.forest_figure(record, own), "Intervals of the parameters of each recording")
         if own
         else None,
-        "honesty": _honesty(record),
+        "coverage": _band_coverage(record),
         "trace": embed(check_figures.trace_figure(record.trace), "Numbers of the sampler over its stages")
         if any(key in row for row in record.trace for key in check_figures.TRACES)
         else None,
@@ -265,7 +265,7 @@ def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[st
     }
 
 
-def _honesty(record: PosteriorRecord) -> Picture | None:
+def _band_coverage(record: PosteriorRecord) -> Picture | None:
     curves, shares = {}, {}
     for role in ("fit", "test"):
         chosen = [r for r in record.recordings if r.split == role]
@@ -273,7 +273,7 @@ def _honesty(record: PosteriorRecord) -> Picture | None:
         if curve is not None:
             curves[role] = curve
             shares[role] = coverage(chosen, nominal=COVERAGE_CURVE).over_all
-    figure = check_figures.honesty_figure(curves, shares) if curves else None
+    figure = check_figures.coverage_figure(curves, shares) if curves else None
     return embed(figure, "PIT-ECDF and coverage of the predictive bands") if figure else None
 
 

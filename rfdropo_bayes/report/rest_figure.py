@@ -27,8 +27,8 @@ class ShownRows(Protocol):
         """In each recording [s]."""
 
 
-class Leftovers(Protocol):
-    """What is left of the markers' motion; see `verbs.rest_fit.RestFit`."""
+class RestResiduals(Protocol):
+    """Residuals of a fit at rest; see `verbs.rest_fit.RestFit`."""
 
     @property
     def rows(self) -> ShownRows: ...
@@ -47,7 +47,7 @@ class Leftovers(Protocol):
 
 
 @style.styled
-def rest_figure(fit: Leftovers) -> Figure:
+def rest_figure(fit: RestResiduals) -> Figure:
     """One cell over time, one for the markers, and one for each command."""
     channels = fit.rows.command.shape[1]
     lines = -(-(2 + channels) // COLUMNS)
@@ -64,7 +64,7 @@ def rest_figure(fit: Leftovers) -> Figure:
     return figure
 
 
-def _over_time(axes: Axes, fit: Leftovers, residual: Float[np.ndarray, "row 3"]) -> None:
+def _over_time(axes: Axes, fit: RestResiduals, residual: Float[np.ndarray, "row 3"]) -> None:
     for axis, colour in enumerate(style.AXIS_COLOURS):
         for number in np.unique(fit.recording):
             own = fit.recording == number
@@ -81,7 +81,7 @@ def _by_marker(axes: Axes, markers: tuple[str, ...], residual: Float[np.ndarray,
     axes.set(xlabel="residual, root mean square [mm]")
 
 
-def _against_command(axes: Axes, fit: Leftovers, residual: Float[np.ndarray, "row 3"], channel: int) -> None:
+def _against_command(axes: Axes, fit: RestResiduals, residual: Float[np.ndarray, "row 3"], channel: int) -> None:
     distance = np.linalg.norm(residual, axis=1)
     for way, colour, word in ((1.0, style.TEST, "rose"), (-1.0, style.POSTERIOR, "fell")):
         own = fit.ways[:, channel] == way

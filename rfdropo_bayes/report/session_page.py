@@ -146,7 +146,7 @@ def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float |
     return 1e3 * float(distance[time <= last][-1]) if (time <= last).any() else None
 
 
-def _held_back(recording: Trajectory) -> float:
+def _clipped_share(recording: Trajectory) -> float:
     """Share of the actions whose executed command differs from the requested command. Commands during stopping and
     homing are not counted.
     """
@@ -170,7 +170,7 @@ def session_steps(session: MotorSession) -> list[str]:
         steps.append(f"{', '.join(lacking)} lack guards: --mode check lists them with their consequences.")
     if recording is None:
         return steps or ["Nothing was recorded: go on with --mode home, shadow or run."]
-    clipped = _held_back(recording)
+    clipped = _clipped_share(recording)
     if clipped:
         words = f"A limit on length or rate held back {100 * clipped:.0f} % of the actions"
         steps.append(f"{words}: see the commands below.")

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, central_interval, piled_at, summarise
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, central_interval, cut_off_at, summarise
 from rfdropo_bayes.report.coverage import Coverage, coverage
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.headline import headline
@@ -112,9 +112,9 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
     """The end of its prior, "low" or "high", that a posterior is piled up at; None if it is not.
 
-    If the prior is logarithmic, the comparison is in logarithms; see `piled_at`.
+    If the prior is logarithmic, the comparison is in logarithms; see `cut_off_at`.
     """
-    return piled_at(draws, *info.ends, logarithmic=info.logarithmic)
+    return cut_off_at(draws, *info.ends, logarithmic=info.logarithmic)
 
 
 def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"], *, log: bool) -> float | None:

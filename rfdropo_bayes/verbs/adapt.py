@@ -290,7 +290,7 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
         key,
         chunk=model.simulator.lanes,
         fitted=record.attrs[FITTED],
-        left=asked.left,
+        model_error=asked.left,
         groups={asked.name: names},
         slow=None if slow is None else dict.fromkeys(names, slow._replace(shown=())),
     ).recordings

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from rfdropo_bayes.data import named_columns
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS, METRES
-from rfdropo_bayes.data.sample_times import PER_SECOND, pace
+from rfdropo_bayes.data.sample_times import PER_SECOND, row_interval
 from rfdropo_bayes.errors import InputError
 
 WORD = re.compile(r"[a-z0-9]+")
@@ -203,7 +203,7 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
     told = told_time_units(table, time)
     if stamps.dated or len(told) == 1:
         return Unit("s" if stamps.dated else told.pop())
-    interval, first = pace(stamps.since(stamps, str(table.path))), float(stamps.ticks[0])
+    interval, first = row_interval(stamps.since(stamps, str(table.path))), float(stamps.ticks[0])
     count = float(stamps.ticks[-1] - stamps.ticks[0])
     since = [
         unit

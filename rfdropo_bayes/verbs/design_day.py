@@ -270,7 +270,7 @@ def _as_recording(
             command_unit=like.command_unit,
             cable_names=like.cable_names,
             initial_command=like.initial_command,
-        ).believed(),
+        ).trusted(),
         Measured(
             time=observed, position=np.tile(like.position[:1], (len(observed), 1, 1)), marker_names=like.marker_names
         ),

@@ -1,4 +1,4 @@
-"""``rfdropo export``: the distribution to randomise over as tables, or a posterior small enough to keep."""
+"""``rfdropo export``: the distribution to randomise over as tables, or a calibrated model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from rfdropo_bayes.simulators.black_box import BlackBox
 
 TABLE, TABLE_JSON, DRAWS = "phi.csv", "phi.json", "phi_draws.csv"
 MOST_DRAWS = 2000
-KEPT_DRAWS = 500
 SCHEMA_VERSION = 1
 LENGTH_POWER = {"m": 1, "N": 1, "Pa": -1, "J": 2, "W": 2}
 
@@ -79,29 +78,6 @@ def export_phi(folder: Path, out: Path | None = None, *, overwrite: bool = False
     with whole(paths[2]) as partial:
         pd.DataFrame(drawn.T, columns=names).to_csv(partial, index=False)
     return paths
-
-
-def export_posterior(folder: Path, out: Path | None, *, overwrite: bool = False) -> Path:
-    """Write posterior.nc with `KEPT_DRAWS` draws and no predictions: enough to predict with, or to start optimisations.
-
-    Returns:
-        the file written.
-
-    Raises:
-        InputError: no posterior in ``folder``, or ``out`` is that folder, or cannot be written.
-    """
-    record = PosteriorRecord.load(folder / POSTERIOR)
-    if out is None or out.resolve() == folder.resolve():
-        raise InputError(
-            "would replace the whole posterior", where=str(folder), remedy="name another folder with --out"
-        )
-    size = next(iter(record.posterior.values())).shape[1]
-    kept = np.linspace(0, size - 1, min(KEPT_DRAWS, size)).round().astype(int)
-    draws = {name: values[:, kept] for name, values in record.posterior.items()}
-    path = output_folder(out) / POSTERIOR
-    _check_absent([path], overwrite)
-    PosteriorRecord(record.parameters, draws, derived=record.derived, attrs=record.attrs).save(path)
-    return path
 
 
 def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:

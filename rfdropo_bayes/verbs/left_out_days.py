@@ -88,7 +88,7 @@ def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[Recordi
         new_key,
         chunk=held.chunk,
         fitted=list(held.model.recordings.names),
-        left=days.left,
+        model_error=days.left,
         groups=model.spec.groups,
     ).recordings
 

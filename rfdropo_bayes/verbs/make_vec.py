@@ -31,7 +31,7 @@ from rfdropo_bayes.policies.randomisation import (
     drawn_rows,
     read_phi,
     read_posterior,
-    spread_out,
+    with_width,
 )
 from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
@@ -187,7 +187,7 @@ def randomisation_of(
             remedy="leave one of them out",
         )
     if table.width != 1.0:
-        parts[-1] = spread_out(parts[-1], table.width, simulator.parameters)
+        parts[-1] = with_width(parts[-1], table.width, simulator.parameters)
     kind = parts[-1].kind
     start = {name: ends for name, ends in table.start.items() if name not in absent}
     return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]

@@ -117,7 +117,7 @@ def predict(
         jax.random.key(model.settings.seed if seed is None else seed),
         chunk=simulator.lanes,
         fitted=fitted,
-        left=recorded_model_error(record),
+        model_error=recorded_model_error(record),
         groups=groups,
         slow=slow,
     )
@@ -214,7 +214,7 @@ def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
     times, values = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
     return commands_alone(
         Origin("commands", model.name, "memory"),
-        SentCommands(times, values, simulator.command_unit, simulator.channel_names).believed(),
+        SentCommands(times, values, simulator.command_unit, simulator.channel_names).trusted(),
         simulator.marker_names,
         start=None if start is None else np.asarray(start, dtype=float)[None],
     )

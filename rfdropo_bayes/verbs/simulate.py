@@ -27,7 +27,6 @@ from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.arguments import given_model
-from rfdropo_bayes.verbs.random_commands import random_walk
 
 # Number that the first marker's column carries in each source.
 FIRST_COLUMN = {"sofa-csv": 0, "optitrack-csv": 1, "asl-csv": 1}
@@ -176,7 +175,7 @@ def _generated(table: CommandsTable, name: str, simulator: AnySimulator, rng: np
             command=command,
             command_unit=simulator.command_unit,
             cable_names=simulator.channel_names,
-        ).believed(),
+        ).trusted(),
         Measured(time=time, position=np.tile(places, (len(time), 1, 1)), marker_names=markers),
     )
 
@@ -219,7 +218,7 @@ def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], 
             command_unit=source.command_unit,
             cable_names=source.cable_names,
             initial_command=source.initial_command,
-        ).believed(),
+        ).trusted(),
         Measured(time=source.time, position=position, marker_names=found.markers, object_pose=found.pose),
     )
 
@@ -271,3 +270,35 @@ def _object_errors(
         name: {"mean": float(np.nanmean(error)), "max": float(np.nanmax(error)), "last": float(error[-1])}
         for name, error in (("position_mm", distance), ("orientation_deg", angle))
     }
+
+
+def random_walk(
+    table: CommandsTable, channels: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, " command"], Float[np.ndarray, "command channel"]]:
+    """Every ``interval`` one channel, chosen at random, moves by ``step`` up or down, reflected at the limits.
+
+    This is how the paper's data were collected: each action pulls or releases one cable.
+
+    Returns:
+        times [s] and cumulative commands [the robot's command unit].
+
+    Raises:
+        InputError: a step larger than the range.
+    """
+    if table.high - table.low < table.step:
+        raise InputError(
+            f"a step of {table.step:g} does not fit between {table.low:g} and {table.high:g}",
+            where="[commands]",
+            remedy="widen the limits or shorten the step",
+        )
+    count = int(np.floor(table.duration / table.interval + 1e-9))
+    level = np.clip(np.zeros(channels), table.low, table.high)
+    value = np.empty((count, channels))
+    for row in range(count):
+        channel = rng.integers(channels)
+        move = table.step * rng.choice([-1.0, 1.0])
+        if not table.low <= level[channel] + move <= table.high:
+            move = -move
+        level[channel] += move
+        value[row] = level
+    return table.interval * np.arange(count), value

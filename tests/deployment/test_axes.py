@@ -15,7 +15,8 @@ from rfdropo_bayes.deployment.cia402 import DriveState, controlword_towards
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, Reading, drives_of
 from rfdropo_bayes.deployment.objects import Object, first_axis, identifiers, of_axis
-from rfdropo_bayes.deployment.watch import Patience, Watch
+from rfdropo_bayes.deployment.settings import SafetyTable
+from rfdropo_bayes.deployment.watch import Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
@@ -128,7 +129,7 @@ def test_every_axis_gets_its_own_limits_and_mapping(rigs) -> None:
 def test_an_emergency_names_the_drives_of_its_node(rigs) -> None:
     """It does not say which axis it means."""
     drives = rigs(TWO_BY_TWO).drives(GUARDS)
-    watch = Watch(drives, Patience())
+    watch = Watch(drives, SafetyTable())
     for drive in drives.all:
         drive.reading = Reading(0x40, 0, 0, 0.0)
     heard = drives.network.subscribers[objects.EMCY + 2][-1]

@@ -15,7 +15,8 @@ from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, controlword
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, Reading
 from rfdropo_bayes.deployment.objects import Object
-from rfdropo_bayes.deployment.watch import Patience, Watch
+from rfdropo_bayes.deployment.settings import SafetyTable
+from rfdropo_bayes.deployment.watch import Watch
 from rfdropo_bayes.errors import InputError
 
 LONG = 0.5  # [s]: a loaded machine answers in time, too
@@ -209,7 +210,7 @@ def test_emergencies_and_heartbeats_are_taken_in(rig) -> None:
 def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig) -> None:
     """Drives that report an error as gone, again and again, fill what is kept of them."""
     drives = rig.drives()
-    watch = Watch(drives, Patience())
+    watch = Watch(drives, SafetyTable())
     left = objects.EMCY + drives.all[1].motor.node
     heard = drives.network.subscribers[left][-1]
     for _ in range(3 * (drives.emergencies.maxlen or 0)):
@@ -226,4 +227,4 @@ def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig
 def test_a_drive_whose_first_status_is_late_is_waited_for(rig) -> None:
     """A loaded machine has no answer yet in the first cycle; nobody may read a tension of it."""
     drives = rig.drives()
-    Watch(drives, Patience()).check(Tick(1, 0.0, 0.0, 0), None)
+    Watch(drives, SafetyTable()).check(Tick(1, 0.0, 0.0, 0), None)

@@ -19,7 +19,7 @@ from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, HomingTable, SafetyTable, load_deployment
-from rfdropo_bayes.deployment.vendors import STANDARD, WITHOUT, Units, told_counts
+from rfdropo_bayes.deployment.vendors import STANDARD, WITHOUT, Units, reported_counts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, Robot
 
@@ -191,10 +191,10 @@ def test_units_that_are_not_certain_are_refused(rigs, sheet: Write, told: dict, 
 
 
 def test_told_units() -> None:
-    assert told_counts(RPM_PER_S, 3200.0) == pytest.approx(3200 / 60)
-    assert told_counts(MRPM, 3200.0) == pytest.approx(3.2 / 60)
-    assert told_counts(0x00B50300, 3200.0) == 1.0
-    assert told_counts(0x00010300, 3200.0) is None  # metres per second
+    assert reported_counts(RPM_PER_S, 3200.0) == pytest.approx(3200 / 60)
+    assert reported_counts(MRPM, 3200.0) == pytest.approx(3.2 / 60)
+    assert reported_counts(0x00B50300, 3200.0) == 1.0
+    assert reported_counts(0x00010300, 3200.0) is None  # metres per second
 
 
 def test_a_value_that_a_drive_cannot_hold_is_refused(rigs) -> None:

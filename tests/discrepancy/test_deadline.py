@@ -10,8 +10,7 @@ import time
 import pytest
 
 from rfdropo_bayes import interrupts
-from rfdropo_bayes.discrepancy.deadline import Deadline
-from rfdropo_bayes.discrepancy.processor_wait import delay, thread_times
+from rfdropo_bayes.discrepancy.deadline import Deadline, delay, thread_times
 
 needs_counts = pytest.mark.skipif(not thread_times(), reason="this system does not count how long threads wait")
 

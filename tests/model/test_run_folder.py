@@ -328,8 +328,8 @@ def test_an_interrupted_calibration_says_how_to_go_on_and_does(tmp_path):
     changed = subprocess.run([*words, "--resume", "--set", "seed=5"], env=environment, capture_output=True, text=True)
     assert changed.returncode == 2
     assert "seed was 1 and is now 5" in changed.stderr
-    done = subprocess.run([*words, "--resume", "--quiet"], env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "")
+    done = subprocess.run([*words, "--resume"], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0
     assert json.loads((out / "run.json").read_text())["status"] == "done"
     again = subprocess.run(words, env=environment, capture_output=True, text=True)
     assert again.returncode == 2

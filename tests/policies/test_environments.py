@@ -25,7 +25,7 @@ from rfdropo_bayes.policies.randomisation import (
     fitting,
     read_phi,
     read_posterior,
-    spread_out,
+    with_width,
 )
 from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, observed_of, potential, reward
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
@@ -205,21 +205,21 @@ def test_a_wider_posterior_keeps_its_middle_and_its_correlations(width) -> None:
     one = rng.normal(0.0, 0.1, 500)
     rows = np.stack([4e6 * np.exp(one), 0.4 * np.exp(-one)], axis=1)
     draws = Draws(("young_modulus", "trunk_mass"), rows, "x")
-    wide = spread_out(Layers((Point({}), draws), "posterior"), width, SPECS).parts[1]
+    wide = with_width(Layers((Point({}), draws), "posterior"), width, SPECS).parts[1]
     logs, own = np.log(wide.rows), np.log(rows)
     np.testing.assert_allclose(logs.mean(axis=0), own.mean(axis=0))
     np.testing.assert_allclose(logs.std(axis=0), width * own.std(axis=0))
     np.testing.assert_allclose(np.corrcoef(logs.T), np.corrcoef(own.T))
     assert wide.sha256 != draws.sha256
-    phi = spread_out(Phi({"trunk_mass": {"mean": 0.4, "std": 0.1, "low": 0.1, "high": 0.7}}), width, SPECS)
+    phi = with_width(Phi({"trunk_mass": {"mean": 0.4, "std": 0.1, "low": 0.1, "high": 0.7}}), width, SPECS)
     assert phi.normals["trunk_mass"] == {"mean": 0.4, "std": 0.1 * width, "low": 0.1, "high": 0.7}
 
 
 def test_a_wider_posterior_ends_at_hard_bounds_and_a_point_has_no_width() -> None:
     draws = Draws(("trunk_mass",), np.array([[1e-3], [9.0]]), "x")
-    assert np.array_equal(spread_out(draws, 5.0, SPECS).rows, [[1e-4], [10.0]])
+    assert np.array_equal(with_width(draws, 5.0, SPECS).rows, [[1e-4], [10.0]])
     with pytest.raises(InputError, match=r"width = 2 applies only to a posterior"):
-        spread_out(Point({}), 2.0, SPECS)
+        with_width(Point({}), 2.0, SPECS)
 
 
 @pytest.mark.parametrize("robot", ["trunk_sofa", "trunk_physical", "asl_trunk"])

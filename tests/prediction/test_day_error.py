@@ -106,10 +106,13 @@ def test_it_is_read_back_from_plain_values(prior):
 def test_the_sentences(prior):
     error = prior._replace(days={"monday": 0.0071, "tuesday": 0.016}, held=0.88)
     assert day_sentence(error) == (
-        "No recording of this day was seen. On days left out this model was 7.1 to 16 mm off; its 90 % bands held 88 %."
+        "No recording of this session was seen. In sessions left out of its fit this model was 7.1 to "
+        "16 mm off; its 90 % bands held 88 %."
     )
     assert left_out_sentence(prior) == ""
-    assert day_sentence(prior).startswith("No recording of this day was seen. This run left no session out of its fit")
+    assert day_sentence(prior).startswith(
+        "No recording of this session was seen. This run left no session out of its fit"
+    )
 
 
 def test_the_lasting_part_of_an_error_is_told_from_one_that_is_forgotten():

@@ -15,7 +15,7 @@ from rfdropo_bayes.fem import state_at_rest
 from rfdropo_bayes.fem.constraints import NORMAL_SOFTNESS
 from rfdropo_bayes.fem.pushing import find_contacts
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.model.compute_backend import backend
+from rfdropo_bayes.model.assembly import backend
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra

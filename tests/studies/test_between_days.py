@@ -12,7 +12,7 @@ from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Measured, Origin, SentCommands
 from rfdropo_bayes.model.experiment import CommandsTable
-from rfdropo_bayes.verbs.random_commands import random_walk
+from rfdropo_bayes.verbs.simulate import random_walk
 
 SIMULATOR = {"refine": 1, "time_step": 0.01}
 PRIORS = {

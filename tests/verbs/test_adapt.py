@@ -236,14 +236,14 @@ def test_errors_last_as_long_in_rows_of_another_rate(adapted):
 
 
 def test_the_terminal_shows_the_day_first_and_what_comes_next(adapted, capsys):
-    show_calibration(adapted, quiet=False, as_json=False)
+    show_calibration(adapted, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     header = next(k for k, line in enumerate(lines) if line.startswith("parameter"))
     assert lines[header + 1].startswith("zero_deviation@today")
     assert f"next: rfdropo predict {adapted.folder} --commands FILE --out OUT" in lines
     facts = {"start_pose_known": True, "rows": 3, "draws": 2, "posterior": "P", "files": ["f"]}
     facts |= {"group": "today", "group_fitted": True, "cautions": [{"sentence": "1 draws did not converge"}]}
-    show_prediction(facts, quiet=False, as_json=False)
+    show_prediction(facts, as_json=False)
     assert capsys.readouterr().out.splitlines()[1:3] == ["group today, fitted", "caution: 1 draws did not converge"]
 
 
@@ -318,7 +318,7 @@ def test_a_run_without_days_left_out_has_the_prior_of_their_error(known, zeros):
     """Of a new day, and says so; a fitted day has none."""
     new, old = (recorded([name], zeros[1:2], 51)[0] for name in ("b", "day_0_b"))
     found = rb.predict(known, new)
-    assert found.unseen.startswith("No recording of this day was seen. This run left no session out of its fit")
+    assert found.unseen.startswith("No recording of this session was seen. This run left no session out of its fit")
     assert rb.predict(known, old).unseen == ""
 
 
@@ -360,9 +360,7 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
 
 def test_what_was_left_out_is_printed(adapted, capsys):
     recordings = [{**row, "masked": 2} for row in adapted.content["recordings"]]
-    show_calibration(
-        replace(adapted, content={**adapted.content, "recordings": recordings}), quiet=False, as_json=False
-    )
+    show_calibration(replace(adapted, content={**adapted.content, "recordings": recordings}), as_json=False)
     assert "left out: 2 of 26 positions" in capsys.readouterr().out
 
 

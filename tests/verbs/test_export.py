@@ -13,7 +13,7 @@ from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import build_summary, write_summary
-from rfdropo_bayes.verbs.export import KEPT_DRAWS, export_model, export_phi, export_posterior, millimetre_factor
+from rfdropo_bayes.verbs.export import export_model, export_phi, millimetre_factor
 
 
 @pytest.mark.parametrize(
@@ -76,18 +76,6 @@ def test_phi_is_written_as_found(tmp_path):
 def test_a_folder_without_a_run_is_named(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         export_phi(tmp_path)
-
-
-def test_a_small_posterior_keeps_draws_that_belong_together(tmp_path):
-    draws = run_folder(tmp_path)
-    record = PosteriorRecord.load(export_posterior(tmp_path, tmp_path / "small"))
-    kept = {name: record.flat(name) for name in draws}
-    assert len(kept["trunk_mass"]) == KEPT_DRAWS
-    index = np.searchsorted(np.sort(draws["trunk_mass"]), kept["trunk_mass"])
-    rows = np.argsort(draws["trunk_mass"])[index]
-    np.testing.assert_array_equal(draws["young_modulus"][rows], kept["young_modulus"])
-    with pytest.raises(InputError, match="would replace"):
-        export_posterior(tmp_path, tmp_path)
 
 
 ARM = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/><geom size="0.01" mass="0.05"/>

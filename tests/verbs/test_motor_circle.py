@@ -24,7 +24,7 @@ from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.robot import CommandTiming
 from rfdropo_bayes.verbs.audit import audit
 from rfdropo_bayes.verbs.calibrate import calibrate
-from rfdropo_bayes.verbs.random_commands import random_walk
+from rfdropo_bayes.verbs.simulate import random_walk
 from rfdropo_bayes.verbs.simulated_plant import trunk
 
 NOISE = 2e-4  # [m]

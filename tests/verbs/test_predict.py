@@ -28,7 +28,7 @@ from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction, Scope
-from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
 from rfdropo_bayes.prediction.predictive import NOISE, draw_extended
 from rfdropo_bayes.results.calibrated import Calibration
@@ -282,15 +282,17 @@ def test_draws_count_as_they_predict_the_first_row():
     measured = np.full((2, 1, 1, 3), 1.0)
     line = SimpleNamespace(valid=np.ones((2, 1, 1), dtype=bool))
     recordings = SimpleNamespace(names=("seen", "new"), markers=("a",), position=measured, line=line)
-    index = weighed_by_first_row(recordings, simulated, ["new"], ModelError(("a",), (2.0,) * 3, 0.1), jax.random.key(0))
+    index = resampled_by_first_row(
+        recordings, simulated, ["new"], ModelError(("a",), (2.0,) * 3, 0.1), jax.random.key(0)
+    )
     np.testing.assert_array_equal(index[:, 0], np.arange(4000))
     drawn = simulated[index[:, 1], 1, 0]
     # prior N(0, 1), a measurement of 1 with deviation 2: the posterior is N(1/5, 4/5); 5 standard errors of the draws
     np.testing.assert_allclose(drawn.mean(axis=0), 0.2, atol=5.0 * np.sqrt(0.8 / 3000))
     np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(0.8), rtol=0.08)
-    few = weighed_by_first_row(recordings, simulated, ["new"], ModelError(("a",), (1e-3,) * 3, 0.1), jax.random.key(0))[
-        :, 1
-    ]
+    few = resampled_by_first_row(
+        recordings, simulated, ["new"], ModelError(("a",), (1e-3,) * 3, 0.1), jax.random.key(0)
+    )[:, 1]
     share = np.bincount(few, minlength=4000) / 4000
     assert 1.0 / np.sum(share**2) == pytest.approx(400, rel=0.1)
 
@@ -304,7 +306,7 @@ def test_a_first_row_far_from_the_model_s_is_found_by_the_model_s_own_error():
 
     def far(observed, mask=seen, error=left):
         row = RecordingPrediction("run", "test", np.arange(2.0), ("a", "b"), observed, mask, simulated)
-        return far_first_rows([row], error)
+        return first_row_distances([row], error)
 
     assert far(off)["run"] == pytest.approx(np.sqrt((2.0**2 + 3.0**2) / 2))
     assert far(off, np.array([[True, False], [True, True]]))["run"] == pytest.approx(2.0)

@@ -18,7 +18,7 @@ from rfdropo_bayes.deployment.cia402 import (
     obey,
 )
 from rfdropo_bayes.deployment.objects import EmergencyCode, Object, of_axis
-from rfdropo_bayes.deployment.vendors import told_counts
+from rfdropo_bayes.deployment.vendors import reported_counts
 
 _HELD = 0.05  # [s]: time for which a faulty drive holds after a quick stop
 _LAG = 0.004  # [s]: time constant of a tuned position loop of 40 Hz
@@ -173,7 +173,7 @@ class SimulatedDrive:
     """Encoder counts per turn of the motor; the speed limit 0x6080 is in turns."""
 
     def _slow_down(self, duration: float) -> None:
-        unit = told_counts(self.value(Object.ACCELERATION_UNIT), self.counts_per_turn) or 1.0
+        unit = reported_counts(self.value(Object.ACCELERATION_UNIT), self.counts_per_turn) or 1.0
         change = self.value(Object.QUICK_STOP_DECELERATION) * unit * duration
         before = self.velocity
         self.velocity = math.copysign(max(0.0, abs(before) - change), before)

@@ -1,4 +1,4 @@
-"""The command that draws the page of a run again, or lists the results of a run without a page."""
+"""Commands on results: their pages, parts of a posterior for other programs, and pictures."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from rfdropo_bayes.cli.options import see_calibration
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.run_folder import COMMANDS, CONFIG, PAGE, RUN, command_of, run_ended
 
@@ -62,3 +63,49 @@ def _say_results(folder: Path) -> list[str]:
     if command in TO_VIEW:
         lines.append(f"to see it: {shlex.join(['rfdropo', 'view', str(folder / TO_VIEW[command])])}")
     return lines
+
+
+def view(
+    source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="experiment or recording to draw")],
+    out: Annotated[
+        Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
+    ] = Path("runs/view.png"),
+    recording: Annotated[
+        str | None, typer.Option(help="recording of the experiment to draw; the first by default")
+    ] = None,
+    robot: Annotated[Path | None, typer.Option(help="file of the robot, if a NetCDF file has none beside it")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="value of a parameter or of an entry of the experiment, as in simulate"
+        ),
+    ] = None,
+) -> None:
+    """Draw a motion. Simulates an experiment, or reads a NetCDF file of simulate or predict."""
+    from rfdropo_bayes.verbs.view import run_view
+
+    written = run_view(source, out, overrides or [], recording, robot)
+    typer.echo(f"{written[0]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a calibration")],
+    phi: Annotated[bool, typer.Option("--phi", help="the distribution to randomise over")] = False,
+    model: Annotated[
+        bool, typer.Option("--model", help="the model of another simulator (MJCF), with posterior means in it")
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace files of an earlier export")] = False,
+) -> None:
+    """Write parts of a calibration for other programs. The distribution to randomise over as tables with units, or
+    a calibrated model."""
+    if not phi and not model:
+        raise InputError("nothing to export was named", where="export", remedy="add --phi or --model")
+    see_calibration(folder, "DIR")
+    from rfdropo_bayes.verbs.export import export_model, export_phi
+
+    paths = export_phi(folder, out, overwrite=overwrite) if phi else []
+    if model:
+        paths.append(export_model(folder, out, overwrite=overwrite))
+    for path in paths:
+        typer.echo(str(path))
