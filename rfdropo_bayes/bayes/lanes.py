@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -71,11 +72,6 @@ class Lanes:
         if backend is not None and backend.name == "numba":
             self.difference = STEP if backend.precision == "float64" else COARSE
         self.physical = tuple(spec.name for spec in simulator.parameters) if physical is None else tuple(physical)
-
-    def serve(self, simulator: Simulator, marker_index: np.ndarray, physical: Sequence[str]) -> bool:
-        """Whether these are the rollouts of a simulator, given some of its parameters."""
-        own = self.simulator is simulator and self.physical == tuple(physical)
-        return own and np.array_equal(self.marker_index, marker_index)
 
     def _observe(
         self, theta: jax.Array, start: jax.Array, commands: Commands, steps: jax.Array
@@ -175,6 +171,19 @@ class Lanes:
         """Derivatives along tangents of the parts of an observation that are data."""
         lanes = (theta, tangent, start, commands)
         return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
+
+
+def lanes_of(simulator: Simulator, marker_index: np.ndarray, physical: tuple[str, ...]) -> Lanes:
+    """Lanes of a simulator, given some of its parameters: all models that use them at a time share one program."""
+    key = (id(simulator), marker_index.tobytes(), physical)
+    found = _IN_USE.get(key)
+    if found is None:
+        found = _IN_USE[key] = Lanes(simulator, marker_index, physical=physical)
+    return found
+
+
+_IN_USE: WeakValueDictionary[tuple[int, bytes, tuple[str, ...]], Lanes] = WeakValueDictionary()
+"""Lanes by the identity of their simulator, which lives as long as they do."""
 
 
 class RoutedLanes(Lanes):

@@ -68,8 +68,8 @@ def command_openings(trajectory: Trajectory) -> dict[str, str]:
 
 
 def same_opening(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
-    """Whether two recordings have the same commands at the same speed, as far as both can be compared
-    (`command_openings`); keys without a speed are compared without it.
+    """Whether two recordings have the same commands at the same speed, over their shared rows; see
+    `command_openings`. If one speed is unknown, only commands are compared.
     """
     shared = set(one) & set(other)
     if not shared:

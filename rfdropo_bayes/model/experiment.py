@@ -284,7 +284,7 @@ class AuditTable(ExperimentTable):
     minutes: float = Field(
         default=30.0,
         gt=0.0,
-        description="bound of the whole run: when they are up, it finishes with its present results",
+        description="bound of the whole run in minutes, after which it finishes with its present results",
     )
 
 
@@ -294,7 +294,7 @@ class DesignTable(ExperimentTable):
     minutes: float = Field(
         default=10.0,
         gt=0.0,
-        description="bound of the whole run: when they are up, it proposes the best candidate so far",
+        description="bound of the whole run in minutes, after which it proposes the best candidate so far",
     )
 
 

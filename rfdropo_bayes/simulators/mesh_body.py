@@ -71,7 +71,8 @@ class TetrahedraTable(BaseModel):
     )
     marker_cables: tuple[str, ...] = Field(
         default=(),
-        description="a marker at the height of guides of these cables is their mean; empty: a point of the body",
+        description="cables at whose guides markers lie: such a marker is the mean of the guides at its height; if "
+        "empty, every marker is a point of the body",
     )
 
 

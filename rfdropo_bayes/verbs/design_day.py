@@ -212,7 +212,9 @@ def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -
     found = gather_groups([run.name for run in runs], groups)
     day = group_of(runs[-1].name, groups) if group is None else group
     if day not in found:
-        raise InputError(f"no recording at hand is of the group {day!r}", where="--group", remedy=nearest(day, found))
+        raise InputError(
+            f"no given recording belongs to the group {day!r}", where="--group", remedy=nearest(day, found)
+        )
     return day, [run for run in runs if run.name in found[day]]
 
 

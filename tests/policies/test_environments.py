@@ -254,7 +254,7 @@ def test_an_action_moves_the_same_cable_whether_commands_are_lengths_or_angles(k
 @pytest.mark.parametrize("action", [-1, 16, 3.0])
 def test_a_discrete_action_that_is_none_is_refused(action) -> None:
     layout = layout_of(TASKS[REACH], Robot.load("trunk_sofa"), "discrete", "paper")
-    with pytest.raises(InputError, match="no action"):
+    with pytest.raises(InputError, match="not an action"):
         layout.change(np.array([0, action]))
 
 

@@ -398,7 +398,7 @@ def test_proposals_are_as_long_as_asked_for(known, zeros):
     tried = day_design._followed_proposals(known.model, begun, runs[0], runs, np.random.default_rng(0))
     assert max(time[-1] for _, time, _ in tried) > 4.5
     assert rb.design_day(known, runs, seconds=1.0).content["group"] == "day_1"
-    with pytest.raises(rb.InputError, match="no recording at hand is of the group 'day_2'"):
+    with pytest.raises(rb.InputError, match="no given recording belongs to the group 'day_2'"):
         rb.design_day(known, runs, group="day_2")
 
 

@@ -86,7 +86,7 @@ class MotorAngle(WhiteSeries):
     def deviation(
         self, measured: Float[Any, "recording time channel"], about: Float[Any, "recording time channel"]
     ) -> Float[Any, "recording time channel"]:
-        """See `Series.deviation`: a difference [rad]."""
+        """Difference of measured and simulated angles [rad]; see `Series.deviation`."""
         return measured - about
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
