@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
-from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -174,16 +174,18 @@ class Lanes:
 
 
 def lanes_of(simulator: Simulator, marker_index: np.ndarray, physical: tuple[str, ...]) -> Lanes:
-    """Lanes of a simulator, given some of its parameters: all models that use them at a time share one program."""
-    key = (id(simulator), marker_index.tobytes(), physical)
-    found = _IN_USE.get(key)
-    if found is None:
-        found = _IN_USE[key] = Lanes(simulator, marker_index, physical=physical)
-    return found
+    """Lanes of a simulator, given some of its parameters: one program for all models of it, such as copies under other
+    priors or of other recordings.
+    """
+    for lanes in _RECENT:
+        own = lanes.simulator is simulator and lanes.physical == physical
+        if own and np.array_equal(lanes.marker_index, marker_index):
+            return lanes
+    _RECENT.append(Lanes(simulator, marker_index, physical=physical))
+    return _RECENT[-1]
 
 
-_IN_USE: WeakValueDictionary[tuple[int, bytes, tuple[str, ...]], Lanes] = WeakValueDictionary()
-"""Lanes by the identity of their simulator, which lives as long as they do."""
+_RECENT: deque[Lanes] = deque(maxlen=8)
 
 
 class RoutedLanes(Lanes):

@@ -252,15 +252,18 @@ def record_posterior(
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
-        known: dict[str, Any] = {
-            "fitted": fitted,
-            "model_error": left,
-            "groups": model.spec.groups,
-            "chunk": problem.chunk,
-        }
-        slowly = {} if slow is None else dict.fromkeys(unseen, slow)
         try:
-            new = predict_new(problem.model, tested, values, test_key, **known, slow=slowly)
+            new = predict_new(
+                problem.model,
+                tested,
+                values,
+                test_key,
+                chunk=problem.chunk,
+                fitted=fitted,
+                model_error=left,
+                groups=model.spec.groups,
+                slow={} if slow is None else dict.fromkeys(unseen, slow),
+            )
         except NoRolloutError as error:  # the fit is worth its page
             cautions = [Caution(Code.NOT_PREDICTED, f"test recordings are not predicted: {error}", grave=True)]
         else:
