@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
@@ -71,11 +72,6 @@ class Lanes:
         if backend is not None and backend.name == "numba":
             self.difference = STEP if backend.precision == "float64" else COARSE
         self.physical = tuple(spec.name for spec in simulator.parameters) if physical is None else tuple(physical)
-
-    def serve(self, simulator: Simulator, marker_index: np.ndarray, physical: Sequence[str]) -> bool:
-        """Whether these are the rollouts of a simulator, given some of its parameters."""
-        own = self.simulator is simulator and self.physical == tuple(physical)
-        return own and np.array_equal(self.marker_index, marker_index)
 
     def _observe(
         self, theta: jax.Array, start: jax.Array, commands: Commands, steps: jax.Array
@@ -175,6 +171,21 @@ class Lanes:
         """Derivatives along tangents of the parts of an observation that are data."""
         lanes = (theta, tangent, start, commands)
         return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
+
+
+def lanes_of(simulator: Simulator, marker_index: np.ndarray, physical: tuple[str, ...]) -> Lanes:
+    """Lanes of a simulator, given some of its parameters: one program for all models of it, such as copies under other
+    priors or of other recordings.
+    """
+    for lanes in _RECENT:
+        own = lanes.simulator is simulator and lanes.physical == physical
+        if own and np.array_equal(lanes.marker_index, marker_index):
+            return lanes
+    _RECENT.append(Lanes(simulator, marker_index, physical=physical))
+    return _RECENT[-1]
+
+
+_RECENT: deque[Lanes] = deque(maxlen=8)
 
 
 class RoutedLanes(Lanes):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Markers, ObjectPose, Seen
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.channels.object_pose import Placing, offset_of
-from rfdropo_bayes.bayes.lanes import Lanes
+from rfdropo_bayes.bayes.lanes import Lanes, lanes_of
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.scopes import Scopes
@@ -39,23 +39,12 @@ class TrajectoryModel:
         scopes: inferred and fixed parameters, including the channels'.
         recordings: commands and times of observation.
         channels: measurement channels, `Markers` first.
-        lanes: the simulator's compiled rollouts, as a function of the parameters that this model gives it. Made here;
-            a copy under other priors, or of other recordings, keeps them.
     """
 
     simulator: Simulator
     scopes: Scopes
     recordings: RecordingSet
     channels: tuple[Channel, ...]
-    lanes: Lanes = field(default=cast(Lanes, None), repr=False)
-
-    def __post_init__(self) -> None:
-        zeros, first = dict.fromkeys(self.scopes.names, jnp.zeros(())), self.recordings.names[0]
-        given = jax.eval_shape(lambda: self.rollout_values(zeros, first))
-        physical = [spec.name for spec in self.simulator.parameters if spec.name in given]
-        if self.lanes is None or not self.lanes.serve(self.simulator, self.recordings.marker_index, physical):
-            own = Lanes(self.simulator, self.recordings.marker_index, physical=physical)
-            object.__setattr__(self, "lanes", own)
 
     @classmethod
     def of_positions(
@@ -116,6 +105,14 @@ class TrajectoryModel:
     def compared(self) -> tuple[FeatureChannel, ...]:
         """Channels that have features."""
         return tuple(channel for channel in self.channels if isinstance(channel, FeatureChannel))
+
+    @cached_property
+    def lanes(self) -> Lanes:
+        """The simulator's compiled rollouts, as a function of the parameters that this model gives it."""
+        zeros, first = dict.fromkeys(self.scopes.names, jnp.zeros(())), self.recordings.names[0]
+        given = jax.eval_shape(lambda: self.rollout_values(zeros, first))
+        physical = tuple(spec.name for spec in self.simulator.parameters if spec.name in given)
+        return lanes_of(self.simulator, self.recordings.marker_index, physical)
 
     @cached_property
     def programs(self) -> Programs:

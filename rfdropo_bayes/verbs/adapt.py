@@ -252,10 +252,17 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
     slow = _error_beyond(fit.record, predictions[0])
     if asked.tested:
         names = [run.name for run in asked.tested]
-        known: dict[str, Any] = {"fitted": [head.name], "left": left}
-        known |= {"groups": {day: [head.name, *names]}, "chunk": simulator.lanes}
-        known |= {"slow": None if slow is None else dict.fromkeys(names, slow)}
-        new = predict_new(problem.model, asked.tested, found.values, rest_key, **known)
+        new = predict_new(
+            problem.model,
+            asked.tested,
+            found.values,
+            rest_key,
+            chunk=simulator.lanes,
+            fitted=[head.name],
+            model_error=left,
+            groups={day: [head.name, *names]},
+            slow=None if slow is None else dict.fromkeys(names, slow),
+        )
         predictions, cautions = predictions + new.recordings, cautions + match_cautions(new)
     return Adapted(found, body, problem, predictions, cautions, float(np.sum(evaluations)), slow)
 

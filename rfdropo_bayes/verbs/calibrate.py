@@ -250,9 +250,16 @@ def record_posterior(
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
-        known: dict[str, Any] = {"fitted": fitted, "left": left, "groups": model.spec.groups, "chunk": problem.chunk}
         found = predict_new(
-            problem.model, tested, values, test_key, **known, slow={} if slow is None else dict.fromkeys(unseen, slow)
+            problem.model,
+            tested,
+            values,
+            test_key,
+            chunk=problem.chunk,
+            fitted=fitted,
+            model_error=left,
+            groups=model.spec.groups,
+            slow={} if slow is None else dict.fromkeys(unseen, slow),
         )
         predictions += found.recordings
         cautions = match_cautions(found)
