@@ -8,8 +8,10 @@ shortest step. Usual damping is the robot's nominal one, small damping a stiffne
 that of one rollout on one thread; between two steps, and beyond the shortest, it follows the line through the last two
 points of error against time, in logarithms.
 
-With `--elements` the rod is refined instead, every element cut into 1, 2 and 4, with SDIRK2 at 10 ms: distances from
-the motion of 8 times the elements, in mm and in percent of the tip's root mean square way from its mean place.
+With `--elements` the rod is refined instead, every element cut into 1, 2, 4 and 8, with SDIRK2 at 10 ms and at rest
+under every command. The limit is Richardson's extrapolation from the two finest rods. Distances from it are in mm and
+in percent of the tip's root mean square way from its mean place. The observed order is log2 of the ratio of differences
+between successive rods: of 1, 2 and 4 times, and of 2, 4 and 8 times the elements.
 
 With `--prior N` parameters are drawn N times from the robot's default priors, each with a motion of its own: the median
 and the 90 % quantile of the draws' errors, and how many lie beyond half a millimetre.
@@ -30,6 +32,7 @@ import numpy as np
 from jaxtyping import Float
 from prior_draws import drawn
 
+from rfdropo_bayes.fem.native.rod_engine import NativeRod
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
@@ -45,9 +48,10 @@ FURTHER_MS = (1.25, 0.625)
 CONVERGED_MS = 0.3125
 SMALL_DAMPING = 0.002  # [s]
 ALLOWED = 1.0  # [mm]
-REFINED, FINEST = (1, 2, 4), 8
-"""Elements for each of the robot's own; the finest stands for the converged rod."""
+REFINED = (1, 2, 4, 8)
+"""Elements for each of the robot's own."""
 ELEMENTS_MS = 10.0
+AT_REST: Any = "quasi-static"
 REPEATS = 3
 PRIOR_MS, PRIOR_CONVERGED_MS = (20.0, 10.0, 5.0), 1.25
 WANTED = 0.5  # [mm]
@@ -68,9 +72,12 @@ class ElementRow(NamedTuple):
     """One robot with more elements, by how many for each of its own."""
 
     robot: str
+    motion: str
+    solved: str  # motions whose equilibria were all found, with all elements
     elements: int  # its own
-    error_mm: dict[str, float]
+    error_mm: dict[str, float]  # from Richardson's limit
     share: dict[str, float]  # of the tip's way
+    order: list[float]  # of 1, 2, 4 and of 2, 4, 8 times the elements
     cpu_s: dict[str, float]  # of one rollout
 
 
@@ -118,19 +125,25 @@ def tip(
     robot: str, integrator: str, step_ms: float, damping: float | None, motions: int, seconds: float, refine: int = 1
 ) -> tuple[Float[np.ndarray, "motion time 3"], float]:
     """Path of the tip [m], and processor time of one rollout [s]."""
-    model = simulator(Robot.load(robot), integrator, step_ms, refine)
+    model = simulator(Robot.load(robot), "euler" if integrator == AT_REST else integrator, step_ms, refine)
     material, start, displacement = inputs(robot, step_ms, motions, seconds, refine)
     if damping is not None:
         material = material._replace(rayleigh_stiffness=np.full(motions, damping))
     begin = {"start" if model.engine.from_equilibrium else "before": start}
-    engine, cost = model.engine.native, np.inf
+    engine, cost, stride = model.engine.native, np.inf, round(1e3 * OBSERVED / step_ms)
+    if integrator == AT_REST:
+        engine = NativeRod(
+            model.assembly.system, model.assembly.markers, engine.time_step, threads=1, integrator=AT_REST
+        )
+        held = round(1e3 * PERIOD / step_ms)
+        displacement, stride = displacement[:, held - 1 :: held], 1
     for _ in range(REPEATS):
         began = time.process_time()
-        found = engine.rollout(material, displacement, **begin, stride=round(1e3 * OBSERVED / step_ms))
+        found = engine.rollout(material, displacement, **begin, stride=stride)
         cost = min(cost, (time.process_time() - began) / motions)
     if found.diverged.any():
         raise SystemExit(f"{robot}: {integrator} at {step_ms} ms diverged")
-    return found.position[:, :, -1], cost
+    return np.where(found.converged[:, None, None], found.position[:, :, -1], np.nan), cost
 
 
 def error(path: np.ndarray, converged: np.ndarray) -> float:
@@ -165,32 +178,48 @@ def rows_of(robot: str, damping: float | None, motions: int, seconds: float) -> 
     return rows
 
 
-def element_row(robot: str, motions: int, seconds: float) -> ElementRow:
-    """A robot with more elements beside the robot with the most."""
-    finest, _ = tip(robot, "sdirk2", ELEMENTS_MS, None, motions, seconds, FINEST)
-    way = error(finest, finest.mean(axis=1, keepdims=True))
-    found = ElementRow(
-        robot, len(simulator(Robot.load(robot), "euler", ELEMENTS_MS).assembly.system.body.station) - 1, {}, {}, {}
+def element_row(robot: str, integrator: Any, motions: int, seconds: float) -> ElementRow | None:
+    """A robot with more and more elements; None if in every motion an equilibrium was not found."""
+    found = {n: tip(robot, integrator, ELEMENTS_MS, None, motions, seconds, n) for n in REFINED}
+    solved = np.all([np.isfinite(place).all(axis=(1, 2)) for place, _ in found.values()], axis=0)
+    if not solved.any():
+        return None
+    path = {n: place[solved] for n, (place, _) in found.items()}
+    limit = path[8] + (path[8] - path[4]) / 3.0
+    way = error(limit, limit.mean(axis=1, keepdims=True))
+    change = [error(path[n], path[m]) for n, m in itertools.pairwise(REFINED)]
+    away = {str(n): error(place, limit) for n, place in path.items()}
+    return ElementRow(
+        robot,
+        integrator,
+        f"{solved.sum()} of {motions}",
+        simulator(Robot.load(robot), "euler", ELEMENTS_MS).assembly.system.body.elements,
+        away,
+        {name: far / way for name, far in away.items()},
+        [float(np.log2(one / two)) for one, two in itertools.pairwise(change)],
+        {str(n): cost for n, (_, cost) in found.items()},
     )
-    for refine in REFINED:
-        path, cost = tip(robot, "sdirk2", ELEMENTS_MS, None, motions, seconds, refine)
-        away = error(path, finest)
-        found.error_mm[str(refine)], found.share[str(refine)], found.cpu_s[str(refine)] = away, away / way, cost
-    return found
 
 
 def print_elements(robots: list[str], motions: int, seconds: float) -> list[ElementRow]:
     """Print the table of elements."""
-    print("| robot | elements | " + " | ".join(f"{n} x: mm, % of the way, CPU ms" for n in REFINED) + " |")
-    print("|" + "---|" * (2 + len(REFINED)))
+    titles = (f"{n} x: mm, % of the way, CPU ms" for n in REFINED)
+    print("| robot | motion | solved | elements | " + " | ".join(titles) + " | order |")
+    print("|" + "---|" * (5 + len(REFINED)))
     rows = []
-    for robot in robots:
-        row = element_row(robot, motions, seconds)
+    for robot, integrator in itertools.product(robots, ("sdirk2", AT_REST)):
+        row = element_row(robot, integrator, motions, seconds)
+        if row is None:
+            print(f"| {robot} | {integrator} | 0 of {motions} |", flush=True)
+            continue
         rows.append(row)
         cells = [
-            f"{row.error_mm[n]:.2f}, {100.0 * row.share[n]:.1f}, {1e3 * row.cpu_s[n]:.1f}" for n in map(str, REFINED)
+            f"{row.error_mm[n]:.3f}, {100.0 * row.share[n]:.2f}, {1e3 * row.cpu_s[n]:.1f}" for n in map(str, REFINED)
         ]
-        print("| " + " | ".join([row.robot, str(row.elements), *cells]) + " |", flush=True)
+        order = ", ".join(f"{value:.2f}" for value in row.order)
+        print(
+            "| " + " | ".join([row.robot, row.motion, row.solved, str(row.elements), *cells, order]) + " |", flush=True
+        )
     return rows
 
 

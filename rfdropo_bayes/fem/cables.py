@@ -10,7 +10,7 @@ rest length counts as longer, by a smooth law, which keeps its direction defined
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -266,14 +266,10 @@ def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ...
     Together with the rod's forces that turn with its sections, this is the exact tangent of a body loaded by cables
     only.
     """
-    offset = sum((course.lever[:, :, :, side] for side in range(1, course.lever.shape[3])), course.lever[:, :, :, 0])
-    before = jnp.concatenate([offset[:, :, :1], offset[:, :, :-1]], axis=2)
-    lanes = [1] * (offset.ndim - 3)
     parts = []
-    for piece in range(layout.share.shape[2]):
-        pieces = (part[:, :, piece].reshape(*part.shape[:2], *lanes) for part in (layout.share, layout.along))
-        share, along = map(jnp.asarray, pieces)
-        taut, arm = tension[:, None] * share, along * offset + (1.0 - along) * before
+    for number, arm in enumerate(_arms(layout, course)):
+        share = layout.share[:, :, number].reshape(*layout.share.shape[:2], *[1] * (arm.ndim - 3))
+        taut = tension[:, None] * share
         a, way, turn = taut * course.inverse, course.direction, cross(course.direction, arm)
         b = taut * course.sharp
         one = jnp.eye(3).reshape(3, 3, *[1] * a.ndim)
@@ -281,17 +277,46 @@ def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ...
         mixed = _outer(way, b * turn) - skew(a * arm)
         moment = one * (a * dot(arm, arm)) - _outer(arm, a * arm) - _outer(turn, b * turn)
         parts.append(jnp.stack([force, mixed, moment]).reshape(27, *a.shape))
+    return Held(*_over_elements(layout, parts, elements).reshape(3, 3, 3, elements, *parts[0].shape[3:]))
+
+
+def pull_beside(
+    layout: CableLayout, course: Courses, tension: Float[Array, "cables ..."], length: Float[Array, "elements ..."]
+) -> Float[Array, "6 elements ..."]:
+    """Force and moment of the cables beside every element, in space."""
+    parts = []
+    for number, arm in enumerate(_arms(layout, course)):
+        lanes = [1] * (arm.ndim - 3)
+        share, way = (part.reshape(*part.shape, *lanes) for part in (layout.share[:, :, number], layout.way))
+        pull = course.direction * (tension[:, None] * share * length[layout.element[:, :, number]] / way)
+        parts.append(jnp.concatenate([pull, cross(arm, pull)]))
+    return _over_elements(layout, parts, len(length))
+
+
+def _arms(layout: CableLayout, course: Courses) -> Iterator[Vector]:
+    """Arms in space of the middles of the ways' pieces beside elements, piece by piece [m]."""
+    offset = sum((course.lever[:, :, :, side] for side in range(1, course.lever.shape[3])), course.lever[:, :, :, 0])
+    before = jnp.concatenate([offset[:, :, :1], offset[:, :, :-1]], axis=2)
+    for piece in range(layout.share.shape[2]):
+        along = jnp.asarray(layout.along[:, :, piece]).reshape(*layout.along.shape[:2], *[1] * (offset.ndim - 3))
+        yield along * offset + (1.0 - along) * before
+
+
+def _over_elements(
+    layout: CableLayout, parts: Sequence[Float[Array, "k cables guides ..."]], elements: int
+) -> Float[Array, "k elements ..."]:
+    """Sums over the pieces of ways beside each element; ``parts`` has one array for each piece of a way."""
     whole = jnp.stack(parts, axis=3)
     index, bound = layout.element, layout.share > 0.0
     if not len(index):
-        return Held(*jnp.zeros((3, 3, 3, elements, *whole.shape[4:])))
+        return jnp.zeros((len(whole), elements, *whole.shape[4:]))
     longest = np.argmax(bound.sum(axis=(1, 2)))
     if np.all((index == index[longest]) | ~bound):
         sums = _at_stations(jnp.sum(whole, axis=1), index[longest], np.asarray(bound.any(axis=0)), elements)
     else:
         each = [_at_stations(whole[:, c], index[c], bound[c], elements) for c in range(len(index))]
         sums = sum(each[1:], each[0])
-    return Held(*jnp.moveaxis(sums, 0, 1).reshape(3, 3, 3, elements, *whole.shape[4:]))
+    return jnp.moveaxis(sums, 0, 1)
 
 
 def lengths(course: Courses) -> Float[Array, "cables ..."]:

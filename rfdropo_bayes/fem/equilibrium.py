@@ -1,6 +1,10 @@
 """Static equilibrium under gravity, external forces and cables: the start of a rollout, and quasi-static motion.
 
-Newton's method with the tangent and the constraints of a step. Mobilised friction of the cables continues from the
+Newton's method with the constraints of a step and its tangent, and with the forces that turn with the sections, in
+leading order. Stresses in the matrix are linear in the increments: in a thin rod the second order of a rotation is a
+large force along the axis (Magisano, Leonetti and Garcea 2017, "How to improve efficiency and robustness of the Newton
+method in geometrically non-linear structural problem discretized via displacement-based finite elements"). Increments
+that shrink slowly are prolonged by Aitken's rule. Mobilised friction of the cables continues from the
 previous state, so that it depends on the path. Derivatives are of the equations at the solution, with all terms.
 """
 
@@ -11,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -22,7 +27,7 @@ from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.derivatives import pushed_forward
 from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, accept, displaced, stage_body, state_at_rest
 from rfdropo_bayes.fem.integrators import Stage
-from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Way, all_rows, linearised, solved_stage
+from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Turning, Way, all_rows, linearised, solved_stage, stresses
 
 ITERATIONS = 60
 SETTLED, ROW_SETTLED = 1e-10, 1e-6
@@ -32,7 +37,15 @@ LONGEST_STEP = 0.1
 """No station moves further than this many body lengths in an iteration."""
 WIDEST_TURN = 0.5
 """No section turns further [rad] in an iteration."""
-SMALLEST_RELAXATION = 0.1
+SLOWER = 0.5
+"""Share of the next way that a body goes whose increments do not shrink."""
+NEAR = 0.1
+"""Increments below this many body lengths follow Aitken's rule."""
+SHORTEST, FARTHEST = 0.3, 10.0
+"""Least and greatest share of an increment by that rule."""
+STEADY = 0.8
+"""Cosine between successive increments above which growing ones lead away from an unstable equilibrium."""
+TINY = 1e-300
 NO_TIME = Stage(0.0, 1.0, 0.0, True)
 """A stage whose "velocities" are the motion itself."""
 
@@ -54,6 +67,7 @@ class Task(NamedTuple):
     drive: Float[Array, " drives"]
     external: Float[Array, "stations 6"]
     slip: Slip | None
+    moves: Float[Array, ""]  # 0 for a body that missed an earlier equilibrium, which stays where it is
 
 
 class Found(NamedTuple):
@@ -70,8 +84,10 @@ class Found(NamedTuple):
 class _Iterate(NamedTuple):
     place: State
     impulse: Float[Array, " rows"]
-    increment: Float[Array, "stations 6"]
-    relaxation: Float[Array, ""]
+    turning: Turning
+    largest: Float[Array, ""]  # increment of the iteration before, over the body's length
+    increment: Float[Array, "6 stations"]  # and all of it, in body lengths and radians
+    pace: Float[Array, ""]  # share of it that was gone; 0 if the matrix has changed its kind since
     moving: Bool[Array, ""]
     solved: Float[Array, ""]
     iterations: Float[Array, ""]
@@ -108,32 +124,55 @@ def _bonds(system: System, task: Task, place: State, previous: Float[Array, " ca
     return bonds._replace(rows=rows, base=length - before, compliance=weight, slips=slips)
 
 
+def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Array, ""]:
+    """Share of an increment by Aitken's rule in the form of Irons and Tuck (1969, Int. J. Numer. Methods Eng. 1:275):
+    from the change that the last increment, and the share of it that was gone, made to the next."""
+    before = current.increment
+    square, along, own = (jnp.sum(a * b) for a, b in ((before, before), (before, increment), (increment, increment)))
+    share = current.pace * (square - along) / jnp.maximum(square - 2.0 * along + own, TINY)
+    away = (along > square) & (along**2 > STEADY**2 * square * own)
+    return jnp.where(away, FARTHEST, jnp.clip(share, SHORTEST, FARTHEST))
+
+
 def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
-    """Newton's method. The increments are limited in length, and relaxed more whenever two in a row point against each
-    other, so that strongly bent soft bodies also converge.
+    """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`. A
+    matrix without a solution
+    is tried again without the forces that turn, which near a loss of stability leave it indefinite; they are back after
+    a whole increment. The increments to come are no more than a geometric series that goes on as the last two did.
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
-    length = system.body.length
+    none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
 
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
-        found, softness = solved_stage(way, _body(system, task, current.place), bonds)
-        increment = found.change.T
-        size = jnp.array([1.0 / length] * 3 + [1.0] * 3)
-        now, before = increment * size, current.increment * size
-        opposed = jnp.sum(now * before) < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
-        relaxation = jnp.clip(current.relaxation * jnp.where(opposed, 0.6, 1.2), SMALLEST_RELAXATION, 1.0)
-        largest = jnp.max(jnp.abs(now))
-        far = jnp.max(jnp.abs(now[:, :3])) / LONGEST_STEP, jnp.max(jnp.abs(now[:, 3:])) / WIDEST_TURN
-        scale = jnp.minimum(relaxation, 1.0 / jnp.maximum(jnp.maximum(*far), 1e-300))
-        moved = displaced(current.place, scale * increment)
+        body = _body(system, task, current.place)
+        found, softness = solved_stage(way, body._replace(turning=current.turning), bonds)
         count = current.iterations + 1.0
-        return _Iterate(moved, found.impulse, increment, relaxation, largest > bound, found.converged, count, softness)
+        again = ~jnp.isfinite(jnp.sum(found.change**2)) & (current.turning.share > 0.0)
+        increment = found.change / scales
+        far, wide = jnp.max(jnp.abs(increment[:3])), jnp.max(jnp.abs(increment[3:]))
+        size = jnp.maximum(far, wide)
+        grown = size > current.largest
+        limit = jnp.minimum(LONGEST_STEP / jnp.maximum(far, TINY), WIDEST_TURN / jnp.maximum(wide, TINY))
+        paced = (current.pace > 0.0) & (size < NEAR)
+        plain = jnp.where(grown, SLOWER, 1.0) * jnp.minimum(limit, 1.0)
+        share = jnp.where(paced, jnp.minimum(limit, _pace(current, increment)), plain)
+        left = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
+        left = jnp.where(share > 1.0, share * size, left)
+        before, kind = current.turning
+        turning = Turning(before + share * (stresses(body, found.change) - before), jnp.where(share < 1.0, kind, 1.0))
+        pace = jnp.where(turning.share == kind, share, 0.0)
+        place = displaced(current.place, share * found.change.T)
+        rest = left > bound, found.converged, count, softness
+        taken = _Iterate(place, found.impulse, turning, size, increment, pace, *rest)
+        waiting = current._replace(turning=Turning(before, none[0, 0]), pace=none[0, 0], iterations=count)
+        return jax.tree.map(lambda old, new: jnp.where(again, old, new), waiting, taken)
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
-    none, whole = jnp.zeros((len(task.start.position), 6)), jnp.ones(())
-    first = _Iterate(task.start, impulse, none, whole, jnp.array(True), whole, jnp.zeros(()), jnp.zeros(cables))
+    turning = Turning(stresses(_body(system, task, task.start), none), jnp.ones(()))
+    rest = task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
+    first = _Iterate(task.start, impulse, turning, jnp.array(jnp.inf), none, jnp.zeros(()), *rest)
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
     return Found(
         last.place.position,
@@ -202,6 +241,7 @@ def settled(
     external_force: Float[Array, "stations 6"] | float = 0.0,
     iterations: int = ITERATIONS,
     bound: float = ROW_SETTLED,
+    moves: Bool[Array, ""] | bool = True,
 ) -> tuple[State, EquilibriumInfo]:
     """The equilibrium that a state comes to under drives (see `System`), and forces [N] and moments [N m] on the
     stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
@@ -216,7 +256,14 @@ def settled(
             system.cables, prepared.effects, memory.slip, memory.segment, state.position, state.orientation
         )
     external = jnp.broadcast_to(jnp.asarray(external_force, dtype=float), (len(state.position), 6))
-    task = Task(prepared, state._replace(memory=memory._replace(slip=None, segment=None)), drive, external, slip)
+    task = Task(
+        prepared,
+        state._replace(memory=memory._replace(slip=None, segment=None)),
+        drive,
+        external,
+        slip,
+        jnp.asarray(moves, float),
+    )
     found = _balanced(system, iterations, bound, task)
     cables, unknown = len(system.cables.anchor), jnp.zeros((len(state.position), 6))
     forces = _unbalanced(system, task, found, unknown, found.impulse)[0]
@@ -256,7 +303,11 @@ def quasi_static_step(
     state: State,
     drive: Float[Array, " drives"],
     external_force: Float[Array, "stations 6"] | float = 0.0,
+    before: StepInfo | None = None,
 ) -> tuple[State, StepInfo]:
-    """A row of quasi-static motion, in place of ``dynamics.step``."""
-    moved, info = settled(system, prepared, state, drive, external_force)
+    """A row of quasi-static motion, in place of ``dynamics.step``. A body that missed an equilibrium ``before`` is not
+    moved: its rollout counts as failed.
+    """
+    moves = True if before is None else before.converged & ~before.diverged
+    moved, info = settled(system, prepared, state, drive, external_force, moves=moves)
     return moved, StepInfo(info.diverged, info.converged)

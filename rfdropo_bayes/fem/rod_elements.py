@@ -36,6 +36,7 @@ from rfdropo_bayes.fem.components import (
     transposed,
     transposed_times,
 )
+from rfdropo_bayes.fem.effects import Scalar
 
 Six = Float[Array, "6 ..."]
 
@@ -125,6 +126,26 @@ def held_resultant(elements: Elements, held: Held, rates: Six) -> Six:
     force = times(held.force, stretching) + times(held.mixed, bending)
     moment = transposed_times(held.mixed, stretching) + times(held.moment, bending)
     return jnp.concatenate([transposed_times(elements.frame, force), transposed_times(elements.frame, moment)])
+
+
+def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six, share: Scalar) -> Stiffness:
+    """The stiffness with a share of how the forces of sections and of cables beside them turn with the middles of the
+    elements, in leading order; it is symmetric.
+
+    Args:
+        elements: shape of all elements.
+        stiffness: their stiffness without it.
+        resultant: forces and moments of the sections in the elements' frames.
+        pull: forces and moments of the cables in space.
+        share: 1 for all of it.
+    """
+    force = 0.5 * share * (pull[:3] + times(elements.frame, resultant[:3]))
+    moment = 0.5 * share * (pull[3:] + times(elements.frame, resultant[3:]))
+    lean = force[:, None] * elements.way[None]
+    swing = 0.25 * (lean + transposed(lean)) - 0.5 * diagonal(jnp.stack([dot(force, elements.way)] * 3))
+    tilt, roll = skew(force), skew(moment)
+    c, a, b, aa, bb, ba = stiffness
+    return Stiffness(c, a - tilt, b - tilt, aa + swing, bb + swing, ba + swing - roll)
 
 
 def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held: Held | None = None) -> Stiffness:

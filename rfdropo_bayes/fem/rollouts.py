@@ -59,7 +59,7 @@ Recorded = tuple[Float[Array, "points 3"], Float[Array, " cables"], Float[Array,
 
 
 def roll(
-    take: Callable[[Any, Any], tuple[Any, StepInfo]],
+    take: Callable[[Any, Any, StepInfo], tuple[Any, StepInfo]],
     start: Any,
     drive: Any,
     points: PointMap,
@@ -74,8 +74,8 @@ def roll(
     """
 
     def one(progress: _Progress, commanded: Any) -> tuple[_Progress, None]:
-        state, info = take(progress.state, commanded)
         before = progress.info
+        state, info = take(progress.state, commanded, before)
         codes = StepInfo(before.diverged | info.diverged, before.converged & info.converged)
         return _Progress(state, codes), None
 
@@ -129,19 +129,21 @@ def simulate(
         raise InputError("a cube cannot be pushed in quasi-static motion", where="[simulator] motion")
     if loads is not None:
 
-        def pushed(before: State, given: tuple[Float[Array, " drives"], Int[Array, ""]]) -> tuple[State, StepInfo]:
+        def pushed(
+            before: State, given: tuple[Float[Array, " drives"], Int[Array, ""]], codes: StepInfo
+        ) -> tuple[State, StepInfo]:
             under, force = loaded(system, prepared, loads, given[1])
             if still:
-                return quasi_static_step(system, under, before, given[0], force)
+                return quasi_static_step(system, under, before, given[0], force, codes)
             return step(system, under, before, given[0], time_step, force, scene, cube, integrator)
 
         number = 1 + jnp.arange(drive.shape[0] * drive.shape[1]).reshape(drive.shape[:2])
         begin = remembering(system, prepared, state, scene, integrator)
         return roll(pushed, begin, (drive, number), points, horizon)
 
-    def take(before: State, commanded: Float[Array, " drives"]) -> tuple[State, StepInfo]:
+    def take(before: State, commanded: Float[Array, " drives"], codes: StepInfo) -> tuple[State, StepInfo]:
         if still:
-            return quasi_static_step(system, prepared, before, commanded)
+            return quasi_static_step(system, prepared, before, commanded, 0.0, codes)
         return step(system, prepared, before, commanded, time_step, scene=scene, cube=cube, integrator=integrator)
 
     return roll(take, remembering(system, prepared, state, scene, integrator), drive, points, horizon)

@@ -21,13 +21,24 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import rod_elements
 from rfdropo_bayes.fem.cable_problem import settle_cables
-from rfdropo_bayes.fem.cables import CableLayout, Courses, Held, Threads, courses, held, lengths, station_rows
+from rfdropo_bayes.fem.cables import (
+    CableLayout,
+    Courses,
+    Held,
+    Threads,
+    courses,
+    held,
+    lengths,
+    pull_beside,
+    station_rows,
+)
 from rfdropo_bayes.fem.chain import Chain, Eliminated, Factor, ascend, descend, eliminate
 from rfdropo_bayes.fem.components import (
     Matrix,
     Quaternion,
     Vector,
     cross,
+    diagonal,
     product,
     rotation,
     times,
@@ -40,6 +51,13 @@ from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.lanes import laned
 from rfdropo_bayes.fem.rod_elements import Elements, Six
 from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
+
+
+class Turning(NamedTuple):
+    """Forces that turn with the sections in the matrix of an equilibrium."""
+
+    resultant: Six  # forces and moments of the sections in the elements' frames
+    share: Scalar  # 0 without them, 1 with them
 
 
 class StageBody(NamedTuple):
@@ -62,6 +80,7 @@ class StageBody(NamedTuple):
     gain: Scalar | None = None  # stiffness of a Prony branch, relative
     branch: Six | None = None  # strains of its dashpot
     blown: Six | None = None  # forces and moments that chambers take from the sections [N], [N m]
+    turning: Turning | None = None  # of an equilibrium
 
 
 class Bonds(NamedTuple):
@@ -104,6 +123,7 @@ class Linearised(NamedTuple):
     course: Courses  # of the cables
     held: Held  # of the elements between them
     right: Six
+    pull: Six | None = None  # of the cables beside the elements, of an equilibrium
 
 
 class Kept(NamedTuple):
@@ -143,7 +163,16 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
     right = body.span * (force - jnp.concatenate([jnp.zeros_like(gyroscopic), gyroscopic]))
     if body.carried is not None:
         right = right + body.carried
-    return Linearised(elements, slope, frame, course, between, right)
+    pull = None if body.turning is None else pull_beside(way.layout, course, tension, body.length)
+    return Linearised(elements, slope, frame, course, between, right, pull)
+
+
+def stresses(body: StageBody, change: Six) -> Six:
+    """Forces and moments of the sections after a change of all stations, linear in it."""
+    elements = rod_elements.shape(body.length, body.position, body.orientation)
+    rates = rod_elements.strain_rates(elements, change)
+    found = answer(body.section, elements.strain) + linear(slopes(body.section, elements.strain), rates)
+    return found if body.blown is None else found - body.blown
 
 
 def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
@@ -163,7 +192,14 @@ def matrix(body: StageBody, line: Linearised) -> Chain:
     """A."""
     scale = body.span * body.lookahead
     taut = Held(*(body.span**2 * part for part in line.held))
-    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, scale * line.slope.bending, taut)
+    bending = scale * line.slope.bending
+    if body.turning is not None:
+        bow = body.turning.share * body.turning.resultant[2] * body.length**2 / 12.0
+        bow = jnp.stack([bow, bow, jnp.zeros_like(bow)])
+        bending = bending + (bow if bending.ndim == bow.ndim else diagonal(bow))
+    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, bending, taut)
+    if body.turning is not None and line.pull is not None:
+        element = rod_elements.turning(line.elements, element, body.turning.resultant, line.pull, body.turning.share)
     grown = 1.0 + body.span * body.loss
     straight = jnp.eye(3).reshape(3, 3, *[1] * body.mass.ndim) * (grown * body.mass)
     if body.added is not None:

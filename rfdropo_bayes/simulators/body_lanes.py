@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import point_positions
-from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
+from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, remembering, step
 from rfdropo_bayes.fem.equilibrium import quasi_static_step
 from rfdropo_bayes.fem.native.rod_session import RodSession
 from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
@@ -231,12 +231,13 @@ class ReferenceLanes:
                 if acting is not None:
                     under, force = loaded(system, under, acting, given[1])
                 if engine.at_rest:
-                    state, info = quasi_static_step(system, under, before.state, given[0], force)
+                    codes = StepInfo(before.diverged, before.converged)
+                    state, info = quasi_static_step(system, under, before.state, given[0], force, codes)
                 else:
                     around = force, engine.scene, before.cube
                     state, info = step(system, under, before.state, given[0], time_step, *around, engine.integrator)
-                codes = before.diverged | info.diverged, before.converged & info.converged
-                return before._replace(state=state, diverged=codes[0], converged=codes[1]), state.tension
+                diverged, converged = before.diverged | info.diverged, before.converged & info.converged
+                return before._replace(state=state, diverged=diverged, converged=converged), state.tension
 
             lane, tension = jax.lax.scan(one, lane, (displacement, jnp.arange(len(displacement))))
             return lane, tension.max(axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
@@ -173,6 +174,36 @@ def test_a_load_bends_a_thin_bar_at_once_in_few_solves():
     assert found.converged.all()
     assert found.position[0, -1, 0, 1] / LENGTH == pytest.approx(0.6033, rel=3e-3)
     assert found.solves[0] <= 12
+
+
+@pytest.mark.slow
+def test_equilibria_are_found_as_fast_by_both_engines():
+    """The thin bar of the test before, and bodies with cables: the same numbers in as many solves, but for one."""
+    half = LENGTH / 400.0
+    body = fem.uniform_rod(LENGTH, half, half, 20)
+    thin, points = fem.System(body, fem.without_cables()), fem.attach(body, np.array([[0.0, 0.0, LENGTH]]))
+    load = np.array([0.0, 3.0 * YOUNG * (2.0 * half) ** 4 / 12.0 / LENGTH**2, 0.0])
+    force = np.zeros((21, 6))
+    force[-1, :3] = load
+    compared = (
+        (thin, points, [bar_material()], np.zeros((1, 0)), force, pushed(load, 1)),
+        (*uneven_rod(), [rows_of(materials(3), k) for k in range(BATCH)], 2.0 * displacements(4)[:, 0], 0.0, None),
+    )
+    for system, shown, each, start, wrench, loads in compared:
+        motion = NativeRod(system, shown, TIME_STEP, threads=1)
+
+        @jax.jit
+        def settle(material, start, system=system, wrench=wrench):
+            return fem.static_equilibrium(system, fem.prepare(system, material), start, wrench)
+
+        for material, commands in zip(each, start, strict=True):
+            state, info = settle(material, commands)
+            found = motion.rollout(material, commands[None], start=commands, steps=0, loads=loads)
+            assert info.converged
+            assert info.iterations <= 14
+            position = fem.point_positions(shown, state.position, state.orientation)
+            np.testing.assert_allclose(position, found.position[0, 0], rtol=0.0, atol=1e-8)
+            np.testing.assert_allclose(state.tension, found.tension[0, 0], rtol=0.0, atol=1e-6)
 
 
 def test_friction_of_rows_at_rest_keeps_its_path():

@@ -101,10 +101,11 @@ class RodWork(NamedTuple):
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses, or an equilibrium, were not found
     points: Float[np.ndarray, "point_values lanes"]
-    before: Float[np.ndarray, "values lanes"]  # the change of velocity in the stage before
+    before: Float[np.ndarray, "values lanes"]  # the change of velocity in the stage before, or a static increment
     sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
     largest: Float[np.ndarray, "1 lanes"]  # increment of the static iteration before [m]
+    pace: Float[np.ndarray, "1 lanes"]  # share of it that was gone; 0 if the matrix has changed its kind since
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]
     softness: Float[np.ndarray, "1 lanes"]  # remaining share of the moduli after the time

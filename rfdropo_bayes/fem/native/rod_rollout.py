@@ -28,7 +28,7 @@ from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
 
-ROW_ITERATIONS = 30
+ROW_ITERATIONS = 60
 """Most iterations of a row of quasi-static motion."""
 
 
@@ -103,8 +103,8 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         stations * SIZE,
     )
     once = (
-        "unsolved", "accepted", "lost", "failed", "moving", "largest", "solves", "imbalance", "softness", "firmness",
-        "loss",
+        "unsolved", "accepted", "lost", "failed", "moving", "largest", "pace", "solves", "imbalance", "softness",
+        "firmness", "loss",
     )  # fmt: skip
     work = rows(
         turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,

@@ -6,7 +6,7 @@ again: how long others take changes nothing of it.
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.equilibrium import LONGEST_STEP
+from rfdropo_bayes.fem.equilibrium import FARTHEST, LONGEST_STEP, NEAR, SHORTEST, SLOWER, STEADY, WIDEST_TURN
 from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import PANEL
 from rfdropo_bayes.fem.native.fields import clear
@@ -30,10 +30,7 @@ from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_r
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
-LARGEST_TURN = 0.5
-"""[rad] No section turns further in an iteration."""
-SLOWER = 0.5
-"""Share of the next way that a lane goes whose increments do not shrink."""
+TINY = 1e-30
 
 
 @kernel
@@ -61,29 +58,51 @@ def _largest(tables, first, field, token):
 
 
 @kernel
+def _pace(tables, work, token):
+    """Share of ``solution`` to go by Aitken's rule; see `equilibrium`."""
+    zero, one, tiny = fill(0.0, work.frame, token), fill(1.0, work.frame, token), fill(TINY, work.frame, token)
+    least, most = fill(SHORTEST, work.frame, token), fill(FARTHEST, work.frame, token)
+    square = _product(tables, work.before, work.before, token)
+    along = _product(tables, work.before, work.solution, token)
+    own = _product(tables, work.solution, work.solution, token)
+    change = square - along - along + own
+    share = load(work.pace, 0, token) * (square - along) / where_greater(change, tiny, change, tiny)
+    share = where_greater(share, least, where_greater(share, most, most, share), least)
+    away = where_greater(along * along, (STEADY * STEADY) * square * own, one, zero)
+    return where_greater(where_greater(along, square, away, zero), zero, most, share)
+
+
+@kernel
 def _choose_way(tables, factors, work, moving, token):
-    """Share of ``solution`` to go, limited in length and less if increments do not shrink; and what the increments
-    after it may add up to.
+    """Share of ``solution`` to go, limited in length, and less if increments do not shrink, or by `_pace` near the end;
+    and what the increments after it may add up to.
 
     A lane that goes its whole way takes the forces that turn into the next matrix again.
 
     All that are left are no more than a geometric series that goes on as the last two did: Newton's method converges
     faster.
     """
-    zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
+    zero, one, tiny = fill(0.0, work.frame, token), fill(1.0, work.frame, token), fill(TINY, work.frame, token)
     far, wide = _largest(tables, 0, work.solution, token), _largest(tables, 3, work.solution, token)
-    longest, widest = fill(LONGEST_STEP * tables.total, work.frame, token), fill(LARGEST_TURN, work.frame, token)
     turn, before = wide * tables.total, load(work.largest, 0, token)
     size = where_greater(far, turn, far, turn)
     grown = where_greater(size, before, one, zero)
-    share = where_greater(far, longest, longest / far, one)
-    share = where_greater(share * wide, widest, widest / wide, share)
+    limit = fill(LONGEST_STEP * tables.total, work.frame, token) / where_greater(far, tiny, far, tiny)
+    widest = fill(WIDEST_TURN, work.frame, token) / where_greater(wide, tiny, wide, tiny)
+    limit = where_greater(limit, widest, widest, limit)
+    share = where_greater(limit, one, one, limit)
     share = where_greater(grown, zero, SLOWER * share, share)
+    pace = _pace(tables, work, token)
+    paced = where_greater(fill(NEAR * tables.total, work.frame, token), size, load(work.pace, 0, token), zero)
+    share = where_greater(paced, zero, where_greater(pace, limit, limit, pace), share)
     store(work.largest, 0, where_greater(moving, zero, size, before))
-    whole = where_greater(one, share, zero, moving)
-    store(factors.turning, 0, where_greater(whole, zero, one, load(factors.turning, 0, token)))
+    whole, turning = where_greater(one, share, zero, moving), load(factors.turning, 0, token)
+    store(factors.turning, 0, where_greater(whole, zero, one, turning))
+    kept = where_greater(whole - turning, zero, zero, share)
+    store(work.pace, 0, where_greater(moving, zero, kept, zero))
     alone = where_greater(before, fill(0.5 * UNBOUNDED, work.frame, token), one, grown)
-    return share, where_greater(alone, zero, size, size * (size / (before - size)))
+    left = where_greater(alone, zero, size, size * (size / (before - size)))
+    return share, where_greater(share, one, share * size, left)
 
 
 @kernel
@@ -145,6 +164,7 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
     share, left = _choose_way(tables, factors, work, moving, token)
     for row in range(SIZE * tables.held, SIZE * tables.stations):
         increment = load(work.solution, row, token)
+        store(work.before, row, increment)
         store(work.velocity, row, increment)
         store(work.solution, row, share * increment)
     store(factors.strain_rate, 0, one)
@@ -169,6 +189,7 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
     _follow_stress(tables, samples, factors, work, one, token)
     store(work.moving, 0, one - load(work.failed, 0, token))
     store(work.largest, 0, fill(UNBOUNDED, work.frame, token))
+    store(work.pace, 0, zero)
     if runs is not None and slips > 0:
         gather_cables(tables, work, one, False, token)
         start_row(tables, runs, samples, friction, work, token)
