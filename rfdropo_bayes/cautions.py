@@ -65,6 +65,8 @@ class Code(StrEnum):
     """Another order of the commands explains the motion better."""
     UNIT_DOUBTFUL = "unit_doubtful"
     """The markers move so much more, or less, than the nominal model that a unit was probably misread."""
+    NOT_PREDICTED = "not_predicted"
+    """No draw could be simulated under the commands of the test recordings."""
     RESIDUALS_CORRELATED = "residuals_correlated"
     """Residuals last from row to row beyond the noise model."""
     RESIDUALS_LAST = "residuals_last"

@@ -26,6 +26,10 @@ class NoLikelihoodError(InputError):
     """No tried parameter set has a positive likelihood: the prior excludes the data, or more draws are needed."""
 
 
+class NoRolloutError(InputError):
+    """No draw could be simulated under the commands of some recordings."""
+
+
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C in the middle of a run.
 

@@ -118,6 +118,7 @@ CONDITIONS = (
     Condition("null_shared_noise", 0, 0.0, shared=True),
     Condition("null_mesh", 0, 0.0, mesh=True),
     Condition("rest_rho_0.5", 1, 0.5, rest=True),
+    Condition("rest_rho_0.3", 1, 0.3, rest=True),
     Condition("null_rest", 0, 0.0, rest=True),
 )
 

@@ -77,9 +77,9 @@ def main() -> None:
     """Run the parts that are named; exit with status 1 if one fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="+", choices=PARTS, metavar="PART", help=", ".join(PARTS))
-    failed = []
+    failed, at = [], commit()  # before the ledger itself differs from the commit
     for part in parser.parse_args().parts:
-        at, before = commit(), spent()
+        before = spent()
         output, status = run(["make", part])
         seconds = spent() - before
         yardstick, _ = run([sys.executable, "tools/yardstick.py"])

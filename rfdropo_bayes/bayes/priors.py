@@ -123,7 +123,7 @@ def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: st
 
 
 def confined(spec: ParameterSpec, table: Mapping[str, Any]) -> ParameterSpec:
-    """The parameter within the ends that a TruncatedNormal has beside the hard bounds; else as it is."""
+    """The parameter with the ends of a TruncatedNormal as its bounds; unchanged under another prior."""
     if table.get("distribution") not in OPTIONAL:
         return spec
     low, high = table.get("low", -math.inf), table.get("high", math.inf)

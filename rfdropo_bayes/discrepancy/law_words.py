@@ -103,8 +103,8 @@ def law_sentence(answer: Answer) -> str:
     laws = " and ".join(_one(refit, row, names) for refit, row in zip(described.found.terms, rows, strict=True))
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
-    unknown = "stands for no mechanism of the library" if answer.problem.candidates else "the model lacks"
-    head = f"Something acts that {unknown}: {laws}{_when(described)}"
+    unknown = "no mechanism of the library describes" if answer.problem.candidates else "the model lacks"
+    head = f"An effect acts that {unknown}: {laws}{_when(described)}"
     worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
     looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.found.terms))
     return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."

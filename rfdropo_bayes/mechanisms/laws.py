@@ -87,7 +87,7 @@ class Law:
         self.port, self.terms, self._ports = port, tuple(terms), ports
         self.name = f"law at {port.name}: {formula}" if formula else f"law at {port.name}"
         self.parameters = tuple(spec for term in terms for spec in (term.spec, term.shape) if spec is not None)
-        self.cause = f"something acts at {port.words} by a law that stands for no mechanism of the library"
+        self.cause = f"an effect at {port.words}, with a law that no mechanism of the library has"
         self.remedy = f"look at {port.look}"
 
     def signal(self, values: Values, levels: Float[Array, "row channel"], time_step: float) -> Float[Array, " row"]:

@@ -5,6 +5,7 @@ A pushed cube starts at its measured pose in a new recording.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -30,13 +31,14 @@ from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import NoRolloutError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.day_error import DayError
 from rfdropo_bayes.prediction.day_spread import draw_deviation
 from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
+from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 # Keys of a posterior's attributes.
@@ -292,10 +294,14 @@ def _predictions(
 
 def _ended_well(problem: CalibrationProblem, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Batch]:
     """Noise-free positions and poses of the object, of the rollouts that succeeded, and their values."""
-    position, pose, status = problem.predict_scene(values)
-    fine = status == 0
+    position, pose, ended = problem.predict_scene(values)
+    status = np.asarray(ended)
+    fine = status == Result.OK
     if not fine.any():
-        raise InputError("no rollout under the posterior succeeded", where="prediction", remedy="narrow the priors")
+        counts = ", ".join(f"{Result(kind).name.lower()} {count}" for kind, count in sorted(Counter(status).items()))
+        names = ", ".join(problem.model.recordings.names)
+        what = f"no draw of the posterior could be simulated under these commands ({counts})"
+        raise NoRolloutError(what, where=names, remedy="cut the rows at which the robot leaves the fitted motion")
     return (
         position[fine],
         None if pose is None else pose[fine],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -62,7 +62,7 @@ class RobotOutline:
         segment_lengths: lengths of the segments, base to tip; equal by default.
         segment_azimuths: azimuth of the first cable of each segment [deg]; cables of all segments are spread evenly by
             default.
-        azimuth_evidence: reason for these azimuths, if they were found from a recording.
+        azimuth_evidence, size_evidence: reasons for azimuths, and for sizes, that were found from a recording.
         usual_command: size of usual commands, in their unit.
         assumed: names of attributes that have default values.
     """
@@ -88,6 +88,7 @@ class RobotOutline:
     segment_lengths: tuple[float, ...] | None = None
     segment_azimuths: tuple[float, ...] | None = None
     azimuth_evidence: str = ""
+    size_evidence: str = ""
     usual_command: float | None = None
     assumed: frozenset[str] = frozenset()
 
@@ -187,15 +188,63 @@ class RobotOutline:
         return float(heights[np.argmin(np.abs(heights - end))])
 
     @property
+    def arm(self) -> float:
+        """Distance of the cables at the base, or of the chambers, from the axis [m]."""
+        return CABLES_AT * self.radius if self.cable_radius is None else self.cable_radius
+
+    @property
     def bending_force(self) -> float:
         """Tension, or thrust of a chamber, that bends the body by a usual pull [N], see `mechanisms.sizes`."""
         moment = float(np.mean(section_profile([self.section]).bending_moment_area_m4))
         return self.young_modulus * moment * USUAL_PULL / self.arm**2
 
     @property
-    def arm(self) -> float:
-        """Distance of the cables at the base, or of the chambers, from the axis [m]."""
-        return CABLES_AT * self.radius if self.cable_radius is None else self.cable_radius
+    def sets_bend(self) -> str | None:
+        """The assumed attribute that sets how far a command bends the body; None if all that do were given."""
+        names = {"m": ("cable_radius",), "rad": ("spool_radius", "cable_radius")}.get(
+            self.command_unit, ("young_modulus",)
+        )
+        return next((name for name in names if name in self.assumed), None)
+
+    def resized(self, scale: float, bend: float, evidence: str) -> RobotOutline:
+        """The robot in the size that a recording shows.
+
+        Args:
+            scale: factor of the lengths that were assumed.
+            bend: factor of the bend of a command, by the attribute that `sets_bend`.
+            evidence: reason for both, in words.
+        """
+        lengths = ("length", "radius", "tip_radius", "inner_radius")
+        changes: dict[str, Any] = {
+            name: _rounded(scale * value)
+            for name in lengths
+            if name in self.assumed and (value := getattr(self, name)) is not None
+        }
+        if "markers" in self.assumed:
+            changes["markers"] = {name: _rounded(scale * height) for name, height in self.markers.items()}
+        if {"radius", "cable_radius"} <= self.assumed:
+            changes["cable_radius"] = None  # it follows the body
+        sized = replace(self, **changes, size_evidence=evidence)
+        if self.sets_bend == "spool_radius":
+            return replace(sized, spool_radius=_rounded(self.spool_radius * bend * sized.arm / self.arm))
+        if self.sets_bend == "cable_radius":
+            arm = self.arm / bend
+            if "radius" not in self.assumed:
+                return replace(sized, cable_radius=_rounded(min(arm, sized.radius)))
+            wider = arm / sized.arm
+            tip = None if sized.tip_radius is None else _rounded(wider * sized.tip_radius)
+            return replace(sized, radius=_rounded(wider * sized.radius), tip_radius=tip)
+        if self.sets_bend == "young_modulus":
+            before, after = (
+                o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized)
+            )
+            return replace(sized, young_modulus=_rounded(self.young_modulus / bend * before / after))
+        return sized
+
+    @property
+    def force_of_unit(self) -> float:
+        """Force of a unit command as far as the body's size sets it: the area of a chamber [m2], else 1."""
+        return self.chamber_area if self.command_unit == "Pa" else 1.0
 
     @property
     def chamber_area(self) -> float:
@@ -232,7 +281,7 @@ class RobotOutline:
 
 def not_given(answers: Mapping[str, Any]) -> frozenset[str]:
     """Names of the answers of a `RobotOutline` that are taken as defaults, and that its shape needs."""
-    needless = {"assumed", "usual_command", "azimuth_evidence"} | (
+    needless = {"assumed", "usual_command", "azimuth_evidence", "size_evidence"} | (
         {"disks"} if answers.get("shape") != "disks" else set()
     )
     needless |= {"segment_lengths", "segment_azimuths"} if answers.get("segments", 1) == 1 else set()
@@ -276,6 +325,7 @@ def _head(o: RobotOutline) -> list[str]:
         "# Shapes one after the other from the clamp to the tip: cylinder, cone, tube, disks. In their place six lists",
         "# of areas and moments may stand, for sections of any form.",
         "[[body.section]]" + _mark(o, "shape", "length", "radius", "tip_radius", "disks"),
+        *([f"# ASSUMED sizes: {o.size_evidence}."] if o.size_evidence else []),
         *(f"{key} = {_toml(value)}" for key, value in section.items()),
         "",
     ]
@@ -427,6 +477,11 @@ def _mark(o: RobotOutline, *names: str) -> str:
     also = {"trunk_mass": "mass"}
     missing = [name for name in names if name in o.assumed or also.get(name) in o.assumed]
     return f"  # ASSUMED: {', '.join(missing)}" if missing else ""
+
+
+def _rounded(value: float) -> float:
+    """Three digits: more are not found."""
+    return float(f"{value:.3g}")
 
 
 def _toml(value: object) -> str:

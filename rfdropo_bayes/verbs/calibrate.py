@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, NoRolloutError
 from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.inference.method_options import options_table
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
@@ -180,7 +180,9 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
-    facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
+    predicted = {each.name for each in record.recordings}
+    scored = [run for run in test if run.name in predicted]
+    facts = gather_facts(model.title, seed, problem, result, runs, scored, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
@@ -250,19 +252,23 @@ def record_posterior(
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
-        found = predict_new(
-            problem.model,
-            tested,
-            values,
-            test_key,
-            chunk=problem.chunk,
-            fitted=fitted,
-            model_error=left,
-            groups=model.spec.groups,
-            slow={} if slow is None else dict.fromkeys(unseen, slow),
-        )
-        predictions += found.recordings
-        cautions = match_cautions(found)
+        try:
+            new = predict_new(
+                problem.model,
+                tested,
+                values,
+                test_key,
+                chunk=problem.chunk,
+                fitted=fitted,
+                model_error=left,
+                groups=model.spec.groups,
+                slow={} if slow is None else dict.fromkeys(unseen, slow),
+            )
+        except NoRolloutError as error:  # the fit is worth its page
+            cautions = [Caution(Code.NOT_PREDICTED, f"test recordings are not predicted: {error}", grave=True)]
+        else:
+            predictions += new.recordings
+            cautions = match_cautions(new)
     record = PosteriorRecord(
         scopes.infos,
         result.draws,

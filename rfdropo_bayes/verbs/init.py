@@ -198,15 +198,14 @@ def write_first_files(
     columns = None if placed.data is None else placed.data.columns
     if seen is None or columns is None or not usual:
         return robot, experiment
-    found = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed)
+    bends = outline.sets_bend is not None
+    found = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed, bends=bends)
     ordered, order = guess, None
     if found.arrangement is not None:
         turns = np.degrees(found.arrangement.turns)
         azimuths = tuple(round(float(a + t), 1) % 360.0 for a, t in zip(outline.first_azimuths(), turns, strict=True))
         evidence = found.evidence if any(found.arrangement.turns) else ""
         outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=evidence)
-        robot.write_text(robot_text(outline), encoding="utf-8")
-        made = Robot.load(robot)
         beside: dict[str, Any] = {
             key: [names[column] for column in found.arrangement.columns]
             for key in ("commands", "tensions", "motor_angles")
@@ -214,12 +213,18 @@ def write_first_files(
         }
         ordered = guess._replace(**beside)
         order = found.evidence if ordered.commands != guess.commands else None
+    explained = (
+        None if found.frame is None else f"a rod at rest explains {100 * found.frame.explained:.3g} % of the motion"
+    )
+    if found.frame is not None and (found.frame.scale, found.bend) != (1.0, 1.0):
+        outline = outline.resized(found.frame.scale, found.bend, f"{explained} with them")
+    robot.write_text(robot_text(outline), encoding="utf-8")
+    made = Robot.load(robot)
     if found.frame is not None:
         turned = found.frame.quarter.T
         if not np.allclose(turned, np.eye(3)) or np.linalg.norm(found.frame.shift) > FAR_ORIGIN * made.length:
-            seen_by = f"a rod at rest explains {100 * found.frame.explained:.0f} % of the motion in this frame"
             lines = moved_frame(columns, turned, -turned @ found.frame.shift)
-            frame = [f"{line}  # ASSUMED: {seen_by}" for line in lines]
+            frame = [f"{line}  # ASSUMED: {explained} in this frame" for line in lines]
             found = found._replace(frame=found.frame._replace(shift=np.zeros(3)))
     write(tables(guess=ordered, frame=frame, order=order), slow, first, found.frame)
     return robot, experiment

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Trajectory, shared_markers
+from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.integrators import STAGES
 from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
@@ -53,7 +54,7 @@ class NumericalError(NamedTuple):
     time_step: float | None  # a quarter of the step; None for a motion without steps
     elements: float | None  # twice the elements; None for a mesh of tetrahedra
     way: float  # of the markers about their mean
-    rest: RestError | None = None  # the other kind of motion; None for a body that has one only
+    rest: RestError | None = None  # the other kind of motion; None without another, or for rows without times
 
 
 def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> NumericalError:
@@ -76,7 +77,8 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
         finer = _distance(here, moved(time_step=simulator.time_step / FINER))
     if simulator.engine.is_rod:
         elements = _distance(here, moved(refine=MORE_ELEMENTS * table.refine))
-    if simulator.engine.carries_loads and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms):
+    timed = UNTIMED not in recording.notes  # rows without times have no speed
+    if timed and simulator.engine.carries_loads and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms):
         other = {"motion": "dynamic"} if simulator.at_rest else {"motion": QUASI_STATIC, **dict.fromkeys(MOVING)}
         dynamic = replace(spec, simulator=table.model_copy(update={"motion": "dynamic"}))
         moving = build_robot_simulator(dynamic) if simulator.at_rest else simulator

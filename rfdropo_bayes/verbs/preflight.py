@@ -237,7 +237,7 @@ def preflight(
 
 
 def _precise(model: Model) -> Model:
-    """The model in double precision: differences of a rounded motion are information that is not there."""
+    """The model in double precision: differences of rounded motions would count as information."""
     if isinstance(model.robot, BlackBox) or model.spec.simulator.precision == "float64":
         return model
     table = changed(model.spec.simulator, where="[simulator]", precision="float64")

@@ -1,12 +1,15 @@
-"""How a first recording lies to its robot at rest: order and azimuth of the cables, and the measuring frame.
+"""How a first recording lies to its robot at rest: order and azimuth of the cables, sizes, and the measuring frame.
 
 A rod at rest under the recorded commands is compared with the measured positions. Cables are arranged by
-`order_finder`; the frame is the rotation, the shift and, for a body of unknown length, the scale that bring the rod to
-the measured positions (Kabsch 1976, Umeyama 1991).
+`order_finder`, or with two of them exchanged; the frame is the rotation, the shift and, for a body of unknown length,
+the scale that bring the rod to the measured positions (Kabsch 1976, Umeyama 1991). If the size that turns a command
+into a bend was not given, several are tried: the form of the motion shows how far the body bends.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +19,20 @@ from scipy.spatial.transform import Rotation
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.verbs.arrangement import Arrangement
-from rfdropo_bayes.verbs.at_rest import RestingRobot, resting, rows_of, spread_rows
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.arrangement import Arrangement, as_written, sections_of
+from rfdropo_bayes.verbs.at_rest import Rows, resting, rows_of, spread_rows
 from rfdropo_bayes.verbs.command_lag import best_delay
 from rfdropo_bayes.verbs.motion_check import LEFT, SOLVED
 from rfdropo_bayes.verbs.motion_direction import AGREEING
-from rfdropo_bayes.verbs.order_finder import ROWS, arranged, find_arrangement
+from rfdropo_bayes.verbs.order_finder import ALIKE, ROWS, SEARCHED, arranged, find_arrangement
 from rfdropo_bayes.verbs.placement import right_angles
 
 EXPLAINED = 0.5
 """Least share of the squared motion that the rod explains in a frame that is taken from it."""
+BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
+"""Factors of the bend of a command that are tried if no answer sets it, a factor of 1.4 apart. An arm whose cables lie
+at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
 
 
 class Frame(NamedTuple):
@@ -58,11 +65,13 @@ class Registration(NamedTuple):
         frame: frame that brings the robot to the recording; None if the robot explains the motion in no frame.
         arrangement: order of the commands, if it explains much more than the written order.
         evidence: reason for the arrangement, in words.
+        bend: bend of the body that explains the recording, over that of the robot as written.
     """
 
     frame: Frame | None
     arrangement: Arrangement | None = None
     evidence: str = ""
+    bend: float = 1.0
 
 
 def frame_of(
@@ -85,13 +94,27 @@ def frame_of(
     return Frame(rotation, shift, scale, float(1.0 - np.sum((moved + shift - seen) ** 2) / motion))
 
 
-def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool) -> Registration:
+class _Sight(NamedTuple):
+    """An arrangement of a robot in the frame, and with the bend, that bring it nearest to a recording."""
+
+    arrangement: Arrangement
+    frame: Frame
+    bend: float
+
+    @property
+    def left(self) -> float:
+        """Share of the squared motion that is left."""
+        return 1.0 - self.frame.explained
+
+
+def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: bool) -> Registration:
     """Bring the robot of a model, at rest and at nominal values, to a recording.
 
     Args:
         spec: model of a robot that can be at rest.
         recording: recording as it is read at present.
         scaled: whether the body's length is not known, so that lengths may be scaled.
+        bends: whether it is not known how far a command bends the body.
     """
     nothing = Registration(None)
     try:
@@ -104,24 +127,66 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool) -> Registr
     robot = robot.showing(recording.marker_names)
     rows = rows_of([recording], recording.marker_names, best_delay([recording]))
     rows = rows.of(spread_rows(rows, ROWS))
+    fewer = rows.of(spread_rows(rows, SEARCHED))
+    tensions = own.actuators[0].unit != "m"
 
-    def seen_by(robot: RestingRobot, command: Float[np.ndarray, "row channel"]) -> Frame | None:
-        made = robot.markers(command)[0]
-        if np.isfinite(made).all(axis=(1, 2)).mean() < SOLVED:
+    def sight(arrangement: Arrangement, of: Rows) -> _Sight | None:
+        """The best frame and bend of an arrangement; None if the rod finds no equilibria."""
+        sent, turned = arrangement.commands(of.command), arranged(robot, arrangement)
+        factors = BENDS if bends else (1.0,)
+        if tensions:
+            modulus = own.nominal()["young_modulus"] / np.array(factors)
+            paths = turned.markers(sent, {"young_modulus": modulus} if bends else None)
+        else:
+            every = np.concatenate([factor * sent for factor in factors])
+            paths = turned.markers(every)[0].reshape(len(factors), len(sent), len(turned.shown), 3)
+        solved = [k for k, path in enumerate(paths) if np.isfinite(path).all(axis=(1, 2)).mean() >= SOLVED]
+        frames = {k: frame_of(paths[k], of.position, scaled=scaled) for k in solved}
+        if not frames:
             return None
-        return frame_of(made, rows.position, scaled=scaled)
+        least = 1.0 - max(frame.explained for frame in frames.values())
+        alike = [k for k, frame in frames.items() if 1.0 - frame.explained <= ALIKE * least]
+        best = min(alike, key=lambda k: abs(np.log(factors[k])))  # small bends are all of one form
+        return _Sight(arrangement, frames[best], float(factors[best]))
 
-    written = seen_by(robot, rows.command)
+    start = as_written(len(own.channel_names), sections_of(own).number)
+    written = sight(start, rows)
     if written is None:
         return nothing
+    chosen, evidence = written, ""
     found = find_arrangement(robot, rows)
     positive = all(sign > 0 for sign in found.arrangement.signs)
     if found.agreement >= AGREEING and found.left <= LEFT and positive and not found.rivals and not found.mirrored:
-        better = seen_by(arranged(robot, found.arrangement), found.arrangement.commands(rows.command))
-        if better is not None and 1.0 - better.explained <= LEFT * (1.0 - written.explained):
+        better = sight(found.arrangement, rows)
+        if better is not None and better.left <= LEFT * written.left:
+            chosen = better
             evidence = (
                 f"the motion agrees to {found.agreement:.2f} with a rod at rest, and to {found.written.straight:.2f} "
                 "without"
             )
-            return Registration(better if better.explained >= EXPLAINED else None, found.arrangement, evidence)
-    return Registration(written if written.explained >= EXPLAINED else None)
+    tried = [each for one in _exchanged(chosen.arrangement, own) if (each := sight(one, fewer)) is not None]
+    best = min(tried, key=lambda each: each.left, default=None)
+    better = None if best is None else sight(best.arrangement, rows)
+    if better is not None and better.left <= LEFT * chosen.left:
+        evidence = (
+            f"a rod at rest explains {100 * better.frame.explained:.3g} % of the motion, and "
+            f"{100 * chosen.frame.explained:.3g} % without"
+        )
+        chosen = better
+    frame = chosen.frame if chosen.frame.explained >= EXPLAINED else None
+    arrangement = None if chosen.arrangement == start else chosen.arrangement
+    return Registration(frame, arrangement, evidence, 1.0 if frame is None else chosen.bend)
+
+
+def _exchanged(arrangement: Arrangement, robot: Robot) -> Iterator[Arrangement]:
+    """Two channels exchanged, and the channels of every section in the other direction about the axis."""
+    channels = range(len(arrangement.columns))
+    for i, j in combinations(channels, 2):
+        yield arrangement.exchanged(i, j)
+    section = sections_of(robot).of_channel
+    columns = list(arrangement.columns)
+    for number in set(section):
+        members = [k for k in channels if section[k] == number]
+        for k, other in zip(members, reversed(members), strict=True):
+            columns[k] = arrangement.columns[other]
+    yield arrangement._replace(columns=tuple(columns))

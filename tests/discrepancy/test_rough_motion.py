@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.discrepancy import held_out, pipeline
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.pipeline import audit
 from rfdropo_bayes.errors import NoLikelihoodError
 from rfdropo_bayes.report.audit_page import render_audit, shown
 
-from .toys import NOISE, Toy, problem
+from .toys import problem
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
@@ -27,19 +26,21 @@ def said(answer):
     return content
 
 
-class Rough(Toy):
-    """Motion whose slope promises, everywhere, what a jump takes back: markers are 100 to 300 deviations of the noise
-    away, however far the gain goes down its saw teeth."""
+@pytest.fixture
+def unfitted(monkeypatch):
+    """No optimisation of the base model converges."""
+    fits = pipeline.base_fits
 
-    def rollout(self, parameters, commands, steps=None):
-        observed = super().rollout(parameters, commands, steps)
-        jump = 0.5 + (1e5 * parameters["gain"]) % 1.0
-        return observed._replace(position=observed.position + 200.0 * NOISE * jump)
+    def stopped(*given):
+        for reached in fits(*given):
+            yield reached if reached.fit is None else replace(reached, fit=replace(reached.fit, promise=np.inf))
+
+    monkeypatch.setattr(pipeline, "base_fits", stopped)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("unfitted")
 def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
-    answer = audit(replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
+    answer = audit(problem(TRUTH, 1))
     assert answer.verdict == "no_verdict"
     content = said(answer)
     assert not content["base_fit_converged"]
@@ -49,15 +50,9 @@ def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
     assert "has not converged" in render_audit(shown(answer), content, "rough", "")
 
 
-def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it(monkeypatch):
+@pytest.mark.usefixtures("unfitted")
+def test_a_cause_is_named_though_the_base_model_cannot_be_fitted_without_it():
     """What a base model lacks may drive it to where motion is rough: a cause counts if the model with it is fitted."""
-    fits = pipeline.base_fits
-
-    def unfitted(*given):
-        for reached in fits(*given):
-            yield reached if reached.fit is None else replace(reached, fit=replace(reached.fit, promise=np.inf))
-
-    monkeypatch.setattr(pipeline, "base_fits", unfitted)
     answer = audit(problem({**TRUTH, "play": 1.0}, 1))
     assert (answer.base.converged, answer.converged) == (False, True)
     content = said(answer)

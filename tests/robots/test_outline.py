@@ -137,3 +137,22 @@ def test_segments_of_disks_end_at_disks_of_their_own():
     given = {"name": "arm", "radius": 0.01, "markers": {"tip": 0.18}, "segments": 2, "cables": 3, "shape": "disks"}
     with pytest.raises(InputError, match="two segments end at one disk"):
         Robot.outline(**given, length=0.2, segment_lengths=(0.199, 0.001))
+
+
+@pytest.mark.parametrize(("unit", "assumed"), [("rad", "spool_radius"), ("m", "cable_radius"), ("N", "young_modulus")])
+def test_a_robot_of_another_size_bends_by_the_given_factor(unit, assumed):
+    """Bend of a command: pull over the cables' distance, or tension times distance and length over the stiffness."""
+    unknown = frozenset({"length", "radius", "markers", assumed})
+    small = RobotOutline("arm", 0.2, 0.012, {"tip": 0.2}, command_unit=unit, assumed=unknown)
+    large = small.resized(1.5, 2.0, "measured")
+
+    def bend(o: RobotOutline) -> float:
+        if unit == "N":
+            return o.arm * o.length / (o.young_modulus * o.radius**4)
+        return (o.spool_radius if unit == "rad" else 1.0) / o.arm
+
+    assert small.sets_bend == assumed
+    assert bend(large) == pytest.approx(2.0 * bend(small), rel=0.01)  # sizes have three digits
+    assert (large.length, large.markers["tip"]) == pytest.approx((0.3, 0.3))
+    assert "measured" in robot_text(large)
+    assert RobotOutline("arm", 0.2, 0.012, {"tip": 0.2}).sets_bend is None

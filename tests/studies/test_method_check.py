@@ -9,16 +9,10 @@ import jax
 import numpy as np
 import pytest
 
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from studies.method_check import run_check
 
 EXPERIMENT = Path(__file__).resolve().parents[2] / "benchmarks" / "sbc.toml"
-
-
-def test_an_unknown_check_is_named(tmp_path):
-    with pytest.raises(InputError, match="unknown check"):
-        run_check(Model.read(EXPERIMENT), tmp_path, "sbx")
 
 
 @pytest.mark.slow

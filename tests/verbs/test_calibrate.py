@@ -25,7 +25,7 @@ from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.calibrate import calibrate, earlier_draws, implausible_fit
 from tests.undrawn import without_panels
-from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
+from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP, lag
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEMO = REPOSITORY / "experiments" / "demo.toml"
@@ -68,6 +68,41 @@ def test_a_black_box_is_calibrated_and_its_run_is_read_again(tmp_path, monkeypat
     assert "two" in (tmp_path / "run" / "report.html").read_text()
     back = rb.load(tmp_path / "run", model=model)
     np.testing.assert_array_equal(back.record.flat("gain"), found.record.flat("gain"))
+
+
+def test_commands_that_no_draw_survives_leave_the_fit_its_page(tmp_path, monkeypatch):
+    """The simulator fails on the test recording alone: nothing of the fit is lost, and the page begins with it."""
+    monkeypatch.setattr(page, "embed", without_panels)
+
+    def fragile(parameters, command):
+        path = lag(parameters, command)
+        return np.where(np.abs(command).max() > 0.05, np.nan, path)
+
+    box = rb.BlackBox(
+        fragile,
+        parameters={name: {"low": 0.01 if name == "time_constant" else -1.0, "high": 3.0} for name in PRIORS},
+        markers=["tip"],
+        channels=["pull"],
+        time_step=STEP,
+        batched=True,
+        name="fragile",
+    )
+    walk = {"duration": 1.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
+    model = rb.Model(BOX, noise="white", priors=PRIORS)
+    truth = {"gain": 1.4, "time_constant": 0.25, "zero": 0.0}
+    noise = {"standard_deviation": SIGMA}
+    (run,) = rb.simulate(model, walk | {"recordings": ["one"]}, parameters=truth, noise=noise, seed=1)
+    wide = walk | {"recordings": ["two"], "low": -0.3, "high": 0.3, "step": 0.1}
+    (far,) = rb.simulate(model, wide, parameters=truth, noise=noise, seed=1)
+    own = rb.Model(box, noise="white", priors=PRIORS)
+    quick = rb.Laplace(draws=200, starts=2, screen=16)
+    found = rb.calibrate(own, [run], quick, test=[far], seed=0, show=False, out=tmp_path / "run")
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    (caution,) = [each for each in summary["cautions"] if each["code"] == Code.NOT_PREDICTED]
+    assert caution["grave"]
+    assert "two: no draw of the posterior" in caution["sentence"]
+    assert found.summary.loc["gain"]["mean"] == pytest.approx(1.4, rel=0.1)
+    assert "one" in (tmp_path / "run" / "report.html").read_text()
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from rfdropo_bayes.verbs.budget import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS
 from rfdropo_bayes.verbs.calibrate import _budgeted
 from rfdropo_bayes.verbs.installation import (
     ORIGIN,
+    ROWS_AT_REST,
     ZERO,
     installed_mechanisms,
     installed_priors,
@@ -85,14 +86,28 @@ def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
 
 
 def test_of_many_rows_at_rest_a_fit_takes_some():
-    many = run("rad", 1.0, rows=1200)
+    rows = 12 * ROWS_AT_REST
+    many, last = run("rad", 1.0, rows=rows), rows - 1
     parts = partial(parts_of, many)
-    assert parts(1, rests=False, timed=True) == [{"rows": [0, 799]}, {"rows": [800, 1199]}]
-    assert parts(1, rests=True, timed=True) == [{"rows": [0, 799], "every": 2}, {"rows": [800, 1199]}]
-    between = [{"rows": [0, 1199], "every": 3}, {"rows": [1, 1199], "every": 3}]
-    assert parts(1, rests=True, timed=False) == between
-    assert parts(3, rests=True, timed=True) == [{"every": 6}, {"every": 6}, {}]
+    assert parts(1, rests=False, timed=True) == [
+        {"rows": [0, 8 * ROWS_AT_REST - 1]},
+        {"rows": [8 * ROWS_AT_REST, last]},
+    ]
+    assert parts(1, rests=True, timed=True)[0] == {"rows": [0, 8 * ROWS_AT_REST - 1], "every": 8}
+    assert parts(1, rests=True, timed=False) == [{"rows": [first, last], "every": 12} for first in (0, 6)]
+    assert parts(3, rests=True, timed=True) == [{"every": 24}, {"every": 24}, {}]
     assert parts(3, rests=False, timed=True) == []
+
+
+def test_cables_of_an_arm_with_sections_stretch_and_are_turned():
+    """Sections are put together by hand, and their cables pull against each other."""
+    several = partial(Robot.outline, name="arm", length=0.2, radius=0.02, markers={"tip": 0.2}, segments=2)
+    robot = several(command_unit="m")
+    assert {"cable_compliance", "guide_azimuth"} <= set(installed_mechanisms(robot))
+    wide, narrow = (priors_of(installed_priors(robot, None, None, known)) for known in (["segment_azimuths"], []))
+    assert wide["guide_azimuth_error"] == 5 * narrow["guide_azimuth_error"]
+    forces = several(command_unit="N")
+    assert not {"cable_compliance", "guide_azimuth"} & {*installed_mechanisms(forces), *installed_mechanisms(arm())}
 
 
 def test_a_budget_in_minutes_follows_the_time_of_a_rollout():

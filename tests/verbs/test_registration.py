@@ -6,7 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rfdropo_bayes.verbs.registration import frame_of
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.model.model_spec import ModelSpec
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.at_rest import resting
+from rfdropo_bayes.verbs.registration import frame_of, register
 
 
 @settings(max_examples=25, deadline=None)
@@ -40,3 +44,46 @@ def test_markers_that_rest_are_no_motion_that_a_rod_explains():
     places = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
     made, seen = (places + 0.01 * rng.normal(size=(40, 2, 3)) for _ in range(2))
     assert frame_of(made, seen, scaled=False).explained < 0.3
+
+
+def arm(length: float, radius: float, spool: float) -> Robot:
+    """An arm without gravity whose sizes were not given."""
+    return Robot.outline(
+        name="arm",
+        length=length,
+        radius=radius,
+        cable_radius=0.75 * radius,
+        cables=3,
+        markers={"tip": length},
+        command_unit="rad",
+        spool_radius=spool,
+    ).with_changes(gravity_m_s2=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("size", "spool"), [(0.6, 0.021), (1.8, 0.013)])
+def test_sizes_order_and_frame_are_found_from_poses(size, spool):
+    """Of a robot that is smaller or larger than described, bends further, is turned, and whose cables run the other
+    way round: three pulls and the poses of a rod at rest under them are enough."""
+    true = resting(ModelSpec(arm(0.2 * size, 0.012 * size, spool * size)))
+    command = np.random.default_rng(0).uniform(0.0, 0.6, size=(60, 3))
+    turn, shift = Rotation.from_euler("xyz", (2.0, 0.4, -1.0)).as_matrix(), np.array([0.3, -0.1, 0.2])
+    made = true.markers(command[:, [0, 2, 1]])[0] @ turn.T + shift
+    recording = Trajectory.from_arrays(
+        time=np.arange(60.0),
+        time_unit="s",
+        position=made,
+        position_unit="m",
+        markers=("tip",),
+        channels=("c1", "c2", "c3"),
+        command=command,
+        command_unit="rad",
+        command_time=np.arange(60.0) - 0.5,
+        initial_command="zero",
+        name="poses",
+    )
+    found = register(ModelSpec(arm(0.2, 0.012, 0.01)), recording, scaled=True, bends=True)
+    assert found.arrangement is not None
+    assert found.arrangement.columns in ((0, 2, 1), (2, 1, 0), (1, 0, 2))
+    assert found.frame.explained > 0.995
+    assert found.frame.scale == pytest.approx(size, rel=0.15)
+    assert found.bend == pytest.approx(spool / 0.01, rel=0.25)  # the nearest of factors that lie 1.4 apart
