@@ -143,7 +143,7 @@ def tetrahedral_balance(
     tension: Float[Array, "rows cables"],
     time_step: Scalar,
 ) -> Balance:
-    """Forces and energies of a rollout of a tetrahedral body from rest; arguments as `layered_balance`."""
+    """Forces and energies of a rollout of a tetrahedral body from rest, given its positions and tensions."""
     body, mass = system.body, material.node_mass[:, None]
     velocities = _velocities(position, time_step)
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
