@@ -13,6 +13,10 @@ AXIS, LONGEST = 0.5, 0.05  # step along an axis of a posterior, in its deviation
 NOISE_STEP = 1e-2  # of a noise coordinate, along which residuals only change their scale
 DAMPINGS = 10.0 ** np.arange(-1.0, 5.0)  # over the damping before, tried in one batch
 ROUNDS = 3  # of differences along axes that get better
+FLAT_STEPS, FLAT, PROMISED = 3, 1e-2, 1.0
+"""An optimisation also ends after so many steps in a row that gain less [nat] and promise less than a nat: on a curved
+ridge, or where differences are as rough as the simulator, a quadratic model promises gains that no step keeps. On poses
+of an arm of unknown sizes 25 further steps promised .2 nats each, and gained .04 in all."""
 SAME = 0.05  # nats between two normal distributions that are taken for one
 
 
@@ -177,7 +181,8 @@ def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: flo
 def maximise(
     target: Climbable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
-    """Optimise from one start, noise first, until the predicted gain of a step is below ``tolerance`` nats.
+    """Optimise from one start, noise first, until the predicted gain of a step is below ``tolerance`` nats, or steps
+    are `FLAT`.
 
     A start without a likelihood has no derivatives, and is returned unchanged.
     """
@@ -188,6 +193,9 @@ def maximise(
     while not state.converged and len(trace) < max_steps:
         state, info = step(target, state, tolerance)
         trace.append({"log_density": state.log_density, "damping": state.damping, **info._asdict()})
+        last = trace[-FLAT_STEPS:]
+        if len(last) == FLAT_STEPS and all(each["gain"] < FLAT and each["promised"] < PROMISED for each in last):
+            state = state._replace(converged=True)
     return state, trace
 
 

@@ -10,7 +10,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes import mode_search as laplace
-from rfdropo_bayes.inference.modes.climb import Laplace, maximise
+from rfdropo_bayes.inference.modes.climb import FLAT_STEPS, Laplace, maximise
 from rfdropo_bayes.inference.modes.mixture import draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.modes.reweighting import FIRST
@@ -208,6 +208,25 @@ def test_a_climb_ends_where_nothing_is_delivered_of_what_is_promised():
     state, steps = maximise(target, np.zeros(1), max_steps=60, tolerance=1e-4)
     assert state.converged
     assert len(steps) == 3
+
+
+@pytest.mark.parametrize(("size", "ends"), [(0.1, True), (3.0, False)])
+def test_an_optimisation_ends_if_steps_keep_little_of_a_small_promise(size, ends):
+    """The quadratic model promises ``size`` nats for ever and each step gains a thousandth: beside a promise of several
+    nats a small gain proves nothing."""
+    gained = []
+
+    def density(points):
+        gained.append(1e-3)
+        return np.full(len(points), float(np.sum(gained)))
+
+    def steep(u):
+        return np.full(1, np.sqrt(2.0 * size)), np.array([[1.0]])
+
+    prior, noise = (lambda u: np.ones(1), lambda u: np.zeros((1, 1))), np.zeros(1, dtype=bool)
+    target = Target(density, density, *prior, steep, np.zeros_like, noise)
+    state, steps = maximise(target, np.zeros(1), max_steps=20, tolerance=1e-4)
+    assert (state.converged, len(steps)) == ((True, FLAT_STEPS) if ends else (False, 20))
 
 
 def test_optima_are_rivals_as_far_as_correlated_rows_let_one_tell():
