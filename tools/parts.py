@@ -39,14 +39,13 @@ def spent() -> float:
 
 
 def commit() -> str:
-    """The commit that is checked out, marked where files differ from it."""
-    return subprocess.run(
-        ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+changes"],
-        cwd=REPOSITORY,
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout.strip()
+    """The commit that is checked out, marked if files other than the ledger differ from it."""
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["git", *words], cwd=REPOSITORY, capture_output=True, text=True)
+
+    changed = git("diff", "--quiet", "HEAD", "--", ".", f":!{LEDGER.relative_to(REPOSITORY)}").returncode
+    return git("rev-parse", "--short=12", "HEAD").stdout.strip() + ("+changes" if changed else "")
 
 
 def run(command: list[str]) -> tuple[str, int]:
@@ -77,7 +76,7 @@ def main() -> None:
     """Run the parts that are named; exit with status 1 if one fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="+", choices=PARTS, metavar="PART", help=", ".join(PARTS))
-    failed, at = [], commit()  # before the ledger itself differs from the commit
+    failed, at = [], commit()
     for part in parser.parse_args().parts:
         before = spent()
         output, status = run(["make", part])
