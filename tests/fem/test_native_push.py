@@ -174,5 +174,5 @@ def test_what_does_not_fit_is_named():
     material, displacement, state, values = case()
     with pytest.raises(InputError, match="state has shape"):
         engine().rollout(material, displacement, cube=(state[:, :7], values))
-    with pytest.raises(InputError, match="a scene without a cube"):
+    with pytest.raises(InputError, match="a scene and a cube must be given together"):
         engine().rollout(material, displacement)

@@ -166,7 +166,7 @@ def test_a_port_is_spoken_of_as_a_cable_only_where_commands_are_metres_of_cable(
     assert [ports.named(port.words) for port in drives] == [ports.named(port.name) for port in drives] == drives
     term = {"coefficient": "c", "feature": "constant", "scale": 1.0}
     law = make_law(LawChoice("cable b", (term,)), ports, ["a", "b"], unit)
-    assert f"acts at {kind} b" in law.cause
+    assert f"an effect at {kind} b" in law.cause
     assert f"of the law at {kind} b" in law.parameters[0].description
 
 
