@@ -135,10 +135,10 @@ def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Arr
 
 
 def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
-    """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`. A
-    matrix without a solution
-    is tried again without the forces that turn, which near a loss of stability leave it indefinite; they are back after
-    a whole increment. The increments to come are no more than a geometric series that goes on as the last two did.
+    """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`.
+    A matrix without a solution is tried again without the forces that turn, which near a loss of stability leave it
+    indefinite; they are back after a whole increment. The increments to come are no more than a geometric series that
+    goes on as the last two did.
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)

@@ -6,7 +6,7 @@ A pushed cube starts at its measured pose in a new recording.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -66,6 +66,18 @@ class NewPredictions(NamedTuple):
     unmatched: int
     far: dict[str, float]
     without: list[Caution]
+
+
+def predicted_after_fit(
+    predict: Callable[[], NewPredictions],
+) -> tuple[list[RecordingPrediction], list[Caution]]:
+    """Predictions of recordings that a finished fit has not seen, and cautions. If no draw can be simulated under their
+    commands, they are left out with a caution, so that the fit is not lost."""
+    try:
+        new = predict()
+    except NoRolloutError as error:
+        return [], [Caution(Code.NOT_PREDICTED, f"test recordings are not predicted: {error}", grave=True)]
+    return new.recordings, match_cautions(new)
 
 
 def match_cautions(new: NewPredictions) -> list[Caution]:

@@ -42,9 +42,9 @@ from rfdropo_bayes.prediction.predictive import (
     KNOWN_NOISE,
     NOISE,
     Batch,
-    match_cautions,
     predict_fitted,
     predict_new,
+    predicted_after_fit,
     thin,
     with_repeats_marked,
     without_cautions,
@@ -252,18 +252,20 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
     slow = _error_beyond(fit.record, predictions[0])
     if asked.tested:
         names = [run.name for run in asked.tested]
-        new = predict_new(
-            problem.model,
-            asked.tested,
-            found.values,
-            rest_key,
-            chunk=simulator.lanes,
-            fitted=[head.name],
-            model_error=left,
-            groups={day: [head.name, *names]},
-            slow=None if slow is None else dict.fromkeys(names, slow),
+        new, more = predicted_after_fit(
+            lambda: predict_new(
+                problem.model,
+                asked.tested,
+                found.values,
+                rest_key,
+                chunk=simulator.lanes,
+                fitted=[head.name],
+                model_error=left,
+                groups={day: [head.name, *names]},
+                slow=None if slow is None else dict.fromkeys(names, slow),
+            )
         )
-        predictions, cautions = predictions + new.recordings, cautions + match_cautions(new)
+        predictions, cautions = predictions + new, cautions + more
     return Adapted(found, body, problem, predictions, cautions, float(np.sum(evaluations)), slow)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
-from rfdropo_bayes.errors import InputError, NoRolloutError
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.inference.method_options import options_table
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
@@ -43,9 +43,9 @@ from rfdropo_bayes.prediction.predictive import (
     FITTED,
     KNOWN_NOISE,
     NOISE,
-    match_cautions,
     predict_fitted,
     predict_new,
+    predicted_after_fit,
     thin,
     with_repeats_marked,
 )
@@ -180,9 +180,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
-    predicted = {each.name for each in record.recordings}
-    scored = [run for run in test if run.name in predicted]
-    facts = gather_facts(model.title, seed, problem, result, runs, scored, record, unmatched)
+    facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
@@ -252,8 +250,8 @@ def record_posterior(
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
-        try:
-            new = predict_new(
+        new, cautions = predicted_after_fit(
+            lambda: predict_new(
                 problem.model,
                 tested,
                 values,
@@ -264,11 +262,8 @@ def record_posterior(
                 groups=model.spec.groups,
                 slow={} if slow is None else dict.fromkeys(unseen, slow),
             )
-        except NoRolloutError as error:  # the fit is worth its page
-            cautions = [Caution(Code.NOT_PREDICTED, f"test recordings are not predicted: {error}", grave=True)]
-        else:
-            predictions += new.recordings
-            cautions = match_cautions(new)
+        )
+        predictions += new
     record = PosteriorRecord(
         scopes.infos,
         result.draws,
@@ -368,18 +363,21 @@ def gather_facts(
     unmatched: Sequence[Caution] = (),
     baselines: Mapping[str, BaselineErrors] | None = None,
 ) -> RunFacts:
-    """Contents of the report beside the posterior; ``baselines`` are those of `baseline_errors` by default."""
+    """Contents of the report beside the posterior; ``baselines`` are those of `baseline_errors` by default. Tested
+    recordings without predictions are left out."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
+    names = {prediction.name for prediction in unseen}
+    scored = [run for run in tested if run.name in names]
     description = problem.model.simulator.description
     simulator = problem.model.simulator
     robot = simulator.robot if isinstance(simulator, RobotSimulator) else None
     added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
-    floor = noise_floor([*fitted, *tested])
+    floor = noise_floor([*fitted, *scored])
     slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
     strange = recorded_doubts(record)
     if robot is not None:
-        strange += robot.unstated(run.name for run in (*fitted, *tested))
+        strange += robot.unstated(run.name for run in (*fitted, *scored))
         strange += implausible_fit(robot, problem.model.scopes.fixed, record)
     return RunFacts(
         title=title,
@@ -397,7 +395,7 @@ def gather_facts(
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),
-            *(RecordingFacts.of_trajectory(t, "test") for t in tested),
+            *(RecordingFacts.of_trajectory(t, "test") for t in scored),
         ],
         model={
             "noise": problem.model.noise,
@@ -406,12 +404,12 @@ def gather_facts(
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
-        baselines=baselines or baseline_errors(fitted, tested, markers=problem.model.simulator.marker_names),
-        fitted_commands=with_fitted_commands(fitted, tested),
+        baselines=baselines or baseline_errors(fitted, scored, markers=problem.model.simulator.marker_names),
+        fitted_commands=with_fitted_commands(fitted, scored),
         noise_floor=floor,
         phi=result.phi,
         optimum=result.optimum,
-        objects=score_objects(unseen, [*fitted, *tested]),
+        objects=score_objects(unseen, [*fitted, *scored]),
         versions=software_versions(),
         unseen_days={} if slow is None else {**slow.as_dict(), "sentence": left_out_sentence(slow)},
         details=result.details,

@@ -14,6 +14,7 @@ import numpy as np
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.arrangement import sections_of
 from rfdropo_bayes.verbs.registration import Frame
 
 ZERO = 0.25
@@ -47,13 +48,13 @@ def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[st
     against each other and whose sections are turned by hand, the stretch and the azimuths of its cables."""
     gain = ["command_gain"] if robot.command_unit == "m" else []
     scale = ["camera_scale"] if "length" in assumed else []
-    sections = ["cable_compliance", "guide_azimuth"] if _sections(robot) > 1 else []
+    sections = ["cable_compliance", "guide_azimuth"] if _pulled_by_section(robot) else []
     return ["axial_stiffness", "camera_rotation", *gain, *scale, *sections]
 
 
-def _sections(robot: Robot) -> int:
-    """Number of sections with cables that hold lengths."""
-    return len({round(cable.guide_z_m[-1], 6) for cable in robot.cables if cable.unit == "m"})
+def _pulled_by_section(robot: Robot) -> bool:
+    """Whether cables of imposed lengths end at several heights."""
+    return robot.actuators[0].unit == "m" and sections_of(robot).number > 1
 
 
 def installed_priors(
@@ -88,7 +89,7 @@ def installed_priors(
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
     if "length" in assumed:
         normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1")
-    if _sections(robot) > 1:
+    if _pulled_by_section(robot):
         lines.append("cable_compliance = {}  # stretch of a cable over its tension")
         wide, words = (TURN, "which was not given") if "segment_azimuths" in assumed else (TILT, "over the drawing's")
         normal("guide_azimuth_error", wide, f"azimuth of the cables of a channel, {words}")
