@@ -77,7 +77,7 @@ LEAST_POSTERIOR = 200
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves
-CLIMBING = ("laplace", "bridge", "smc")  # smc if it starts at the optima
+OPTIMISING = ("laplace", "bridge", "smc")  # smc if it starts at the optima
 
 
 def calibrate(
@@ -195,11 +195,11 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner |
     """
     if fit is None:
         return None
-    if method not in CLIMBING:
+    if method not in OPTIMISING:
         raise InputError(
             f"method {method!r} does not optimise, so it needs no start",
             where="--from",
-            remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
+            remedy=f"leave it out, or use one of {', '.join(OPTIMISING)}",
         )
     if isinstance(fit, Calibration):
         record, content = fit.record, fit.content

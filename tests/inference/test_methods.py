@@ -27,7 +27,7 @@ OTHERS = ("nuts", "nested")
         ("smc", {"variance_floor": 1e-5}, "unknown option 'variance_floor'"),
         ("smc", {"metod": "laplace"}, "did you mean 'method'"),
         ("rfdropo", {"rolouts": 100}, "did you mean 'rollouts'"),
-        ("bridge", {"climb": {"strats": 3}}, "did you mean 'starts'"),
+        ("bridge", {"optimisation": {"strats": 3}}, "did you mean 'starts'"),
         ("smc", {"particles": "many"}, "'many' is not of type int"),
         ("smc", {"particles": True}, "True is not of type int"),
         ("rfdropo", {"search": {"frequency": [1.0]}}, "is not a range"),
@@ -44,7 +44,7 @@ def test_options_come_as_toml_has_them():
     assert config.rollouts == 20000.0
     assert config.parameters == ("a",)
     assert config.search == {"a": (1.0, 2.0)}
-    assert methods.make_config("bridge", {"climb": {"starts": 3}}).climb.starts == 3
+    assert methods.make_config("bridge", {"optimisation": {"starts": 3}}).optimisation.starts == 3
     assert methods.make_config("smc", {"rollouts": None}).rollouts is None
 
 
@@ -57,10 +57,10 @@ def test_options_of_every_method_are_written_as_toml_and_read_again(method):
 
 
 def test_what_nested_options_say_stays():
-    config = methods.make_config("bridge", {"climb": {"starts": 3}, "rollouts": 4000})
+    config = methods.make_config("bridge", {"optimisation": {"starts": 3}, "rollouts": 4000})
     table = options_table(config)
-    assert (table["climb"]["starts"], table["rollouts"]) == (3, 4000.0)
-    assert None not in [*table.values(), *table["climb"].values()]
+    assert (table["optimisation"]["starts"], table["rollouts"]) == (3, 4000.0)
+    assert None not in [*table.values(), *table["optimisation"].values()]
     ranges = methods.make_config("rfdropo", {"search": {"a": [1, 2]}})
     assert options_table(ranges)["search"] == {"a": [1.0, 2.0]}
 

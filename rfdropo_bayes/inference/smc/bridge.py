@@ -30,8 +30,8 @@ from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProble
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.inference.evaluations import evaluate_prior
 from rfdropo_bayes.inference.method_options import MethodOptions
-from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, mode_values
+from rfdropo_bayes.inference.modes.optimisation import SAME, Laplace, divergence
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import (
     Draws,
@@ -58,7 +58,7 @@ class BridgeConfig(MethodOptions, called="Bridge"):
     """Bridge: posterior and an evidence of small variance, by SMC from the optima to the posterior.
 
     Attributes:
-        climb: settings of the search for optima.
+        optimisation: settings of the search for optima.
         rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
         particles: number per replicate; None takes the largest number that the budget allows.
         replicates: independent repetitions.
@@ -66,7 +66,7 @@ class BridgeConfig(MethodOptions, called="Bridge"):
         draws: see `SmcConfig`.
     """
 
-    climb: LaplaceConfig = field(default_factory=LaplaceConfig)
+    optimisation: LaplaceConfig = field(default_factory=LaplaceConfig)
     rollouts: float | None = None
     particles: int | None = 500
     replicates: int = 4
@@ -135,31 +135,22 @@ class BridgedProblem(ProblemDefaults):
         return u, {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in names}
 
 
-def run(
-    problem: Problem,
-    config: BridgeConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: BridgeConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Find the optima, then sample from around them to the posterior."""
-    climb_key, sample_key = jax.random.split(key)
+    search_key, sample_key = jax.random.split(key)
     digest = run_digest(problem, "bridge", config, key)
     checkpoint = logbook.checkpoint("bridge_climbs", digest)
-    found = find_modes(problem, config.climb, climb_key, checkpoint, logbook.part(0.0, 0.5))
-    return sample_from_modes(problem, config, found, sample_key, logbook.part(0.5, 1.0))
+    optima = find_modes(problem, config.optimisation, search_key, checkpoint, logbook.part(0.0, 0.5))
+    return sample_from_modes(problem, config, optima, sample_key, logbook.part(0.5, 1.0))
 
 
 def sample_from_modes(
-    problem: Problem,
-    config: BridgeConfig,
-    found: Modes,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
+    problem: Problem, config: BridgeConfig, optima: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
 ) -> InferenceResult:
     """Sample from around optima that are known to the posterior; the result includes the cost of the optimisations."""
     moment_key, run_key = jax.random.split(key)
     view: Problem = problem
-    modes, ledger, sampling = found.modes, found.climbs.ledger, config.sampling
+    modes, ledger, sampling = optima.modes, optima.search.ledger, config.sampling
     if isinstance(problem, ResidualProblem):
         view = straight = StraightProblem(problem, moment_key)
         modes = [straight.mode(mode) for mode in modes]
@@ -171,9 +162,9 @@ def sample_from_modes(
     # coordinates and its share of rollouts are restated below for parameters and the total.
     kept = stage_cautions(sampled.trace, sampling.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
-    first = found.climbs.trace[0]["horizon"]
-    kept += unseen_modes(sampling.chains, sum(row["horizon"] == first for row in found.climbs.trace))
-    kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
+    first = optima.search.trace[0]["horizon"]
+    kept += unseen_modes(sampling.chains, sum(row["horizon"] == first for row in optima.search.trace))
+    kept += [caution for caution in optima.cautions if caution.code is Code.OPTIMISATION_UNFINISHED]
     return replace(
         sampled,
         method="bridge",
@@ -181,16 +172,16 @@ def sample_from_modes(
         prefix_log_evidence=None,
         block_scores=[],
         log_likelihood=None,
-        trace=[*found.climbs.trace, *sampled.trace],
+        trace=[*optima.search.trace, *sampled.trace],
         **spent.record(),
         cautions=[*kept, *prior_cautions(problem, draws), *exclusion_cautions(spent.excluded, spent.evaluations)],
-        seconds=found.climbs.seconds + sampled.seconds,
-        optimum=mode_values(problem, found.modes[0]),
+        seconds=optima.search.seconds + sampled.seconds,
+        optimum=mode_values(problem, optima.modes[0]),
         details=sampled.details
         | {
             "algorithm": "bridge",
-            "laplace_log_evidence": [mode.log_evidence for mode in found.modes],
-            "modes": len(found.modes),
+            "laplace_log_evidence": [mode.log_evidence for mode in optima.modes],
+            "modes": len(optima.modes),
         },
     )
 
@@ -222,8 +213,8 @@ class ModeMixture:
     def sample(self, key: PRNGKeyArray, n: int) -> Float[np.ndarray, "n d"]:
         """Draws in random order; components get their exact shares, up to one draw."""
         generator = host_generator(key)
-        spread = (np.arange(n) + generator.uniform()) / n
-        component = np.searchsorted(np.cumsum(self.share), spread)
+        quantile = (np.arange(n) + generator.uniform()) / n
+        component = np.searchsorted(np.cumsum(self.share), quantile)
         of_mode = np.minimum(component, len(self.share) - 1)
         z = generator.standard_normal((n, self.means.shape[1]))
         scale = generator.chisquare(self.degrees, n) / self.degrees
@@ -239,15 +230,15 @@ class ModeMixture:
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
         """Log density, normalised; minus infinity if coordinates are not finite."""
         u = np.asarray(u)
-        held = np.isfinite(u).all(axis=1)
-        u = np.where(held[:, None], u, 0.0)
+        finite = np.isfinite(u).all(axis=1)
+        u = np.where(finite[:, None], u, 0.0)
         parts = [
             np.log(share) + _student_t(u, mean, factor, self.degrees)
             for share, mean, factor in zip(self.share, self.means, self.factors, strict=True)
         ]
         if self.prior_share > 0.0:
             parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, u))
-        return np.where(held, logsumexp(np.stack(parts), axis=0), -np.inf)
+        return np.where(finite, logsumexp(np.stack(parts), axis=0), -np.inf)
 
 
 def _student_t(
@@ -267,11 +258,11 @@ def _student_t(
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
     """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
     mean, prior = prior_moments(problem, key)
-    found = []
+    components = []
     for mode in modes:
         wide = _with_prior_moments(mode, mean, prior)
-        found += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
-    return found
+        components += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
+    return components
 
 
 def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
