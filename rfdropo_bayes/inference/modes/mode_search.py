@@ -40,20 +40,10 @@ from rfdropo_bayes.inference.modes.climb import (
     normal_at,
 )
 from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
-from rfdropo_bayes.inference.modes.mixture import (
-    MIXTURES,
-    draw_mixture,
-    mixture_cautions,
-    mixture_weights,
-    rivals,
-)
+from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_cautions, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.reweighting import CANDIDATE_SHARE, Reweighted, reweighted, reweighting_cautions
 from rfdropo_bayes.inference.modes.scales import integrate_scales
-from rfdropo_bayes.inference.modes.targets import (
-    Target,
-    make_target,
-    prior_derivatives,
-)
+from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import Draws, InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc import sampler
@@ -321,12 +311,7 @@ def survey(
     # The sampler assumes rows of equal cost in a block, which overestimates short prefixes.
     whole = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts * problem.n_rows / horizons[-1]
     sampling = sampler.SmcConfig(
-        rollouts=whole,
-        particles=config.survey,
-        blocks=len(horizons),
-        spacing="linear",
-        max_moves=SURVEY_MOVES,
-        draws=1,
+        rollouts=whole, particles=config.survey, blocks=len(horizons), spacing="linear", max_moves=SURVEY_MOVES, draws=1
     )
     checkpoint = logbook.checkpoint("survey", run_digest(blocks, "survey", sampling, run_key))
     populations, state = _populations(blocks, sampling, run_key, checkpoint, logbook)
@@ -535,12 +520,7 @@ def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
     return all(distance > len(position) for distance in away)
 
 
-def run(
-    problem: Problem,
-    config: LaplaceConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Posterior modes and draws of the normal approximations around them, mapped back to physical units.
 
     A `Hierarchy` is climbed with its standard deviations held, which are then integrated out (`integrate_scales`).

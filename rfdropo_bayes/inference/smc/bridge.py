@@ -135,12 +135,7 @@ class BridgedProblem(ProblemDefaults):
         return u, {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in names}
 
 
-def run(
-    problem: Problem,
-    config: BridgeConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: BridgeConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Find the optima, then sample from around them to the posterior."""
     climb_key, sample_key = jax.random.split(key)
     digest = run_digest(problem, "bridge", config, key)
@@ -150,11 +145,7 @@ def run(
 
 
 def sample_from_modes(
-    problem: Problem,
-    config: BridgeConfig,
-    found: Modes,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
+    problem: Problem, config: BridgeConfig, found: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
 ) -> InferenceResult:
     """Sample from around optima that are known to the posterior; the result includes the cost of the optimisations."""
     moment_key, run_key = jax.random.split(key)

@@ -296,12 +296,7 @@ def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
     )
 
 
-def run(
-    problem: Problem,
-    config: SmcConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Sample a problem's posterior with independent replicates.
 
     Raises:

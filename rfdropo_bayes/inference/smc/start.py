@@ -61,12 +61,7 @@ MOST_STEPS = 12  # of the optimisation from the optimum of all rows to the optim
 MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
-def run(
-    problem: Problem,
-    config: SmcConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Sample a posterior, from the start that ``config.start`` names or that the budget allows.
 
     Raises:
@@ -159,12 +154,7 @@ def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
 
 
 def _from_optima(
-    problem: ResidualProblem,
-    config: SmcConfig,
-    found: Modes,
-    way: Way | None,
-    key: PRNGKeyArray,
-    logbook: Logbook,
+    problem: ResidualProblem, config: SmcConfig, found: Modes, way: Way | None, key: PRNGKeyArray, logbook: Logbook
 ) -> InferenceResult:
     sample_key, score_key = jax.random.split(key)
     left = _left(config, found.climbs.ledger)
