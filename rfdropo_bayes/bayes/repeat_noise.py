@@ -82,9 +82,7 @@ def mean_error(
 
 
 def deviations(
-    errors: Float[np.ndarray, "recording time column"],
-    valid: Bool[np.ndarray, "recording time column"],
-    groups: Groups,
+    errors: Float[np.ndarray, "recording time column"], valid: Bool[np.ndarray, "recording time column"], groups: Groups
 ) -> tuple[Float[np.ndarray, "repeat time column"], Bool[np.ndarray, "repeat time column"], float]:
     """Errors of repeats about their means, which of them count, and their degrees of freedom per value."""
     parts, counted, freedom, values = [], [], 0.0, 0

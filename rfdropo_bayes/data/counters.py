@@ -169,8 +169,7 @@ def find_restart(columns: Sequence[Column], motion: Motion) -> Restart | None:
         return None
     names = [column.name for column in columns]
     return Restart(
-        row + 1,
-        {names[k]: (float(values[row, k]), float(values[row + 1, k])) for k in np.flatnonzero(moved)},
+        row + 1, {names[k]: (float(values[row, k]), float(values[row + 1, k])) for k in np.flatnonzero(moved)}
     )
 
 

@@ -88,13 +88,10 @@ class CsvColumns(BaseModel):
         '"rosbag": "header", stamps if messages have them, or "log", the recorder\'s times',
     )
     time_unit: TimeUnit = Field(
-        default="s",
-        description='unit of the times; dates, durations, "rosbag" and "motive-csv" need no unit',
+        default="s", description='unit of the times; dates, durations, "rosbag" and "motive-csv" need no unit'
     )
     sample_time: float | None = Field(
-        default=None,
-        gt=0,
-        description="time between rows [s], if no column has times, or only times of arrival",
+        default=None, gt=0, description="time between rows [s], if no column has times, or only times of arrival"
     )
     commands: list[str] = Field(
         min_length=1,

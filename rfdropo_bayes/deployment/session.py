@@ -31,13 +31,7 @@ from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals,
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
 from rfdropo_bayes.deployment.loop import ControlLoop, Phase, Snapshot
-from rfdropo_bayes.deployment.policy import (
-    CommandSource,
-    OnnxPolicy,
-    RecordedCommands,
-    pulls_too_hard,
-    replay_rate,
-)
+from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands, pulls_too_hard, replay_rate
 from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
@@ -141,13 +135,7 @@ class _Session:
     """State of one `deploy` call; the stack closes everything that was opened."""
 
     def __init__(
-        self,
-        settings: Deployment,
-        mode: Mode,
-        robot: Robot,
-        out: Path,
-        simulated: bool,
-        stack: contextlib.ExitStack,
+        self, settings: Deployment, mode: Mode, robot: Robot, out: Path, simulated: bool, stack: contextlib.ExitStack
     ) -> None:
         self.settings, self.mode, self.robot, self.out = settings, mode, robot, out
         self.simulated, self._stack = simulated, stack
@@ -208,13 +196,7 @@ class _Session:
         motors = self._motors()
         guards = settings.safety.guards([motor.node for motor in motors])
         drives = drives_of(
-            self.network,
-            motors,
-            self.offsets,
-            identity.eds,
-            identity.answer_s,
-            identity.units,
-            identity.unguarded,
+            self.network, motors, self.offsets, identity.eds, identity.answer_s, identity.units, identity.unguarded
         )
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:

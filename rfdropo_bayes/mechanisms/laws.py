@@ -212,11 +212,7 @@ class BodyLaw(SignalLaw):
         return self._ports.push(self.port, w)
 
     def push(
-        self,
-        values: Values,
-        command: Float[Array, "row channel"],
-        path: Float[Array, "row 3"] | None,
-        time_step: float,
+        self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
     ) -> BodySignals:
         """See `PushingMechanism`."""
         w = _summed([t for t in self.terms if not t.feature.of_motion], values, command, time_step)
@@ -242,11 +238,7 @@ class SensingLaw(SignalLaw):
         return sensed(self.port, w, position, time)
 
     def sense_with_commands(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
-        meanwhile: Meanwhile,
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"], meanwhile: Meanwhile
     ) -> Float[Array, "time marker 3"]:
         """See `CommandedSensingMechanism`."""
         w = sample(self.signal(values, meanwhile.levels, meanwhile.time_step), meanwhile.commands)

@@ -239,10 +239,5 @@ def parts_seen(
     """Pieces of an observation that a layout may ask for, from the measurements now and one action ago."""
     seen, moved = marker[:, shown], (marker - before)[:, shown]
     lanes = len(goal)
-    parts = {
-        "markers": seen.reshape(lanes, -1),
-        "goal": goal,
-        "commands": commands,
-        "moved": moved.reshape(lanes, -1),
-    }
+    parts = {"markers": seen.reshape(lanes, -1), "goal": goal, "commands": commands, "moved": moved.reshape(lanes, -1)}
     return parts if pose is None else {**parts, "object": pose}

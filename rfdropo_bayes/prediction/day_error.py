@@ -76,11 +76,7 @@ class DayError(NamedTuple):
         return beyond * np.array(self.left)[index] / (whole * np.sqrt(3.0))
 
     def draw(
-        self,
-        key: PRNGKeyArray,
-        count: int,
-        time: Float[np.ndarray, " time"],
-        unit: Float[np.ndarray, "time marker"],
+        self, key: PRNGKeyArray, count: int, time: Float[np.ndarray, " time"], unit: Float[np.ndarray, "time marker"]
     ) -> Float[np.ndarray, "draw time marker 3"]:
         """Realisations [m]: each draw has one scale for all markers, and a constant and a slow part for each axis."""
         rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))

@@ -68,9 +68,7 @@ class NewPredictions(NamedTuple):
     without: list[Caution]
 
 
-def predicted_after_fit(
-    predict: Callable[[], NewPredictions],
-) -> tuple[list[RecordingPrediction], list[Caution]]:
+def predicted_after_fit(predict: Callable[[], NewPredictions]) -> tuple[list[RecordingPrediction], list[Caution]]:
     """Predictions of recordings that a finished fit has not seen, and cautions. If no draw can be simulated under their
     commands, they are left out with a caution, so that the fit is not lost."""
     try:

@@ -127,11 +127,7 @@ def _tolerance(recording: Trajectory) -> float:
 
 
 def baseline_errors(
-    fit: Sequence[Trajectory],
-    test: Sequence[Trajectory],
-    *,
-    markers: Sequence[str] | None = None,
-    trained_on: str = "",
+    fit: Sequence[Trajectory], test: Sequence[Trajectory], *, markers: Sequence[str] | None = None, trained_on: str = ""
 ) -> dict[str, BaselineErrors]:
     """Train every predictor on the fit recordings and score it on both roles, by the markers that all of them have.
 
@@ -191,12 +187,7 @@ def _describe(fir: FirRegression, trained_on: str) -> str:
 
 
 def scored(
-    name: str,
-    title: str,
-    description: str,
-    predict: Predictor,
-    fit: Sequence[Trajectory],
-    test: Sequence[Trajectory],
+    name: str, title: str, description: str, predict: Predictor, fit: Sequence[Trajectory], test: Sequence[Trajectory]
 ) -> BaselineErrors:
     """Errors of a predictor on the fitted and the test recordings, or the reason if it cannot predict."""
     figures: list[ErrorFigures | None] = []

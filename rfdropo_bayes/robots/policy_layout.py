@@ -193,10 +193,7 @@ class Earlier:
     def parts(self, rows: Any = slice(None)) -> dict[str, Float[np.ndarray, "row size"]]:
         """The two parts of an observation, of some robots."""
         commands, moved = self._commands[rows], self._moved[rows]
-        return {
-            EARLIER_COMMANDS: commands.reshape(len(commands), -1),
-            EARLIER_MOVED: moved.reshape(len(moved), -1),
-        }
+        return {EARLIER_COMMANDS: commands.reshape(len(commands), -1), EARLIER_MOVED: moved.reshape(len(moved), -1)}
 
 
 def _brief(value: Any) -> str:

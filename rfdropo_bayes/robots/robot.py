@@ -52,7 +52,7 @@ class CommandTiming(RobotTable):
     unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = Field(
         description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, "Pa" of '
         'pressure, or "-" of drives that are sent volts or a share of their supply; channels.gain has the newtons of '
-        "torques, and the newtons or pascals of such drives",
+        "torques, and the newtons or pascals of such drives"
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
@@ -88,7 +88,7 @@ class PushScene(RobotTable):
     contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
     parameters: dict[Name, Parameter] = Field(
         description="the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
-        "turn about the vertical [rad], zero if the edges are parallel to the axes",
+        "turn about the vertical [rad], zero if the edges are parallel to the axes"
     )
 
     @model_validator(mode="after")
@@ -116,7 +116,7 @@ class Robot(RobotTable):
         '"euler", the scheme of SOFA, has one solve and about ten times the error',
     )
     initial_state: Literal["rest", "equilibrium"] = Field(
-        description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',
+        description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command'
     )
     command: CommandTiming = Field(description="unit and timing of commands")
     channels: Channels = Field(description="map from commands to the drives of cables and chambers")

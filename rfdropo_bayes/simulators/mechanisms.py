@@ -113,11 +113,7 @@ class CommandedSensingMechanism(Mechanism, Protocol):
     """Acts on measurements, depending on the commands."""
 
     def sense_with_commands(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
-        meanwhile: Meanwhile,
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"], meanwhile: Meanwhile
     ) -> Float[Array, "time marker 3"]:
         """Return the measured marker positions [m], from the true positions, their times of observation [s], and the
         commands at the cables.
@@ -133,11 +129,7 @@ class PushingMechanism(Mechanism, Protocol):
         """Whether it depends on how the body moves."""
 
     def push(
-        self,
-        values: Values,
-        command: Float[Array, "row channel"],
-        path: Float[Array, "row 3"] | None,
-        time_step: float,
+        self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
     ) -> BodySignals:
         """Return the loads on the body; row 0 is before the first step.
 

@@ -520,10 +520,7 @@ def _checks(
     """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
-        p.name: {
-            "from_first_row": _fared(replace(p, mask=adapted[p.name].mask)),
-            "adapted": _fared(adapted[p.name]),
-        }
+        p.name: {"from_first_row": _fared(replace(p, mask=adapted[p.name].mask)), "adapted": _fared(adapted[p.name])}
         for p in before
         if p.name in adapted
     }

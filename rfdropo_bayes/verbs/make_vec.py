@@ -146,10 +146,7 @@ def steps_of(simulator: AnySimulator) -> str:
 
 
 def randomisation_of(
-    table: TrainingTable,
-    spec: ModelSpec,
-    simulator: AnySimulator,
-    fit: Calibration | Path | None = None,
+    table: TrainingTable, spec: ModelSpec, simulator: AnySimulator, fit: Calibration | Path | None = None
 ) -> Randomisation:
     """Sources of parameters: fixed values, randomised parameters, and parameters that differ between episodes.
 

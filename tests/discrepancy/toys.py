@@ -215,8 +215,7 @@ def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProbl
     gathered = gather_recordings(toy, trajectories)
     space = build_scopes(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     coordinates = COORDINATES.setdefault(
-        gathered.names,
-        Coordinates(space, len(BASE), tuple(s.name for s in toy.parameters)),
+        gathered.names, Coordinates(space, len(BASE), tuple(s.name for s in toy.parameters))
     )
     model = TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),))
     place = {name: i for i, name in enumerate(space.names)}

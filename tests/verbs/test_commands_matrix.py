@@ -127,8 +127,7 @@ def mesh(folder: Path, bar: Path) -> Bench:
 
 
 @pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("demo", "own", "mesh")],
+    scope="module", params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("demo", "own", "mesh")]
 )
 def bench(request, tmp_path_factory, bar_mesh) -> Bench:
     folder = tmp_path_factory.mktemp(request.param)
@@ -186,16 +185,7 @@ def test_report_draws_the_same_page_again(bench) -> None:
 @pytest.mark.slow
 def test_predict_says_where_new_commands_lead(bench, tmp_path) -> None:
     rfdropo(
-        *(
-            "predict",
-            bench.experiment,
-            "--from",
-            bench.run,
-            "--commands",
-            bench.unseen,
-            "--out",
-            tmp_path / "next",
-        ),
+        *("predict", bench.experiment, "--from", bench.run, "--commands", bench.unseen, "--out", tmp_path / "next"),
         overrides=bench.overrides,
     )
     assert list((tmp_path / "next").glob("*.csv"))

@@ -205,12 +205,7 @@ def choose_finalists(state: SearchState, plan: ScorePlan, centre: Float[np.ndarr
     return np.stack(chosen[: max(1, plan.finalists)] if plan.finalists > 1 else chosen[1:2])
 
 
-def run(
-    problem: Problem,
-    config: RfdropoConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: RfdropoConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Search phi and draw from the distribution found.
 
     Raises:

@@ -95,10 +95,7 @@ class SearchSpace(NamedTuple):
 
 
 def search_space(
-    problem: Problem,
-    names: tuple[str, ...],
-    ranges: Mapping[str, tuple[float, float]],
-    prior: Values,
+    problem: Problem, names: tuple[str, ...], ranges: Mapping[str, tuple[float, float]], prior: Values
 ) -> SearchSpace:
     """Search ranges: the given ranges, else the central 99 % of the prior, which lie inside the bounds, like the
     paper's.

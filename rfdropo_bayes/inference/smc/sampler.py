@@ -298,12 +298,7 @@ def _no_remainder(state: SmcState, horizon: int) -> NoLikelihoodError:
     )
 
 
-def run(
-    problem: Problem,
-    config: SmcConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Sample a problem's posterior with independent replicates.
 
     Raises:

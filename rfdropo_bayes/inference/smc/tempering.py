@@ -245,12 +245,7 @@ def _by_halves(
 
 
 def stage(
-    key: PRNGKeyArray,
-    population: Population,
-    stop: float,
-    evaluate: Evaluate,
-    tuning: Tuning,
-    moves: int,
+    key: PRNGKeyArray, population: Population, stop: float, evaluate: Evaluate, tuning: Tuning, moves: int
 ) -> tuple[Population, StageInfo]:
     """Reweight towards ``stop``; resample and move unless the end was reached with enough effective particles.
 
@@ -263,12 +258,7 @@ def stage(
 
 
 def refresh(
-    key: PRNGKeyArray,
-    population: Population,
-    info: StageInfo,
-    evaluate: Evaluate,
-    tuning: Tuning,
-    moves: int,
+    key: PRNGKeyArray, population: Population, info: StageInfo, evaluate: Evaluate, tuning: Tuning, moves: int
 ) -> tuple[Population, StageInfo]:
     """Resample to equal weights and move under the present target."""
     resample_key, move_key = jax.random.split(key)
