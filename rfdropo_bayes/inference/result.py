@@ -44,7 +44,7 @@ class InferenceResult:
         cautions: reasons to doubt the draws.
         seconds: time spent, earlier parts of a resumed run included.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None.
-        held: {name: value} of fixed parameters.
+        fixed: {name: value} of fixed parameters.
         optimum: posterior mode {name: value} if the method finds it; else None.
         details: further numbers of the method, plain values.
     """
@@ -62,7 +62,7 @@ class InferenceResult:
     cautions: list[Caution] = field(default_factory=list)
     seconds: float = 0.0
     phi: dict[str, dict[str, Any]] | None = None
-    held: dict[str, float] = field(default_factory=dict)
+    fixed: dict[str, float] = field(default_factory=dict)
     optimum: dict[str, float] | None = None
     details: dict[str, Any] = field(default_factory=dict)
 

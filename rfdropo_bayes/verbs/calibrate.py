@@ -28,7 +28,7 @@ from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
-    HELD,
+    FIXED,
     DrawsByOwner,
     PosteriorRecord,
     ProductOfPowers,
@@ -176,7 +176,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
         problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
-    problem = problem.holding(result.held)
+    problem = problem.holding(result.fixed)
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
@@ -276,7 +276,7 @@ def record_posterior(
             **attributes,
             NOISE: problem.model.noise,
             FITTED: fitted,
-            HELD: [{"parameter": p.info.as_dict(), "value": result.held[p.name]} for p in scopes.known],
+            FIXED: [{"parameter": p.info.as_dict(), "value": result.fixed[p.name]} for p in scopes.known],
             MODEL_ERROR: None if left is None else left._asdict(),
             DAY_ERROR: None if slow is None else slow.as_dict(),
             OPENINGS: openings_of(asked.runs),

@@ -80,7 +80,7 @@ def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[Recordi
     problem = model.problem(kept, days.start)
     fit_key, new_key = jax.random.split(key)
     result = run(problem, "laplace", OPTIMISATION, fit_key)
-    held = problem.holding(result.held)
+    held = problem.holding(result.fixed)
     return predict_new(
         held.model,
         left_out,

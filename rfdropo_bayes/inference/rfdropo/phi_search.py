@@ -235,7 +235,7 @@ def run(problem: Problem, config: RfdropoConfig, key: PRNGKeyArray, logbook: Log
         cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
-        held=dict(plan.fixed),
+        fixed=dict(plan.fixed),
         details=details,
     )
 
