@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.verbs.calibrate import calibrate as calibrate
     from rfdropo_bayes.verbs.check import check as check
     from rfdropo_bayes.verbs.design import design as design
-    from rfdropo_bayes.verbs.design_day import design_day as design_day
+    from rfdropo_bayes.verbs.design_session import design_session as design_session
     from rfdropo_bayes.verbs.evaluate import evaluate as evaluate
     from rfdropo_bayes.verbs.make_vec import make_vec as make_vec
     from rfdropo_bayes.verbs.predict import predict as predict
@@ -98,7 +98,7 @@ _HOMES = {
     "check": "verbs.check",
     "deploy": "deployment.session",
     "design": "verbs.design",
-    "design_day": "verbs.design_day",
+    "design_session": "verbs.design_session",
     "evaluate": "verbs.evaluate",
     "load": "results.load",
     "load_deployment": "deployment.settings",
@@ -149,7 +149,7 @@ __all__ = [
     "check",
     "deploy",
     "design",
-    "design_day",
+    "design_session",
     "evaluate",
     "load",
     "load_deployment",

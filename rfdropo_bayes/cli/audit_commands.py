@@ -91,12 +91,12 @@ def design(
     from rfdropo_bayes.results.calibrated import Calibration
     from rfdropo_bayes.results.designed import COMMANDS
     from rfdropo_bayes.verbs.design import design as propose
-    from rfdropo_bayes.verbs.design_day import design_day
+    from rfdropo_bayes.verbs.design_session import design_session
 
     model = Model.read(experiment, overrides)
     options: dict[str, Any] = {"out": folder, "overwrite": overwrite, "show": True}
     if adapt and fit is not None:
-        result = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
+        result = design_session(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
     else:
         result = propose(model, fit=fit, **options)
     commands = folder / COMMANDS

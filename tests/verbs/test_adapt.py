@@ -24,8 +24,8 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.report import page
 from rfdropo_bayes.verbs import adapt as adaptation
-from rfdropo_bayes.verbs import design_day as day_design
-from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
+from rfdropo_bayes.verbs import design_session as day_design
+from rfdropo_bayes.verbs.left_out_sessions import of_unseen_sessions, openings_of
 from tests.undrawn import without_panels
 from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
@@ -271,7 +271,7 @@ def test_a_day_that_the_model_cannot_fit_has_a_caution(known, zeros):
     run = recorded(["b"], zeros[1:2], 51)[0]
     drift = 10.0 * SIGMA * np.sqrt(3.0) * np.sin(40.0 * run.time)
     off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + xr.DataArray(drift, dims="time")))
-    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.DAY_UNMATCHED]
+    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.SESSION_UNMATCHED]
     times = float(said[0].sentence.removeprefix("the session is fitted ").partition(" ")[0])
     assert times == pytest.approx(np.sqrt(1.0 + 10.0**2 * 3.0 / 2.0), rel=0.25)
     assert not [c for c in rb.adapt(known, run, show=False).cautions if "times worse" in c.sentence]
@@ -328,8 +328,8 @@ def test_fitted_days_under_other_commands_are_unseen(zeros):
     repeat, new = (fitted[0].with_attributes(name=name) for name in ("day_0_b", "new"))
     other = recorded(["day_0_c"], zeros[:1], 77)[0]
     days = ["day_0", "day_1"]
-    assert of_unseen_days([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
-    assert of_unseen_days([repeat, other, new], DAYS, days, None) == ["new"]
+    assert of_unseen_sessions([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
+    assert of_unseen_sessions([repeat, other, new], DAYS, days, None) == ["new"]
 
 
 @pytest.mark.slow
@@ -375,17 +375,17 @@ def test_a_day_that_was_fitted_is_refused_before_a_folder_is_made(known, zeros, 
 def test_the_shortest_commands_that_determine_a_day(known, zeros):
     """One row of a marker that a zero moves says what there is to say; where it moves none, no commands do."""
     runs = recorded(["day_0_a"], zeros[:1], 0)
-    found = rb.design_day(known, runs, seconds=1.0)
+    found = rb.design_session(known, runs, seconds=1.0)
     assert found.content["determined"]
     assert found.content["seconds"] == 0.0
-    assert found.content["parameters_of_a_day"] == ["zero_deviation@another day"]
+    assert found.content["parameters_of_a_session"] == ["zero_deviation@another day"]
     assert found.content["tip_uncertain_before_mm"] == pytest.approx(1e3 * GAIN * SPREAD, rel=0.1)
     assert found.content["tip_uncertain_after_mm"] <= found.content["tip_error_of_the_model_mm"]
     assert list(found.commands.columns) == ["time_s", "pull_m"]
     assert "The first row of a recording is enough" in found.sentence
     assert found.content["group"] == "day_0"
     none = {**known.record.posterior, "zero_spread": np.full((1, 60), 1e-9)}
-    same = rb.design_day(replace(known, record=replace(known.record, posterior=none)), runs, seconds=1.0)
+    same = rb.design_session(replace(known, record=replace(known.record, posterior=none)), runs, seconds=1.0)
     assert same.content["tip_uncertain_before_mm"] < 1e-3
 
 
@@ -397,9 +397,9 @@ def test_proposals_are_as_long_as_asked_for(known, zeros):
     np.testing.assert_allclose(begun.time, STEP * np.arange(251))
     tried = day_design._followed_proposals(known.model, begun, runs[0], runs, np.random.default_rng(0))
     assert max(time[-1] for _, time, _ in tried) > 4.5
-    assert rb.design_day(known, runs, seconds=1.0).content["group"] == "day_1"
+    assert rb.design_session(known, runs, seconds=1.0).content["group"] == "day_1"
     with pytest.raises(rb.InputError, match="no given recording belongs to the group 'day_2'"):
-        rb.design_day(known, runs, group="day_2")
+        rb.design_session(known, runs, group="day_2")
 
 
 @pytest.fixture
@@ -452,9 +452,9 @@ def test_the_command_refuses_a_folder_without_a_posterior(tmp_path):
 
 @pytest.mark.slow
 def test_a_day_that_one_row_determines_needs_no_motion() -> None:
-    assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=0.0), 0.0, 0.002, 0.005).startswith(
-        "The first row"
-    )
-    assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=1.5), 1.5, 0.02, 0.005).startswith(
-        "Record the first 1.5 s"
-    )
+    assert day_design._sentence(
+        "chirp", day_design.SessionOutlook(left=0.001, seconds=0.0), 0.0, 0.002, 0.005
+    ).startswith("The first row")
+    assert day_design._sentence(
+        "chirp", day_design.SessionOutlook(left=0.001, seconds=1.5), 1.5, 0.02, 0.005
+    ).startswith("Record the first 1.5 s")
