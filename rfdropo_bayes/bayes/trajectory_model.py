@@ -223,8 +223,8 @@ class Programs:
             return jnp.stack([jnp.stack([jnp.asarray(row[name], float) for name in physical]) for row in rows])
 
         def features(seen: Seen) -> tuple[Array, Array]:
-            found = [c.features(c.expected(seen)) for c in model.compared]
-            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
+            columns = [c.features(c.expected(seen)) for c in model.compared]
+            return jnp.concatenate(columns, axis=-1), jnp.max(seen.observation.status)
 
         def of_seen(function: Callable, *axes: None) -> Callable:
             """A function of what is seen, compiled for batches of observations and of the values behind them."""
@@ -246,7 +246,7 @@ class Programs:
             # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
             steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
             above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
-            found = (above - below) / (2.0 * np.diag(steps)[:, None])
-            return 0.5 * (found + found.T)
+            matrix = (above - below) / (2.0 * np.diag(steps)[:, None])
+            return 0.5 * (matrix + matrix.T)
 
         self.prior_derivatives = (lambda u: gradient(u[None])[0]), hessian

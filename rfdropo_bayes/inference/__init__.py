@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.methods import METHODS as METHODS
     from rfdropo_bayes.inference.methods import make_config as make_config
     from rfdropo_bayes.inference.methods import method_named as method_named
-    from rfdropo_bayes.inference.modes.climb import climb_cost as climb_cost
-    from rfdropo_bayes.inference.modes.climb import maximise as maximise
-    from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
     from rfdropo_bayes.inference.modes.lasting import lasting_series as lasting_series
     from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig as LaplaceConfig
     from rfdropo_bayes.inference.modes.mode_search import find_modes as find_modes
+    from rfdropo_bayes.inference.modes.optimisation import maximise as maximise
+    from rfdropo_bayes.inference.modes.optimisation import normal_at as normal_at
+    from rfdropo_bayes.inference.modes.optimisation import optimisation_cost as optimisation_cost
     from rfdropo_bayes.inference.modes.targets import Target as Target
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
@@ -42,9 +42,9 @@ PUBLIC = {
     "METHODS": "methods",
     "make_config": "methods",
     "method_named": "methods",
-    "climb_cost": "modes.climb",
-    "maximise": "modes.climb",
-    "normal_at": "modes.climb",
+    "optimisation_cost": "modes.optimisation",
+    "maximise": "modes.optimisation",
+    "normal_at": "modes.optimisation",
     "lasting_series": "modes.lasting",
     "LaplaceConfig": "modes.mode_search",
     "find_modes": "modes.mode_search",

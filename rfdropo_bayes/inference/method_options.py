@@ -69,16 +69,16 @@ def _entry(value: Any) -> Any:
 def attributes_of(kind: type) -> dict[str, str]:
     """Text on each name in the section "Attributes" of a docstring; ``a, b: text`` describes both."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     names: list[str] = []
     for line in section.splitlines():
         entry = _ENTRY.match(line)
         if entry:
             names = entry[1].split(", ")
-            found |= dict.fromkeys(names, entry[2])
+            texts |= dict.fromkeys(names, entry[2])
         elif line.startswith(" " * 8):
-            found |= {name: f"{found[name]} {line.strip()}" for name in names}
-    return found
+            texts |= {name: f"{texts[name]} {line.strip()}" for name in names}
+    return texts
 
 
 def settings_text(value: Any) -> str:

@@ -112,7 +112,7 @@ class Progress:
             append_line(self.log, json.dumps({k: _plain(v) for k, v in line.items()}))
 
     @property
-    def seconds_left(self) -> float | None:
+    def remaining_seconds(self) -> float | None:
         """Time left at the pace since the first report [s]; None until enough work is done."""
         if self._first is None or self.share - self._first[1] < SMALLEST_SHARE:
             return None
@@ -124,8 +124,8 @@ class Progress:
         now = time.monotonic()
         if self._first is None:
             self._first = (now, self.share)
-        left = self.seconds_left
-        words = "" if left is None or self.share >= 1.0 else f"{clock(left)} left"
+        remaining = self.remaining_seconds
+        words = "" if remaining is None or self.share >= 1.0 else f"{clock(remaining)} left"
         self._bar.update(self._task, completed=self.share, left=words, words=self._words)
         if self._prints and (ends or now - self._printed >= SECONDS_BETWEEN_LINES):
             self._printed = now

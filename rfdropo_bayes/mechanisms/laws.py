@@ -112,11 +112,11 @@ class CableLaw(Law):
         numbers = [member.number for member in self._ports.members(self.port)]
         return [(k, [term._replace(feature=term.feature.of(k)) for term in self.terms]) for k in numbers]
 
-    def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
+    def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
         """See `ActuationMechanism`."""
-        reached = held
+        reached = constant
         for k, terms in self._cables:
-            parts = (values[term.spec.name] * term.feature.at_rest(held) for term in terms)
+            parts = (values[term.spec.name] * term.feature.at_rest(constant) for term in terms)
             reached = reached.at[k].add(sum(parts, jnp.zeros(())))
         return reached
 

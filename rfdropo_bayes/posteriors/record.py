@@ -27,7 +27,7 @@ from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, Scope
 
 AXES = ("x", "y", "z")
 DRAWS = "draws"  # attribute of a prediction: how many draws are its own
-HELD = "held_parameters"  # attribute of a posterior
+FIXED = "held_parameters"  # attribute of a posterior
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ class PosteriorRecord:
         return tuple(info for info in self.parameters if info.name not in names)
 
     @property
-    def held(self) -> list[tuple[ParameterInfo, float]]:
+    def fixed(self) -> list[tuple[ParameterInfo, float]]:
         """Parameters whose values the fit took for known, with these."""
-        return [(ParameterInfo.from_dict(each["parameter"]), each["value"]) for each in self.attrs.get(HELD, ())]
+        return [(ParameterInfo.from_dict(each["parameter"]), each["value"]) for each in self.attrs.get(FIXED, ())]
 
     def flat(self, name: str) -> Float[np.ndarray, " n"]:
         """Draws of one variable, chains joined."""

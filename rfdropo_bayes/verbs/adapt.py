@@ -435,7 +435,7 @@ def day_scopes(fit: Calibration, model: Model, recordings: Sequence[str], day: s
     """The body's parameters without the noise of the fit, and the parameters of a session, with or without draws."""
     noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
     pooled = pooling(model.spec, model.simulator.parameters, recordings)
-    found = fitted_scopes(fit).of_day(day, recordings, fit.record.attrs[FITTED], pooled)
+    found = fitted_scopes(fit).of_session(day, recordings, fit.record.attrs[FITTED], pooled)
     return replace(found, parameters=tuple(p for p in found.parameters if p.spec.name not in noise))
 
 

@@ -197,7 +197,7 @@ def fitted_scopes(fit: Calibration) -> Scopes:
     """Inferred and fixed parameters of a calibration."""
     model, record = model_of(fit), fit.record
     fixed = fixed_values(model.spec, model.simulator)
-    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.held)
+    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.fixed)
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:

@@ -29,7 +29,7 @@ OPTIONS = {
 }
 CASES = [
     *OPTIONS.items(),
-    ("laplace", {"starts": 4, "survey": 50, "rollouts": 2000.0, "draws": 50}),
+    ("laplace", {"starts": 4, "pilot_particles": 50, "rollouts": 2000.0, "draws": 50}),
     ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "linear"}),
 ]
 
@@ -208,9 +208,9 @@ def test_a_damaged_checkpoint_is_refused(damage, tmp_path):
         methods.run(decay(), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True)
 
 
-@pytest.mark.parametrize("part", ["survey", "smc_climbs"])
-def test_a_damaged_checkpoint_of_climbs_does_not_start_them_over(part, tmp_path):
-    """They fall back to the prior, but only where no draw to climb from has a likelihood."""
+@pytest.mark.parametrize("part", ["pilot_run", "smc_optimisations"])
+def test_a_damaged_checkpoint_of_optimisations_does_not_start_them_over(part, tmp_path):
+    """They fall back to the prior, but only if no draw to start from has a likelihood."""
     (tmp_path / f"{part}.npz").write_bytes(b"")
     options = {"rollouts": 6000.0, "particles": 60, "start": "optimum"}
     with pytest.raises(InputError, match="damaged"):

@@ -261,8 +261,9 @@ class Ratio(LinearGaussian):
 
 
 class Washboard(LinearGaussian):
-    """A valley with a ripple of 20 nats across it: climbs end on the nearest of thousands of crests, and the highest
-    holds the posterior. Each row has an equal share."""
+    """A valley with a ripple of 20 nats across it: optimisations end at the nearest of thousands of local maxima, and
+    the highest holds the posterior. Each row has an equal share.
+    """
 
     width, ripple = 0.25, 10.0
 

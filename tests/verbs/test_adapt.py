@@ -55,12 +55,12 @@ def fit(zeros):
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
     runs = recorded([f"day_{k}_a" for k in range(5)], zeros[:5], 0)
     unseen = recorded([f"new_{k}" for k in range(10)], zeros[5:], 10)
-    return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, screen=32), test=unseen, seed=0, show=False)
+    return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, prior_draws=32), test=unseen, seed=0, show=False)
 
 
 @pytest.mark.slow
 def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
-    """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
+    """Optimisations start where an earlier fit ended, fit the data that they were given, and say how far they are."""
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
     earlier = {"gain": {"": np.full(2, 1.1 * GAIN)}, "zero_deviation": {"day_1": np.full(2, 0.004)}}
     whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)

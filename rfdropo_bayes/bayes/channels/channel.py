@@ -242,17 +242,17 @@ def padded_readings(
     Raises:
         InputError: a recording without readings that needs them.
     """
-    found: list[tuple[np.ndarray, ...]] = []
+    parts: list[tuple[np.ndarray, ...]] = []
     for index, trajectory in enumerate(trajectories):
         own = read(trajectory)
         if own is not None:
-            found.append(tuple(np.pad(part, ((0, length - len(part)), (0, 0))) for part in own))
+            parts.append(tuple(np.pad(part, ((0, length - len(part)), (0, 0))) for part in own))
         elif needed is not None and index >= needed:
-            found.append(tuple(np.zeros_like(part) for part in found[0]))
+            parts.append(tuple(np.zeros_like(part) for part in parts[0]))
         else:
             remedy = f"leave [model] {key} = true out, or record them"
             raise InputError(f"has no {words}", where=trajectory.name, remedy=remedy)
-    measured, valid = zip(*found, strict=True)
+    measured, valid = zip(*parts, strict=True)
     return np.stack(measured), np.stack(valid)
 
 

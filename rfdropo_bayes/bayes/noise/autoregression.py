@@ -90,8 +90,8 @@ class Autoregression:
         """The same noise in recordings with the given seconds between rows."""
         if self.step is None or not self.order:
             return self
-        found = tuple(_pace(float(step) / self.step, np) for step in steps)
-        paces = None if set(found) <= {1.0} else found
+        every = tuple(_pace(float(step) / self.step, np) for step in steps)
+        paces = None if set(every) <= {1.0} else every
         return self if paces == self.paces else replace(self, paces=paces)
 
     def resampled(self, step: float) -> Autoregression:
@@ -108,9 +108,9 @@ class Autoregression:
     def as_dict(self) -> dict[str, Any]:
         """As plain values without recordings; `from_dict` is the inverse."""
         arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
-        found = {name: None if array is None else array.tolist() for name, array in arrays.items()}
+        values = {name: None if array is None else array.tolist() for name, array in arrays.items()}
         freedom = self.freedom if np.isfinite(self.freedom) else None
-        return {**found, "source": self.source, "freedom": freedom, "step": self.step}
+        return {**values, "source": self.source, "freedom": freedom, "step": self.step}
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> Autoregression:
@@ -175,11 +175,11 @@ class Autoregression:
         """Logarithms that normalise the density of `whiten`: zero if not valid; their sum is half the log determinant
         of the covariance. The effect of correlation is divided equally between a row's columns.
         """
-        found = np.log(self._prediction(valid)[1] * self.scale)
+        logarithm = np.log(self._prediction(valid)[1] * self.scale)
         if self.correlation is not None:
             shared = half_log_determinant(self.correlation, valid)
-            found = found + (shared / np.maximum(valid.sum(axis=-1), 1))[..., None]
-        return np.where(valid, found, 0.0)
+            logarithm = logarithm + (shared / np.maximum(valid.sum(axis=-1), 1))[..., None]
+        return np.where(valid, logarithm, 0.0)
 
     def innovations(
         self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
@@ -239,8 +239,8 @@ class Autoregression:
         memory = np.minimum(np.arange(rows), self.order)
 
         def advance(last: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-            share, spread, fresh = row
-            now = share @ last + spread * fresh
+            share, scale, fresh = row
+            now = share @ last + scale * fresh
             return jnp.concatenate([now[None], last[:-1]]), now
 
         before = jnp.zeros((coefficients.shape[1], len(self.scale)))
@@ -411,12 +411,12 @@ def mixed(
     patterns, which = _patterns(valid)
     if len(patterns) == 1 and patterns[0].all():
         return used @ _power(correlation, power)
-    found = numbers.zeros_like(used)
+    result = numbers.zeros_like(used)
     for index, pattern in enumerate(patterns):
         root = np.zeros_like(correlation)
         root[np.ix_(pattern, pattern)] = _power(correlation[np.ix_(pattern, pattern)], power)
-        found = numbers.where((which == index)[..., None], used @ root, found)
-    return found
+        result = numbers.where((which == index)[..., None], used @ root, result)
+    return result
 
 
 def half_log_determinant(

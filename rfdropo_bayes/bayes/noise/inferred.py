@@ -213,8 +213,8 @@ def _filtered(
         surprise = value - phi[:, None] * mean
         gain = (power - short_now) / variance
         updated = phi[:, None] * mean + gain[:, None] * surprise
-        left = power - white * gain
-        state = jnp.where(valid[:, None], updated, mean), jnp.where(valid, left, short)
+        remaining = power - white * gain
+        state = jnp.where(valid[:, None], updated, mean), jnp.where(valid, remaining, short)
         return state, (surprise / jnp.sqrt(variance)[:, None], jnp.sqrt(variance))
 
     nothing = jnp.zeros(residual.shape[1:]), jnp.zeros(residual.shape[1])
@@ -252,8 +252,8 @@ def _lasting(
     phi, scale = jnp.exp(-gap / tau), _innovation(sigma, gap, tau)
 
     def advance(last: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        coefficient, spread, innovation = row
-        now = coefficient * last + spread * innovation
+        coefficient, size, innovation = row
+        now = coefficient * last + size * innovation
         return now, now
 
     return jax.lax.scan(advance, jnp.zeros((markers, 3)), (phi, scale, white))[1]

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression, estimate_noise
 from rfdropo_bayes.bayes.problem import ResidualProblem
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.modes.targets import Target
 
 WIDER = 1.2  # by a fifth

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.bayes.problem import BatchedResiduals, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.climb import positive_part
+from rfdropo_bayes.inference.modes.optimisation import positive_part
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order 1
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
@@ -62,7 +62,7 @@ class Target(NamedTuple):
     bounds: tuple[Any, Any] = UNBOUNDED
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
-        """See `Climbable.along`."""
+        """See `Optimisable.along`."""
         differences = self.differences
         if differences is None:
             return None
@@ -77,7 +77,7 @@ class Target(NamedTuple):
         return self._replace(linearise=linearise)
 
     def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
-        """See `Climbable.quadratic`."""
+        """See `Optimisable.quadratic`."""
         residual, jacobian = self.linearise(u)
         jacobian = _known(jacobian)
         gradient = -jacobian.T @ residual
@@ -92,7 +92,7 @@ class Target(NamedTuple):
         return gradient + self.prior_gradient(u), curvature + positive_part(-self.prior_hessian(u))
 
     def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-        """See `Climbable.information`: Gauss-Newton, with second differences for noise parameters."""
+        """See `Optimisable.information`: Gauss-Newton, with second differences for noise parameters."""
         curvature = self.quadratic(u)[1] - positive_part(-self.prior_hessian(u))
         if self.noise.any():
             exact = -_noise_hessian(self.likelihood, u, self.noise)

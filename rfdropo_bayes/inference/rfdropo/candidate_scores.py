@@ -77,17 +77,17 @@ def simulate(
 
 
 def row_scores(
-    problem: RolloutProblem, plan: ScorePlan, found: CandidateRollouts, horizon: int
+    problem: RolloutProblem, plan: ScorePlan, rollouts: CandidateRollouts, horizon: int
 ) -> Float[np.ndarray, "c horizon"]:
     """Log likelihood (eq. 3) of each row under every candidate; minus infinity if half of its rollouts failed."""
     mask = np.asarray(problem.observed_mask)[:horizon]
     observed = np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale
-    c, m = found.alive.shape
+    c, m = rollouts.alive.shape
     rows = np.full((c, horizon), -np.inf)
     for index in range(c):
-        if found.alive[index].sum() >= max(2, m / 2):
-            features = found.features[index, :, :horizon]
-            rows[index] = step_log_likelihood(features, found.alive[index], observed, mask, plan.floor)
+        if rollouts.alive[index].sum() >= max(2, m / 2):
+            features = rollouts.features[index, :, :horizon]
+            rows[index] = step_log_likelihood(features, rollouts.alive[index], observed, mask, plan.floor)
     return rows
 
 

@@ -179,8 +179,8 @@ def step(
     m, d, horizon = config.rollouts_per_candidate, len(plan.space.names), plan.horizons[i]
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
     simulated = _simulated(horizon, problem.n_rows, config.levels)
-    found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
-    values = -row_scores(problem, plan, found, horizon).sum(axis=1)
+    rollouts = simulate(problem, plan, asked, uniform, simulated, state.ledger)
+    values = -row_scores(problem, plan, rollouts, horizon).sum(axis=1)
     facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
     return state._replace(
@@ -235,7 +235,7 @@ def run(problem: Problem, config: RfdropoConfig, key: PRNGKeyArray, logbook: Log
         cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
-        held=dict(plan.fixed),
+        fixed=dict(plan.fixed),
         details=details,
     )
 
@@ -285,8 +285,8 @@ def _choose(
     finalists = choose_finalists(state, plan, centre)
     m, n = config.rollouts_per_candidate, problem.n_rows
     uniform = uniforms(jax.random.fold_in(key, FINAL), m, len(plan.space.names), stratified=True)
-    found = simulate(problem, plan, finalists, uniform, n, state.ledger)
-    scores = -row_scores(problem, plan, found, n).sum(axis=1)
+    rollouts = simulate(problem, plan, finalists, uniform, n, state.ledger)
+    scores = -row_scores(problem, plan, rollouts, n).sum(axis=1)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     return finalists[int(np.argmin(scores))], details
@@ -375,11 +375,11 @@ class CrossEntropy:
         return np.minimum(folded, 2.0 * self.high - folded)
 
     def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
-        """Refit to the elite; the spread is taken about the OLD mean, so that it cannot collapse on the way."""
+        """Refit to the elite. Deviations are taken from the OLD mean, so that the width does not collapse early."""
         best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
-        spread = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
+        deviation = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
         self.mean = self.smoothing * best.mean(axis=0) + (1.0 - self.smoothing) * self.mean
-        self.sd = self.smoothing * spread + (1.0 - self.smoothing) * self.sd
+        self.sd = self.smoothing * deviation + (1.0 - self.smoothing) * self.sd
 
     @property
     def centre(self) -> Float[np.ndarray, " d"]:

@@ -29,8 +29,8 @@ from scipy.special import gammaln, logsumexp
 from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
 from rfdropo_bayes.inference.modes.mode_search import Modes, mode_values
+from rfdropo_bayes.inference.modes.optimisation import SAME, Laplace, divergence
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import (
     Draws,
@@ -100,36 +100,36 @@ class BridgedProblem(ProblemDefaults):
 
 
 def sample_from_modes(
-    problem: ResidualProblem, config: sampler.SmcConfig, found: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
+    problem: ResidualProblem, config: sampler.SmcConfig, optima: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
 ) -> InferenceResult:
     """Sample from around optima that are known to the posterior; the result includes the cost of the optimisations."""
     moment_key, run_key = jax.random.split(key)
     straight = StraightProblem(problem, moment_key)
-    modes = [straight.mode(mode) for mode in found.modes]
+    modes = [straight.mode(mode) for mode in optima.modes]
     bridged = BridgedProblem(straight, covering(straight, modes, moment_key))
     sampled = sampler.run(bridged, config, run_key, logbook)
     draws = bridged.carried_back(sampled.draws)
-    spent = found.climbs.ledger + sampled.spent
+    spent = optima.search.ledger + sampled.spent
     # Several optima are normal for the mixture: no caution here, unlike in Laplace alone. The sampler's cautions about
     # coordinates and its share of rollouts are restated below for parameters and the total.
     kept = stage_cautions(sampled.trace, config.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
-    first = found.climbs.trace[0]["horizon"]
-    kept += unseen_modes(config.chains, sum(row["horizon"] == first for row in found.climbs.trace))
-    kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
+    first = optima.search.trace[0]["horizon"]
+    kept += unseen_modes(config.chains, sum(row["horizon"] == first for row in optima.search.trace))
+    kept += [caution for caution in optima.cautions if caution.code is Code.OPTIMISATION_UNFINISHED]
     return replace(
         sampled,
         draws=draws,
         prefix_log_evidence=None,
         block_scores=[],
         log_likelihood=None,
-        trace=[*found.climbs.trace, *sampled.trace],
+        trace=[*optima.search.trace, *sampled.trace],
         **spent.record(),
         cautions=[*kept, *prior_cautions(problem, draws), *exclusion_cautions(spent.excluded, spent.evaluations)],
-        seconds=found.climbs.seconds + sampled.seconds,
-        optimum=mode_values(problem, found.modes[0]),
+        seconds=optima.search.seconds + sampled.seconds,
+        optimum=mode_values(problem, optima.modes[0]),
         details=sampled.details
-        | {"laplace_log_evidence": [mode.log_evidence for mode in found.modes], "modes": len(found.modes)},
+        | {"laplace_log_evidence": [mode.log_evidence for mode in optima.modes], "modes": len(optima.modes)},
     )
 
 
@@ -160,8 +160,8 @@ class ModeMixture:
     def sample(self, key: PRNGKeyArray, n: int) -> Float[np.ndarray, "n d"]:
         """Draws in random order; components get their exact shares, up to one draw."""
         generator = host_generator(key)
-        spread = (np.arange(n) + generator.uniform()) / n
-        component = np.searchsorted(np.cumsum(self.share), spread)
+        quantile = (np.arange(n) + generator.uniform()) / n
+        component = np.searchsorted(np.cumsum(self.share), quantile)
         of_mode = np.minimum(component, len(self.share) - 1)
         z = generator.standard_normal((n, self.means.shape[1]))
         scale = generator.chisquare(self.degrees, n) / self.degrees
@@ -177,15 +177,15 @@ class ModeMixture:
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
         """Log density, normalised; minus infinity if coordinates are not finite."""
         u = np.asarray(u)
-        held = np.isfinite(u).all(axis=1)
-        u = np.where(held[:, None], u, 0.0)
+        finite = np.isfinite(u).all(axis=1)
+        u = np.where(finite[:, None], u, 0.0)
         parts = [
             np.log(share) + _student_t(u, mean, factor, self.degrees)
             for share, mean, factor in zip(self.share, self.means, self.factors, strict=True)
         ]
         if self.prior_share > 0.0:
             parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, u))
-        return np.where(held, logsumexp(np.stack(parts), axis=0), -np.inf)
+        return np.where(finite, logsumexp(np.stack(parts), axis=0), -np.inf)
 
 
 def _student_t(
@@ -205,11 +205,11 @@ def _student_t(
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
     """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
     mean, prior = prior_moments(problem, key)
-    found = []
+    components = []
     for mode in modes:
         wide = _with_prior_moments(mode, mean, prior)
-        found += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
-    return found
+        components += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
+    return components
 
 
 def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:

@@ -230,7 +230,7 @@ def step(
     tuning = config.tuning
     population, info = stage(key, state.population, float(horizon), evaluate, tuning, moves)
     if not np.isfinite(info.log_evidence_increment):
-        raise _nothing_left(state, horizon)
+        raise _no_remainder(state, horizon)
     finished = population.progress == problem.n_rows
     evidence = state.log_evidence + info.log_evidence_increment
     prefix = state.prefix_log_evidence.copy()
@@ -241,8 +241,10 @@ def step(
         moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
         last_key = jax.random.fold_in(key, 1)
         population, done = refresh(last_key, population, info, evaluate, tuning, moves)
-        left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
-        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
+        affordable = (
+            _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
+        )
+        rounds = min(affordable // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
         population = prolong(jax.random.fold_in(key, 2), population, evaluate, tuning, done.moves, rounds)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
@@ -275,11 +277,11 @@ def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows
     if not np.isfinite(plan.budget):
         return 10**9
     looks = sum(plan.horizons[state.block + 1 :]) / n_rows
-    left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
+    remaining = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
     cost = plan.particles * horizon / n_rows
-    if left < cost:
+    if remaining < cost:
         return 0
-    return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
+    return max(1, int((remaining if last else 0.5 * remaining) / cost + 1e-9))
 
 
 def _facts(info: StageInfo) -> dict[str, Any]:
@@ -287,7 +289,7 @@ def _facts(info: StageInfo) -> dict[str, Any]:
     return {name: getattr(info, name) for name in kept}
 
 
-def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
+def _no_remainder(state: SmcState, horizon: int) -> NoLikelihoodError:
     return NoLikelihoodError(
         "the prior excludes the data: no parameter set has a positive likelihood "
         f"up to row {horizon} ({state.ledger.reasons})",

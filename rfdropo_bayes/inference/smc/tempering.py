@@ -162,12 +162,12 @@ def cross_references(population: Population) -> tuple[Reference, Reference]:
     weights = np.exp(population.log_weights)
     halves = (slice(n // 2, n), slice(0, n // 2))
     whole = fit_reference(population.position, weights / weights.sum())
-    found = []
+    references = []
     for half in halves:
         share = weights[half].sum()
         usable = share > 0.0 and distinct_size(population.position[half], weights[half]) > 2.0
-        found.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
-    return found[0], found[1]
+        references.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
+    return references[0], references[1]
 
 
 def resample(key: PRNGKeyArray, population: Population) -> tuple[Population, Int[np.ndarray, " n"]]:
@@ -282,13 +282,15 @@ def prolong(
     The key must differ from the key of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``,
     and moves with the same random numbers end near their start.
     """
-    found = [population]
+    populations = [population]
     for index in range(rounds):
         second = np.arange(len(population.base)) >= len(population.base) // 2
         round_key = jax.random.fold_in(key, 1 + index)
-        found.append(move(round_key, found[-1], cross_references(found[-1]), second, evaluate, tuning, moves)[0])
+        populations.append(
+            move(round_key, populations[-1], cross_references(populations[-1]), second, evaluate, tuning, moves)[0]
+        )
     joined: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in found]) for name in ("position", "base", "rows")
+        name: np.concatenate([getattr(p, name) for p in populations]) for name in ("position", "base", "rows")
     }
     count = len(joined["base"])
     return population._replace(log_weights=np.full(count, -np.log(count)), **joined)
