@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
     from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RfdropoConfig
-    from rfdropo_bayes.inference.smc.bridge import BridgeConfig as BridgeConfig
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SmcConfig
     from rfdropo_bayes.inference.smc.tempering import next_step as next_step
 
@@ -56,7 +55,6 @@ PUBLIC = {
     "InferenceResult": "result",
     "RfdropoConfig": "rfdropo.phi_search",
     "next_step": "smc.tempering",
-    "BridgeConfig": "smc.bridge",
     "SmcConfig": "smc.sampler",
 }
 """Public names, and the module of each."""

@@ -61,8 +61,6 @@ def options_table(options: Any) -> dict[str, Any]:
 
 
 def _entry(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return options_table(value)
     if isinstance(value, Mapping):
         return {name: _entry(each) for name, each in value.items() if each is not None}
     return [_entry(each) for each in value] if isinstance(value, list | tuple) else value
@@ -100,6 +98,4 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 def _written(value: Any) -> str:
     """A value in a few characters."""
-    if isinstance(value, MethodOptions):
-        return value.call
     return f"{value:.12g}" if isinstance(value, float) else repr(value)

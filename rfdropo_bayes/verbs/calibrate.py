@@ -88,7 +88,7 @@ LEAST_POSTERIOR = 200
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves
-OPTIMISING = ("laplace", "bridge", "smc")  # smc if it starts at the optima
+OPTIMISING = ("laplace", "smc")  # smc if it starts at the optima
 
 
 def calibrate(

@@ -25,7 +25,6 @@ KEY = jax.random.key(12)
 OPTIONS = {
     "smc": {"particles": 40, "replicates": 2, "blocks": 2, "target_ess": 0.3},
     "laplace": {"starts": 2, "blocks": 2, "draws": 50},
-    "bridge": {"particles": 40, "replicates": 2, "optimisation": {"starts": 1, "blocks": 1}},
     "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
 }
 CASES = [
@@ -154,7 +153,6 @@ methods.run(problem, sys.argv[3], json.loads(sys.argv[4]), jax.random.key(12), c
     ("method", "options", "begun"),
     [
         pytest.param("smc", OPTIONS["smc"], "smc_1", marks=pytest.mark.slow),
-        pytest.param("bridge", OPTIONS["bridge"], "smc_0", marks=pytest.mark.slow),
         pytest.param("rfdropo", OPTIONS["rfdropo"], "rfdropo", marks=pytest.mark.slow),
         pytest.param(*CASES[-1], "rfdropo", marks=pytest.mark.slow),
     ],

@@ -225,7 +225,8 @@ class Ratio(LinearGaussian):
 
     def to_unconstrained(self, values):
         x = together(values, self.names)
-        return kind(x).log((x - self.low) / (self.high - x))
+        with np.errstate(invalid="ignore"):  # beyond a bound there is no coordinate
+            return kind(x).log((x - self.low) / (self.high - x))
 
     def from_unconstrained(self, u):
         x = self.low + (self.high - self.low) * sigmoid(u)

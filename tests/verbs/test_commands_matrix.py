@@ -239,17 +239,3 @@ def test_two_groups_of_recordings_are_compared(bench, tmp_path) -> None:
     found = json.loads((tmp_path / "days" / "audit.json").read_text())
     assert found["between"]["groups"] == {name: [f"demo_{k}[0:{ROWS}]"] for name, k in (("before", 1), ("after", 2))}
     assert (tmp_path / "days" / "report.html").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bench", ["demo"], indirect=True)
-def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
-    rfdropo(
-        *("design", bench.experiment, "--from", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
-        overrides=[*bench.overrides, "model.per_group.young_modulus=1e5"],
-    )
-    proposed = pd.read_csv(tmp_path / "day" / "next_commands.csv")
-    assert proposed["time_s"].between(0.0, 1.0).all()
-    assert np.isfinite(proposed.to_numpy()).all()
-    assert proposed.shape[1] == 5  # time and the four cables
-    assert json.loads((tmp_path / "day" / "design.json").read_text())["sentence"]

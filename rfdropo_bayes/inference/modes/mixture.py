@@ -76,6 +76,6 @@ def mixture_cautions(weights: Float[np.ndarray, " mode"], mixture: str) -> list[
     use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
     sentence = (
         f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does "
-        "not describe this posterior; use the bridge or SMC if the noise model is right"
+        "not describe this posterior; use SMC if the noise model is right"
     )
     return [Caution(Code.SEVERAL_OPTIMA, sentence)]

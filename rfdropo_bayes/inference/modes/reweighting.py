@@ -176,7 +176,7 @@ def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) 
 
 def reweighting_cautions(comparison: Reweighted | None) -> list[Caution]:
     """Cautions from the comparison of the normal approximation with the exact posterior; None means no comparison."""
-    remedy = "allow more rollouts, or use the bridge or SMC"
+    remedy = "allow more rollouts, or use SMC"
     if comparison is None:
         sentence = f"no rollouts were left to check the normal approximation that the draws are from: {remedy}"
         return [Caution(Code.NORMAL_DIFFERS, sentence)]

@@ -17,7 +17,7 @@ and covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -29,10 +29,9 @@ from scipy.special import gammaln, logsumexp
 from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.method_options import MethodOptions
-from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, mode_values
+from rfdropo_bayes.inference.modes.mode_search import Modes, mode_values
 from rfdropo_bayes.inference.modes.optimisation import SAME, Laplace, divergence
-from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
+from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import (
     Draws,
     InferenceResult,
@@ -51,39 +50,6 @@ PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for modes that
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
-
-
-@dataclass(frozen=True, repr=False)
-class BridgeConfig(MethodOptions, called="Bridge"):
-    """Bridge: posterior and an evidence of small variance, by SMC from the optima to the posterior.
-
-    Attributes:
-        optimisation: settings of the search for optima.
-        rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
-        particles: number per replicate; None takes the largest number that the budget allows.
-        replicates: independent repetitions.
-        target_ess: share of effective particles kept from one target to the next.
-        draws: see `SmcConfig`.
-    """
-
-    optimisation: LaplaceConfig = field(default_factory=LaplaceConfig)
-    rollouts: float | None = None
-    particles: int | None = 500
-    replicates: int = 4
-    target_ess: float = 0.5
-    draws: int = 400
-
-    @property
-    def sampling(self) -> sampler.SmcConfig:
-        """The same as settings of the sampler."""
-        return sampler.SmcConfig(
-            rollouts=self.rollouts,
-            particles=self.particles,
-            replicates=self.replicates,
-            blocks=1,
-            target_ess=self.target_ess,
-            draws=self.draws,
-        )
 
 
 class BridgedProblem(ProblemDefaults):
@@ -126,48 +92,33 @@ class BridgedProblem(ProblemDefaults):
         density = evaluate_prior(self.problem, u) + np.asarray(rows).sum(axis=1)
         return (density - self.mixture.log_density(u))[:, None], np.asarray(status)
 
-    def carried_back(self, draws: Draws, names: tuple[str, ...]) -> tuple[Float[np.ndarray, "chain draw d"], Draws]:
-        """Draws from the bridge as points of the other problem, and as draws of its parameters, or of the parameters it
-        is a view of.
-        """
+    def carried_back(self, draws: Draws) -> Draws:
+        """Draws from the bridge as draws of the other problem's parameters."""
         u = np.stack([draws[name] for name in self.names], axis=-1)
         values = self.problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
-        return u, {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in names}
-
-
-def run(problem: Problem, config: BridgeConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
-    """Find the optima, then sample from around them to the posterior."""
-    search_key, sample_key = jax.random.split(key)
-    digest = run_digest(problem, "bridge", config, key)
-    checkpoint = logbook.checkpoint("bridge_climbs", digest)
-    optima = find_modes(problem, config.optimisation, search_key, checkpoint, logbook.part(0.0, 0.5))
-    return sample_from_modes(problem, config, optima, sample_key, logbook.part(0.5, 1.0))
+        return {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in self.problem.names}
 
 
 def sample_from_modes(
-    problem: Problem, config: BridgeConfig, optima: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
+    problem: ResidualProblem, config: sampler.SmcConfig, optima: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
 ) -> InferenceResult:
     """Sample from around optima that are known to the posterior; the result includes the cost of the optimisations."""
     moment_key, run_key = jax.random.split(key)
-    view: Problem = problem
-    modes, ledger, sampling = optima.modes, optima.search.ledger, config.sampling
-    if isinstance(problem, ResidualProblem):
-        view = straight = StraightProblem(problem, moment_key)
-        modes = [straight.mode(mode) for mode in modes]
-    bridged = BridgedProblem(view, covering(view, modes, moment_key))
-    sampled = sampler.run(bridged, sampling, run_key, logbook)
-    _, draws = bridged.carried_back(sampled.draws, problem.names)
-    spent = ledger + sampled.spent
+    straight = StraightProblem(problem, moment_key)
+    modes = [straight.mode(mode) for mode in optima.modes]
+    bridged = BridgedProblem(straight, covering(straight, modes, moment_key))
+    sampled = sampler.run(bridged, config, run_key, logbook)
+    draws = bridged.carried_back(sampled.draws)
+    spent = optima.search.ledger + sampled.spent
     # Several optima are normal for the mixture: no caution here, unlike in Laplace alone. The sampler's cautions about
     # coordinates and its share of rollouts are restated below for parameters and the total.
-    kept = stage_cautions(sampled.trace, sampling.rollouts)
+    kept = stage_cautions(sampled.trace, config.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     first = optima.search.trace[0]["horizon"]
-    kept += unseen_modes(sampling.chains, sum(row["horizon"] == first for row in optima.search.trace))
+    kept += unseen_modes(config.chains, sum(row["horizon"] == first for row in optima.search.trace))
     kept += [caution for caution in optima.cautions if caution.code is Code.OPTIMISATION_UNFINISHED]
     return replace(
         sampled,
-        method="bridge",
         draws=draws,
         prefix_log_evidence=None,
         block_scores=[],
@@ -178,11 +129,7 @@ def sample_from_modes(
         seconds=optima.search.seconds + sampled.seconds,
         optimum=mode_values(problem, optima.modes[0]),
         details=sampled.details
-        | {
-            "algorithm": "bridge",
-            "laplace_log_evidence": [mode.log_evidence for mode in optima.modes],
-            "modes": len(optima.modes),
-        },
+        | {"laplace_log_evidence": [mode.log_evidence for mode in optima.modes], "modes": len(optima.modes)},
     )
 
 

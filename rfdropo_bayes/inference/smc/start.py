@@ -73,7 +73,7 @@ def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook
         raise InputError(
             'start = "optimum" needs residuals, but this problem has no residuals',
             where="[inference] start",
-            remedy='start = "prior", or method = "bridge"',
+            remedy='start = "prior"',
         )
     way_key, search_key, sample_key = jax.random.split(key, 3)
     spent = Ledger()
@@ -161,13 +161,8 @@ def _from_optima(
     prefixed = len(block_boundaries(problem.n_rows, config.blocks, config.spacing)) > 1
     scoring = None if remaining is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
     sampling = None if remaining is None else remaining - scoring  # type: ignore[operator]
-    settings = bridge.BridgeConfig(
-        rollouts=sampling,
-        particles=config.particles,
-        replicates=sampler.decided(1, replace(config, rollouts=sampling, blocks=1)).chains,
-        target_ess=config.target_ess,
-        draws=config.draws,
-    )
+    once = replace(config, rollouts=sampling, blocks=1)
+    settings = replace(once, replicates=sampler.decided(1, once).chains)
     result = bridge.sample_from_modes(problem, settings, optima, sample_key, logbook)
     prefixes, ledger = _prefixes(problem, config, optima, scoring, score_key)
     value, sd = result.log_evidence or (np.nan, np.nan)

@@ -16,7 +16,6 @@ from rfdropo_bayes.inference.modes.optimisation import FLAT_STEPS, Laplace, maxi
 from rfdropo_bayes.inference.modes.reweighting import FIRST
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.smc import bridge, sampler
-from rfdropo_bayes.inference.smc.bridge import BridgeConfig
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from ..toys import Decay, LinearGaussian, Spring, Touched, TwoModes
@@ -134,12 +133,12 @@ def test_a_nonlinear_model_agrees_with_smc():
 def test_the_bridge_has_the_evidence_at_a_fraction_of_the_rollouts():
     """4 replicates of 500 scatter by 0.06 nat: their mean is within 0.12 of the truth but for 1 in 15000 seeds."""
     problem = LinearGaussian(n_rows=20, d=4)
-    result = bridge.run(problem, BridgeConfig(), KEY)
+    found = laplace.find_modes(problem, LaplaceConfig(), KEY)
+    result = bridge.sample_from_modes(problem, SmcConfig(particles=500, replicates=4, blocks=1), found, KEY)
     exact = problem.prefix_log_evidence()[-1]
     assert result.log_evidence[0] == pytest.approx(exact, abs=0.12)
     assert result.log_evidence[1] < 0.15
     assert result.rollouts < 4 * 500 * 8
-    assert result.details["algorithm"] == "bridge"
     mean, covariance = problem.posterior()
     draws = np.stack([result.draws[name].ravel() for name in problem.names], axis=1)
     assert np.abs((draws.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))).max() < 0.12
@@ -157,8 +156,8 @@ class Absolute(TwoModes):
 def test_the_bridge_keeps_two_modes_that_the_optimisations_found():
     problem = Absolute()
     evidence, share = problem.mode_evidence()
-    config = BridgeConfig(optimisation=LaplaceConfig(starts=8, blocks=1), replicates=2)
-    result = bridge.run(problem, config, KEY)
+    found = laplace.find_modes(problem, LaplaceConfig(starts=8, blocks=1), KEY)
+    result = bridge.sample_from_modes(problem, SmcConfig(particles=500, replicates=2, blocks=1), found, KEY)
     assert result.details["modes"] == 2
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.2)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.1)
