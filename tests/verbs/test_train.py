@@ -19,7 +19,7 @@ from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord, Scope
+from rfdropo_bayes.posteriors import FIXED, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
@@ -291,7 +291,7 @@ def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
     held = {"trunk_mass": 0.31, "observation_noise": 1e-3}
     modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
     record = PosteriorRecord(
-        (modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: [held_at(*each) for each in held.items()]}
+        (modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={FIXED: [held_at(*each) for each in held.items()]}
     )
     record.save(tmp_path / "posterior.nc")
     normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}
