@@ -30,24 +30,18 @@ class CalibrationProblem:
     into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
     compilations suffice for every batch size. The number of simulated steps is a run-time argument, so that they
     suffice for every horizon. Problems of one model share its compiled programs.
-
-    Attributes:
-        model: priors, simulator and data.
-        chunk: most parameter sets in one compiled call.
-        earlier: draws of the posterior of another model of the same robot, from which optimisations may start; missing
-            parameters start from their priors.
-        other: measured data in place of the model's data; None for the model's.
-        counted: factors of the log likelihood of some channels; the other factors are 1.
-        jacobian: method of Jacobians, see `ResidualProblem`.
-        count_rollouts: called with the number of rollouts, in full-length equivalents, after each chunk.
     """
 
-    model: TrajectoryModel
-    chunk: int = 32
+    model: TrajectoryModel  # priors, simulator and data
+    chunk: int = 32  # most parameter sets in one compiled call
+    # draws of the posterior of another model of the same robot, from which optimisations may start; missing parameters
+    # start from their priors
     earlier: DrawsByOwner = field(default_factory=dict)
-    other: Measured | None = None
+    other: Measured | None = None  # measured data in place of the model's data; None for the model's
+    # factors of the log likelihood of some channels; the other factors are 1
     counted: Mapping[str, float] = field(default_factory=dict)
-    jacobian: str = "auto"
+    jacobian: str = "auto"  # method of Jacobians, see `ResidualProblem`
+    # called with the number of rollouts, in full-length equivalents, after each chunk
     count_rollouts: Callable[[float], None] = lambda rollouts: None
 
     @property

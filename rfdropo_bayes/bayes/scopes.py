@@ -25,18 +25,13 @@ class Scopes:
     """The parameters of a model, and the value of each in each recording.
 
     Values and draws are mappings from labels, see `InferredParameter.name`.
-
-    Attributes:
-        parameters: inferred parameters in sampling order; a spread precedes its parameters.
-        specs: every parameter that a recording may have, by name.
-        fixed: fixed values, by label.
-        known: formerly inferred parameters whose values are now in ``fixed``.
     """
 
-    parameters: tuple[InferredParameter, ...]
+    parameters: tuple[InferredParameter, ...]  # inferred parameters in sampling order; a spread precedes its parameters
+    # every parameter that a recording may have, by name
     specs: Mapping[str, ParameterSpec] = field(default_factory=dict)
-    fixed: Mapping[str, float] = field(default_factory=dict)
-    known: tuple[InferredParameter, ...] = ()
+    fixed: Mapping[str, float] = field(default_factory=dict)  # fixed values, by label
+    known: tuple[InferredParameter, ...] = ()  # formerly inferred parameters whose values are now in ``fixed``
 
     @classmethod
     def read(
@@ -306,14 +301,10 @@ class Scopes:
 
 
 class Extension(NamedTuple):
-    """The parameters of new recordings.
+    """The parameters of new recordings."""
 
-    Attributes:
-        scopes: scopes with them instead of the fitted recordings' parameters.
-        like: labels of fitted parameters from which each takes its values; none for the deviation of a new group.
-    """
-
-    scopes: Scopes
+    scopes: Scopes  # scopes with them instead of the fitted recordings' parameters
+    # labels of fitted parameters from which each takes its values; none for the deviation of a new group
     like: Mapping[str, tuple[str, ...]]
 
 

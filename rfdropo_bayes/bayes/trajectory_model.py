@@ -32,19 +32,12 @@ Measured = Mapping[str, Float[Any, "..."]]
 
 @dataclass(frozen=True)
 class TrajectoryModel:
-    """The probabilistic program: priors, rollouts of the simulator, channels of measurements.
+    """The probabilistic program: priors, rollouts of the simulator, channels of measurements."""
 
-    Attributes:
-        simulator: anything that satisfies `Simulator`, mechanisms included.
-        scopes: inferred and fixed parameters, including the channels'.
-        recordings: commands and times of observation.
-        channels: measurement channels, `Markers` first.
-    """
-
-    simulator: Simulator
-    scopes: Scopes
-    recordings: RecordingSet
-    channels: tuple[Channel, ...]
+    simulator: Simulator  # anything that satisfies `Simulator`, mechanisms included
+    scopes: Scopes  # inferred and fixed parameters, including the channels'
+    recordings: RecordingSet  # commands and times of observation
+    channels: tuple[Channel, ...]  # measurement channels, `Markers` first
 
     @classmethod
     def of_positions(

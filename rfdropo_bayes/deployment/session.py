@@ -56,22 +56,15 @@ class Mode(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """End of a session.
+    """End of a session."""
 
-    Attributes:
-        cause, detail: reason of the end, and one line about it.
-        folder: folder with the session's files.
-        figures: lateness, misses, the policy's time, the time to a stop; as in summary.json.
-        drives: identity of each drive as read at the check.
-        without: objects that each drive lacks, with the consequence of each.
-    """
-
+    # cause, detail: reason of the end, and one line about it
     cause: Cause
     detail: str
-    folder: Path
-    figures: dict[str, Any]
-    drives: dict[str, dict[str, int]]
-    without: dict[str, list[str]]
+    folder: Path  # folder with the session's files
+    figures: dict[str, Any]  # lateness, misses, the policy's time, the time to a stop; as in summary.json
+    drives: dict[str, dict[str, int]]  # identity of each drive as read at the check
+    without: dict[str, list[str]]  # objects that each drive lacks, with the consequence of each
 
     @property
     def finished(self) -> bool:

@@ -26,16 +26,11 @@ class Ledger:
     """Cost of the work on a problem.
 
     A rollout of horizon h counts as h / n_rows rollouts, because its cost is proportional to its steps.
-
-    Attributes:
-        rollouts: full-length equivalents used.
-        evaluations: parameter sets evaluated, at any horizon.
-        excluded: parameter sets that got no weight, counted by status.
     """
 
-    rollouts: float = 0.0
-    evaluations: int = 0
-    excluded: Counter[str] = field(default_factory=Counter)
+    rollouts: float = 0.0  # full-length equivalents used
+    evaluations: int = 0  # parameter sets evaluated, at any horizon
+    excluded: Counter[str] = field(default_factory=Counter)  # parameter sets that got no weight, counted by status
 
     @property
     def reasons(self) -> str:

@@ -16,13 +16,9 @@ _WIDTH = 110
 
 
 class MethodOptions:
-    """Base of the options of every method: frozen dataclasses with a section "Attributes" in their docstring.
+    """Base of the options of every method: frozen dataclasses with a section "Attributes" in their docstring."""
 
-    Attributes:
-        called: name of the class in ``import rfdropo_bayes as rb``.
-    """
-
-    called: ClassVar[str]
+    called: ClassVar[str]  # name of the class in ``import rfdropo_bayes as rb``
 
     def __init_subclass__(cls, *, called: str) -> None:
         cls.called = called

@@ -24,17 +24,11 @@ from rfdropo_bayes.tables import nearest, plain
 
 
 class Method(NamedTuple):
-    """One way of inference.
+    """One way of inference."""
 
-    Attributes:
-        config: its configuration, a frozen dataclass.
-        run: ``run(problem, config, key, logbook) -> InferenceResult``.
-        posterior: its draws are of a posterior, and not of a distribution to randomise over.
-    """
-
-    config: type[Any]
-    run: Callable[..., InferenceResult]
-    posterior: bool = True
+    config: type[Any]  # its configuration, a frozen dataclass
+    run: Callable[..., InferenceResult]  # ``run(problem, config, key, logbook) -> InferenceResult``
+    posterior: bool = True  # its draws are of a posterior, and not of a distribution to randomise over
 
 
 METHODS: dict[str, Method] = {

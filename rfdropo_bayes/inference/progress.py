@@ -265,18 +265,12 @@ UNSAVED = Checkpoint(None, "")
 
 @dataclass(frozen=True)
 class Logbook:
-    """Checkpoints and progress of a run; the empty logbook stores and shows nothing.
+    """Checkpoints and progress of a run; the empty logbook stores and shows nothing."""
 
-    Attributes:
-        folder: folder for checkpoints; None keeps none.
-        resume: continue from its checkpoints.
-        progress: receives reports of stages.
-        begin, end: shares of the whole work before and after this part.
-    """
-
-    folder: Path | None = None
-    resume: bool = False
-    progress: Progress | None = None
+    folder: Path | None = None  # folder for checkpoints; None keeps none
+    resume: bool = False  # continue from its checkpoints
+    progress: Progress | None = None  # receives reports of stages
+    # begin, end: shares of the whole work before and after this part
     begin: float = 0.0
     end: float = 1.0
 

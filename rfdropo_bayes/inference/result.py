@@ -28,43 +28,30 @@ Draws = dict[str, Float[np.ndarray, "chain draw"]]
 
 @dataclass(frozen=True)
 class InferenceResult:
-    """Draws of equal weight, and facts about the run.
+    """Draws of equal weight, and facts about the run."""
 
-    Attributes:
-        method: registry name of the method.
-        draws: one array (chain, draw) per parameter, physical units; independent repetitions are chains.
-        log_evidence: value and standard deviation in nats, or None; the deviation is NaN if it was not measured.
-        prefix_log_evidence: log p(first h rows) for h = 1 ... n_rows, NaN if the method did not pass h; or None.
-        block_scores: prequential scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` =
-            log p(block | rows before it) and its ``sd`` over repetitions.
-        log_likelihood: (chain, draw, row) log density of each row at each draw, or None.
-        trace: one dictionary per stage.
-        rollouts: full-length equivalents used; evaluations: parameter sets tried.
-        excluded: parameter sets that got no weight, by reason.
-        cautions: reasons to doubt the draws.
-        seconds: time spent, earlier parts of a resumed run included.
-        phi: distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None.
-        fixed: {name: value} of fixed parameters.
-        optimum: posterior mode {name: value} if the method finds it; else None.
-        details: further numbers of the method, plain values.
-    """
-
-    method: str
-    draws: Draws
+    method: str  # registry name of the method
+    draws: Draws  # one array (chain, draw) per parameter, physical units; independent repetitions are chains
+    # value and standard deviation in nats, or None; the deviation is NaN if it was not measured
     log_evidence: tuple[float, float] | None = None
+    # log p(first h rows) for h = 1 ... n_rows, NaN if the method did not pass h; or None.
     prefix_log_evidence: Float[np.ndarray, " n_rows"] | None = None
+    # prequential scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows
+    # before it) and its ``sd`` over repetitions
     block_scores: list[dict[str, Any]] = field(default_factory=list)
+    # (chain, draw, row) log density of each row at each draw, or None
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None
-    trace: list[dict[str, Any]] = field(default_factory=list)
-    rollouts: float = 0.0
+    trace: list[dict[str, Any]] = field(default_factory=list)  # one dictionary per stage
+    rollouts: float = 0.0  # full-length equivalents used; evaluations: parameter sets tried
     evaluations: int = 0
-    excluded: dict[str, int] = field(default_factory=dict)
-    cautions: list[Caution] = field(default_factory=list)
-    seconds: float = 0.0
+    excluded: dict[str, int] = field(default_factory=dict)  # parameter sets that got no weight, by reason
+    cautions: list[Caution] = field(default_factory=list)  # reasons to doubt the draws
+    seconds: float = 0.0  # time spent, earlier parts of a resumed run included
+    # distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None
     phi: dict[str, dict[str, Any]] | None = None
-    fixed: dict[str, float] = field(default_factory=dict)
-    optimum: dict[str, float] | None = None
-    details: dict[str, Any] = field(default_factory=dict)
+    fixed: dict[str, float] = field(default_factory=dict)  # {name: value} of fixed parameters
+    optimum: dict[str, float] | None = None  # posterior mode {name: value} if the method finds it; else None
+    details: dict[str, Any] = field(default_factory=dict)  # further numbers of the method, plain values
 
     @property
     def spent(self) -> Ledger:

@@ -15,15 +15,11 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class SessionDeviation(NamedTuple):
-    """Normal distribution of a session's deviation of one parameter, for every draw, in the parameter's unit.
+    """Normal distribution of a session's deviation of one parameter, for every draw, in the parameter's unit."""
 
-    Attributes:
-        shift: its mean: the deviation of the session that a posterior was adapted to; zero for any other session.
-        spread: its standard deviation: that between sessions for a session that no fit has seen; zero for the adapted
-        one.
-    """
-
+    # its mean: the deviation of the session that a posterior was adapted to; zero for any other session
     shift: Float[np.ndarray, " draw"]
+    # its standard deviation: that between sessions for a session that no fit has seen; zero for the adapted one
     spread: Float[np.ndarray, " draw"]
 
 

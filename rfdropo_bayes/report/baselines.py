@@ -23,22 +23,15 @@ Predictor = Callable[[Trajectory], Float[np.ndarray, "time marker 3"]]
 
 @dataclass(frozen=True)
 class BaselineErrors:
-    """Errors of one predictor.
+    """Errors of one predictor."""
 
-    Attributes:
-        name: key in summary.json.
-        title: name for people.
-        description: the method, in one sentence.
-        fit, test: errors on fitted and on test recordings; None without such recordings.
-        reason: why it could not predict; empty if it could.
-    """
-
-    name: str
-    title: str
-    description: str
+    name: str  # key in summary.json
+    title: str  # name for people
+    description: str  # the method, in one sentence
+    # fit, test: errors on fitted and on test recordings; None without such recordings
     fit: ErrorFigures | None
     test: ErrorFigures | None
-    reason: str = ""
+    reason: str = ""  # why it could not predict; empty if it could
 
 
 def held_initial_pose(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:

@@ -23,17 +23,11 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Weighed(NamedTuple):
-    """A parameter, or the sum of several, known from a measurement of its own.
+    """A parameter, or the sum of several, known from a measurement of its own."""
 
-    Attributes:
-        parameters: names; their sum was measured.
-        value: measured value in their unit.
-        sd: its standard deviation.
-    """
-
-    parameters: tuple[str, ...]
-    value: float
-    sd: float
+    parameters: tuple[str, ...]  # names; their sum was measured
+    value: float  # measured value in their unit
+    sd: float  # its standard deviation
 
 
 @dataclass(frozen=True)

@@ -36,26 +36,20 @@ LEAST_ROWS = 3  # for each column, to estimate correlations at all
 
 @dataclass(frozen=True)
 class Autoregression:
-    """Stationary AR(p) noise with one memory for all columns.
+    """Stationary AR(p) noise with one memory for all columns."""
 
-    Attributes:
-        scale: marginal standard deviation of each column, in the column's unit.
-        autocorrelation: values at lags 0 ... p; its length gives the order.
-        source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's
-            residuals are noise of such a process).
-        freedom: degrees of freedom of the variance; infinite if stated.
-        correlation: correlation of the columns at one time; None if they are independent.
-        step: time between rows [s] that the lags count; None if unknown, and rows of any rate count equally.
-        paces: time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then
-            have an axis of these recordings before the time axis.
-    """
-
-    scale: Float[np.ndarray, " column"]
-    autocorrelation: Float[np.ndarray, " lag"]
+    scale: Float[np.ndarray, " column"]  # marginal standard deviation of each column, in the column's unit
+    autocorrelation: Float[np.ndarray, " lag"]  # values at lags 0 ... p; its length gives the order.
+    # "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's residuals
+    # are noise of such a process)
     source: str
-    freedom: float
+    freedom: float  # degrees of freedom of the variance; infinite if stated
+    # correlation of the columns at one time; None if they are independent
     correlation: Float[np.ndarray, "column column"] | None = None
+    # time between rows [s] that the lags count; None if unknown, and rows of any rate count equally
     step: float | None = None
+    # time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then have an axis
+    # of these recordings before the time axis.
     paces: tuple[float, ...] | None = None
 
     @property

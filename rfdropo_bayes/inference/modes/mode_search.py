@@ -121,23 +121,15 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
 
 
 class Optimisations(NamedTuple):
-    """State of several optimisations over growing horizons.
+    """State of several optimisations over growing horizons."""
 
-    Attributes:
-        positions: present point of each optimisation.
-        log_density: log posterior there, at the horizon of its last update.
-        converged: whether it converged at that horizon.
-        level: index of the present horizon; done: optimisations finished at it.
-        noise: noise coordinates.
-        ledger, trace, seconds: as in every method.
-    """
-
-    positions: Float[np.ndarray, "start d"]
-    log_density: Float[np.ndarray, " start"]
-    converged: Bool[np.ndarray, " start"]
-    level: int
+    positions: Float[np.ndarray, "start d"]  # present point of each optimisation
+    log_density: Float[np.ndarray, " start"]  # log posterior there, at the horizon of its last update
+    converged: Bool[np.ndarray, " start"]  # whether it converged at that horizon
+    level: int  # index of the present horizon; done: optimisations finished at it
     done: int
-    noise: Bool[np.ndarray, " d"] | None
+    noise: Bool[np.ndarray, " d"] | None  # noise coordinates
+    # ledger, trace, seconds: as in every method
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float

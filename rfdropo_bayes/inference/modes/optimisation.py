@@ -66,19 +66,12 @@ class Optimisable(Protocol):
 
 
 class LevenbergState(NamedTuple):
-    """State of an optimisation.
+    """State of an optimisation."""
 
-    Attributes:
-        position: unconstrained point.
-        log_density: log posterior there.
-        damping: Levenberg-Marquardt damping, relative to the diagonal of the Hessian.
-        converged: whether the predicted gain of the last step was below the tolerance, or slightly above with a smaller
-            actual gain.
-    """
-
-    position: Float[np.ndarray, " d"]
-    log_density: float
-    damping: float
+    position: Float[np.ndarray, " d"]  # unconstrained point
+    log_density: float  # log posterior there
+    damping: float  # Levenberg-Marquardt damping, relative to the diagonal of the Hessian
+    # whether the predicted gain of the last step was below the tolerance, or slightly above with a smaller actual gain
     converged: bool
 
 

@@ -40,19 +40,13 @@ LIKE = 0.1  # share of the candidates that counts if the normal describes the po
 
 
 class Reweighted(NamedTuple):
-    """Draws of equal weight.
+    """Draws of equal weight."""
 
-    Attributes:
-        position: unconstrained.
-        rows: log density of each data row at each of them; None for draws of the normals, which no rollout has seen.
-        effective: number of independent draws that they are worth.
-        candidates: number of candidates with a posterior density.
-    """
-
-    position: Float[np.ndarray, "draw d"]
+    position: Float[np.ndarray, "draw d"]  # unconstrained
+    # log density of each data row at each of them; None for draws of the normals, which no rollout has seen
     rows: Float[np.ndarray, "draw row"] | None
-    effective: float
-    candidates: int
+    effective: float  # number of independent draws that they are worth
+    candidates: int  # number of candidates with a posterior density
 
 
 def reweighted(

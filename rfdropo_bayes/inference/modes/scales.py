@@ -28,17 +28,11 @@ WIDEST = 2.0  # deviation of the proposal's logarithms: beyond it the prior is a
 
 
 class Mixed(NamedTuple):
-    """A normal approximation with its scales integrated out.
+    """A normal approximation with its scales integrated out."""
 
-    Attributes:
-        scales: draws of the standard deviations.
-        position: draws of the coordinates, given each.
-        log_evidence: log evidence with the scales integrated out.
-    """
-
-    scales: Float[np.ndarray, "draw scale"]
-    position: Float[np.ndarray, "draw d"]
-    log_evidence: float
+    scales: Float[np.ndarray, "draw scale"]  # draws of the standard deviations
+    position: Float[np.ndarray, "draw d"]  # draws of the coordinates, given each
+    log_evidence: float  # log evidence with the scales integrated out
 
 
 def integrate_scales(

@@ -34,32 +34,23 @@ UNBOUNDED = (-np.inf, np.inf)
 
 
 class Target(NamedTuple):
-    """A posterior at one horizon, as functions of one unconstrained point (batched if marked).
+    """A posterior at one horizon, as functions of one unconstrained point (batched if marked)."""
 
-    Attributes:
-        density: log posterior of a batch (n, d).
-        likelihood: log likelihood of a batch (n, d).
-        prior_gradient, prior_hessian: derivatives of the log prior.
-        linearise: residuals (m,) and their Jacobian (m, d).
-        residuals: residuals (n, m) of a batch (n, d); zero for missing data.
-        noise: coordinates along which the log determinant changes.
-        differences: residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if
-            derivatives are not recomputed.
-        beside: gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is
-            neglected; None if these terms depend on noise coordinates only.
-        bounds: lowest and highest value of each coordinate.
-    """
-
-    density: Callable[[np.ndarray], np.ndarray]
-    likelihood: Callable[[np.ndarray], np.ndarray]
+    density: Callable[[np.ndarray], np.ndarray]  # log posterior of a batch (n, d)
+    likelihood: Callable[[np.ndarray], np.ndarray]  # log likelihood of a batch (n, d)
+    # prior_gradient, prior_hessian: derivatives of the log prior
     prior_gradient: Callable[[np.ndarray], np.ndarray]
     prior_hessian: Callable[[np.ndarray], np.ndarray]
-    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-    residuals: Callable[[np.ndarray], np.ndarray]
-    noise: Bool[np.ndarray, " d"]
+    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # residuals (m,) and their Jacobian (m, d)
+    residuals: Callable[[np.ndarray], np.ndarray]  # residuals (n, m) of a batch (n, d); zero for missing data
+    noise: Bool[np.ndarray, " d"]  # coordinates along which the log determinant changes
+    # residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if derivatives are
+    # not recomputed
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    # gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is neglected; None if
+    # these terms depend on noise coordinates only
     beside: Callable[[np.ndarray], np.ndarray] | None = None
-    bounds: tuple[Any, Any] = UNBOUNDED
+    bounds: tuple[Any, Any] = UNBOUNDED  # lowest and highest value of each coordinate
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
         """See `Optimisable.along`."""

@@ -19,25 +19,15 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 
 
 class ScorePlan(NamedTuple):
-    """Sizes fixed at the start.
+    """Sizes fixed at the start."""
 
-    Attributes:
-        space: search space.
-        population: candidates per generation.
-        horizons: horizon of every generation, in rows.
-        finalists: number of candidates scored again.
-        fixed: values of fixed parameters.
-        scale: unit of the features [unit of the problem's features].
-        floor: added to the variance of each feature, in squares of that unit.
-    """
-
-    space: SearchSpace
-    population: int
-    horizons: tuple[int, ...]
-    finalists: int
-    fixed: dict[str, float]
-    scale: float
-    floor: Float[np.ndarray, " f"]
+    space: SearchSpace  # search space
+    population: int  # candidates per generation
+    horizons: tuple[int, ...]  # horizon of every generation, in rows
+    finalists: int  # number of candidates scored again
+    fixed: dict[str, float]  # values of fixed parameters
+    scale: float  # unit of the features [unit of the problem's features]
+    floor: Float[np.ndarray, " f"]  # added to the variance of each feature, in squares of that unit
 
 
 def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:

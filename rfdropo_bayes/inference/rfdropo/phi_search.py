@@ -87,16 +87,11 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
 
 
 class SearchState(NamedTuple):
-    """History of the search; the optimiser's state is a function of it.
+    """History of the search; the optimiser's state is a function of it."""
 
-    Attributes:
-        candidates: candidates of every finished generation.
-        losses: their losses, each generation at its own horizon.
-        ledger, trace, seconds: as in every method.
-    """
-
-    candidates: Float[np.ndarray, "generation population k"]
-    losses: Float[np.ndarray, "generation population"]
+    candidates: Float[np.ndarray, "generation population k"]  # candidates of every finished generation
+    losses: Float[np.ndarray, "generation population"]  # their losses, each generation at its own horizon
+    # ledger, trace, seconds: as in every method
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float

@@ -25,15 +25,10 @@ POSITIVE_DRAWS = 1000  # from the prior, which show the positive parameters
 
 
 class Reference(NamedTuple):
-    """Location and spread of a population, which shape its proposals.
+    """Location and spread of a population, which shape its proposals."""
 
-    Attributes:
-        mean: weighted mean.
-        cholesky: lower Cholesky factor of the weighted covariance.
-    """
-
-    mean: Float[np.ndarray, " d"]
-    cholesky: Float[np.ndarray, "d d"]
+    mean: Float[np.ndarray, " d"]  # weighted mean
+    cholesky: Float[np.ndarray, "d d"]  # lower Cholesky factor of the weighted covariance
 
 
 def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> Reference:

@@ -110,43 +110,25 @@ class SmcConfig(MethodOptions, called="SMC"):
 
 
 class ReplicatePlan(NamedTuple):
-    """Sizes that are fixed before a replicate starts.
+    """Sizes that are fixed before a replicate starts."""
 
-    Attributes:
-        particles: number of particles.
-        horizons: prefix lengths at the ends of the blocks.
-        budget: rollouts of this replicate; infinite for no limit.
-    """
-
-    particles: int
-    horizons: tuple[int, ...]
-    budget: float
+    particles: int  # number of particles
+    horizons: tuple[int, ...]  # prefix lengths at the ends of the blocks
+    budget: float  # rollouts of this replicate; infinite for no limit
 
 
 class SmcState(NamedTuple):
-    """State of a replicate between two stages.
+    """State of a replicate between two stages."""
 
-    Attributes:
-        population: particles; their rows reach to the end of the present block.
-        block: index of the present block; -1 before the first.
-        stage: number of stages done; random keys derive from it.
-        log_evidence: log p(rows passed).
-        prefix_log_evidence: log evidence at every prefix passed, NaN elsewhere.
-        ledger: cost and exclusions.
-        trace: one dictionary per stage.
-        seconds: time spent.
-        finished: the last stage is done.
-    """
-
-    population: Population
-    block: int
-    stage: int
-    log_evidence: float
-    prefix_log_evidence: Float[np.ndarray, " n_rows"]
-    ledger: Ledger
-    trace: list[dict[str, Any]]
-    seconds: float
-    finished: bool
+    population: Population  # particles; their rows reach to the end of the present block
+    block: int  # index of the present block; -1 before the first
+    stage: int  # number of stages done; random keys derive from it
+    log_evidence: float  # log p(rows passed)
+    prefix_log_evidence: Float[np.ndarray, " n_rows"]  # log evidence at every prefix passed, NaN elsewhere
+    ledger: Ledger  # cost and exclusions
+    trace: list[dict[str, Any]]  # one dictionary per stage
+    seconds: float  # time spent
+    finished: bool  # the last stage is done
 
 
 def decided(n_rows: int, config: SmcConfig) -> SmcConfig:

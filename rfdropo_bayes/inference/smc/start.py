@@ -198,17 +198,11 @@ def _prefixes(
 
 
 class Way(NamedTuple):
-    """From the prior to the posterior.
+    """From the prior to the posterior."""
 
-    Attributes:
-        stages: expected number of targets in between.
-        rollouts: full-length rollouts that each particle needs for it.
-        information: entropy lost on the way if both ends are normal [nat].
-    """
-
-    stages: float
-    rollouts: float
-    information: float
+    stages: float  # expected number of targets in between
+    rollouts: float  # full-length rollouts that each particle needs for it
+    information: float  # entropy lost on the way if both ends are normal [nat]
 
 
 def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray, ledger: Ledger) -> Way:

@@ -38,61 +38,37 @@ Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Population(NamedTuple):
-    """Weighted particles on their way along a path.
+    """Weighted particles on their way along a path."""
 
-    Attributes:
-        position: unconstrained particles.
-        base: log density of the path's starting target.
-        rows: log density still to come in, and already in, row by row; minus infinity is a dead particle.
-        log_weights: normalised.
-        progress: position s on the path, in rows.
-        scale: step size of the proposals, carried from stage to stage.
-    """
-
-    position: Float[np.ndarray, "n d"]
-    base: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n d"]  # unconstrained particles
+    base: Float[np.ndarray, " n"]  # log density of the path's starting target
+    # log density still to come in, and already in, row by row; minus infinity is a dead particle
     rows: Float[np.ndarray, "n h"]
-    log_weights: Float[np.ndarray, " n"]
-    progress: float
-    scale: float
+    log_weights: Float[np.ndarray, " n"]  # normalised
+    progress: float  # position s on the path, in rows
+    scale: float  # step size of the proposals, carried from stage to stage
 
 
 class Tuning(NamedTuple):
-    """Settings of a stage's moves.
+    """Settings of a stage's moves."""
 
-    Attributes:
-        target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        max_moves: most moves in a stage.
-    """
-
-    target_ess: float
-    max_moves: int
+    target_ess: float  # effective sample size kept from one target to the next, as a share of the live particles
+    max_moves: int  # most moves in a stage
 
 
 class StageInfo(NamedTuple):
-    """Facts about one stage.
+    """Facts about one stage."""
 
-    Attributes:
-        progress: position on the path at its end.
-        log_evidence_increment: its increment of the log evidence.
-        row_log_evidence: log evidence, relative to the start of the stage, at each whole row it passed.
-        passed: these rows, as prefix lengths.
-        ess: effective sample size before resampling, as a share of all particles.
-        moves: number of moves of every particle, 0 if weights were kept instead.
-        acceptance: mean acceptance over the moves.
-        scale: step size at the end.
-        correlation: slowest remaining correlation after the moves.
-    """
-
-    progress: float
-    log_evidence_increment: float
+    progress: float  # position on the path at its end
+    log_evidence_increment: float  # its increment of the log evidence
+    # log evidence, relative to the start of the stage, at each whole row it passed
     row_log_evidence: Float[np.ndarray, " passed"]
-    passed: Int[np.ndarray, " passed"]
-    ess: float
-    moves: int
-    acceptance: float
-    scale: float
-    correlation: float
+    passed: Int[np.ndarray, " passed"]  # these rows, as prefix lengths
+    ess: float  # effective sample size before resampling, as a share of all particles
+    moves: int  # number of moves of every particle, 0 if weights were kept instead
+    acceptance: float  # mean acceptance over the moves
+    scale: float  # step size at the end
+    correlation: float  # slowest remaining correlation after the moves
 
 
 def path_density(rows: Float[np.ndarray, "n h"], progress: float) -> Float[np.ndarray, " n"]:
