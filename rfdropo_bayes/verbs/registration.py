@@ -60,7 +60,7 @@ class Registration(NamedTuple):
     frame: Frame | None
     arrangement: Arrangement | None = None  # order of the commands, if it explains much more than the written order
     evidence: str = ""  # reason for the arrangement, in words
-    bend: float = 1.0  # bend of the body that explains the recording, over that of the robot as written
+    bend: float = 1.0  # bend of the body that explains the recording, over the bend of the robot as written
 
 
 def frame_of(

@@ -62,7 +62,7 @@ class RestFit(NamedTuple):
     """A fit at rest."""
 
     estimates: tuple[Estimate, ...]  # results for the parameters
-    markers: tuple[str, ...]  # names; the errors are those of the last marker, root mean square [m]
+    markers: tuple[str, ...]  # names; errors are of the last marker, root mean square [m]
     # before, after: errors on the fitted rows
     before: float
     after: float
