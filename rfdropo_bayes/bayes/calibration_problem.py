@@ -108,7 +108,7 @@ class CalibrationProblem:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Digest of data, parameters and simulator: a checkpoint belongs to the problem it was made for."""
+        """Digest of data, parameters and simulator: a checkpoint is valid for one problem only."""
         digest = hashlib.sha256()
         recordings = self.model.recordings
         data = self.measured.values()

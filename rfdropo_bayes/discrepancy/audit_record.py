@@ -280,8 +280,8 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
 
 
 def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
-    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free, so
-    that only ratios are known if no force was measured. First-order error propagation in logarithms.
+    """Masses, forces and stiffnesses over Young's modulus. With imposed cable lengths and no measured force only these
+    ratios are determined. First-order error propagation in logarithms.
     """
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}

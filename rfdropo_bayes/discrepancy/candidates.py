@@ -245,8 +245,9 @@ def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way 
 def _best_of(
     target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]
 ) -> tuple[float, Float[np.ndarray, " d"], int]:
-    """Largest decrease of the sum of squares over the points, with refitted base parameters; this point; its
-    number, the last one of several that take as much."""
+    """Largest decrease of the sum of squares over the points, with refitted base parameters; this point; and its index,
+    the last of several with the same decrease.
+    """
     base = span(fit.jacobian)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
     left = np.sum(project_out(base, found.T) ** 2, axis=0)

@@ -151,7 +151,8 @@ def without_needless_steps(named: Named) -> Named:
 
 
 def without_each_other(steps: Sequence[Added]) -> tuple[Added, ...]:
-    """Steps whose classes do not have mechanisms that are steps themselves: both are in the model, which tells them
-    apart."""
+    """Steps with classes from which mechanisms of other steps are removed: the model contains both, so they are
+    distinguishable.
+    """
     named = {step.name for step in steps}
     return tuple(replace(s, members=tuple(n for n in s.members if n == s.name or n not in named)) for s in steps)

@@ -1,7 +1,7 @@
 """Sizes that change linearly from the start of a recording: the same mechanisms, with a rate in the place of a size.
 
-A size that differs between recordings needs no mechanism of its own: [model.per_recording] and [model.per_group] give
-each recording or group its size.
+A size that differs between recordings needs no separate mechanism: [model.per_recording] and [model.per_group] give
+each recording or group a size.
 """
 
 from __future__ import annotations

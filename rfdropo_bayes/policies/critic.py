@@ -121,7 +121,7 @@ class AsymmetricPolicy(ActorCriticPolicy):
     def predict(self, observation: Any, *rest: Any, **options: Any) -> tuple[np.ndarray, Any]:
         """Actions for observations with parameters or without.
 
-        In the place of parameters that are not given stands no number: an actor that saw one would give no action.
+        Unknown parameters are NaN: an actor that used them would give no action.
         """
         absent = spaces.flatdim(self.observation_space) - observation.shape[-1]
         edges = [(0, 0)] * (observation.ndim - 1) + [(0, absent)]

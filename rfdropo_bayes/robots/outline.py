@@ -156,7 +156,7 @@ class RobotOutline:
         return np.cumsum(lengths).tolist()
 
     def end_of_cables(self, segment: int) -> float:
-        """Height at which the cables of a segment end [m]: its end, or the disk that is nearest to it."""
+        """Height at which the cables of a segment end [m]: the segment's end, or the nearest disk."""
         end = self.segment_ends()[segment]
         if self.shape != "disks":
             return end
@@ -188,7 +188,7 @@ class RobotOutline:
         Args:
             scale: factor of the lengths that were assumed.
             bend: factor of the bend of a command, by the attribute that `sets_bend`.
-            evidence: reason for both, in words.
+            evidence: reason for length and radius, in words.
         """
         lengths = ("length", "radius", "tip_radius", "inner_radius")
         changes: dict[str, Any] = {

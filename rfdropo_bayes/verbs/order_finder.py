@@ -158,7 +158,7 @@ class _Finder:
         return equals
 
     def alternatives(self, chosen: Arrangement) -> tuple[tuple[Arrangement, float], ...]:
-        """Arrangements unlike the chosen one that explain the motion as well."""
+        """Other arrangements that explain the motion as well as the chosen arrangement."""
         others = [each for each in neighbours(chosen, self.sections) if self._differs(each, chosen)]
         if not others:
             return ()

@@ -104,7 +104,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
 def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: CsvColumns) -> list[str]:
     """Lines of [data.columns], axes and origin, that bring a first row to the undeformed robot.
 
-    Empty if it is near already, or if no frame brings it near.
+    Empty if the first row is near already, or if no frame brings it near.
 
     Args:
         robot: robot with the undeformed markers.

@@ -42,7 +42,7 @@ class MotorAngle(WhiteSeries):
     def gather(cls, trajectories: Sequence[Trajectory], length: int, needed: int | None = None) -> MotorAngle:
         """Motor angles of recordings padded to ``length`` rows; only the first ``needed`` recordings must have them.
 
-        They belong to the columns of commands, and these to the robot's channels, in the order in which they stand.
+        Columns of angles follow the order of the columns of commands, which follow the order of the robot's channels.
 
         Raises:
             InputError: a recording without motor angles, or commands that are no angles.

@@ -26,12 +26,11 @@ class Attribute(NamedTuple):
     """An attribute of a kind of element.
 
     Attributes:
-        fields: its fields of MjModel, each with a column (None for all of them) and the sign it enters with; all of
-            them change by the same factor.
+        fields: fields of MjModel that change by the same factor, each with a column (None for all columns) and a sign.
         unit: SI unit; one for linear and one for rotational motion if these differ.
-        signed: whether it may be negative.
+        signed: whether the attribute may be negative.
         sigma: standard deviation of its logarithm under the default prior.
-        typical: scale of the default prior if its nominal value is zero or it may be negative; in ``unit``.
+        typical: scale of the default prior for attributes that are zero or may be negative; in ``unit``.
         words: its description.
     """
 
