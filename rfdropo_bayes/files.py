@@ -120,7 +120,7 @@ def append_line(path: Path, line: str) -> None:
 
 
 def _end_last_line(file: BinaryIO) -> None:
-    """Take away the last line of a file of JSON lines if it was cut; add a missing newline."""
+    """Remove an incomplete last line of a file of JSON lines, and add a missing newline."""
     size = file.seek(0, os.SEEK_END)
     if size == 0:  # or a device, which ends nowhere
         return

@@ -85,7 +85,7 @@ class Lanes:
         lacking = [name for name in self.fields if parts[name] is None]
         if lacking:
             raise InputError(
-                f"the simulator does not tell its {lacking[0].replace('_', ' ')}",
+                f"the simulator does not return its {lacking[0].replace('_', ' ')}",
                 where=f"[model] {lacking[0]}",
                 remedy="leave it out, or let its rollout return it",
             )
@@ -105,7 +105,7 @@ class Lanes:
         return 0.0
 
     def with_difference(self, step: float) -> Self:
-        """The same with differences over another step."""
+        """The lanes with another step of differences."""
         changed = copy.copy(self)
         changed.difference = step
         return changed

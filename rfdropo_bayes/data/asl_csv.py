@@ -149,7 +149,7 @@ def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | 
     numbers, first = np.unique(recording.identity, return_index=True)
     where = f"{recording.table.path} with {commands}"
     if np.any(np.diff(recording.identity) < 0):
-        raise InputError("its rows are not in the order of their ID", where=where, remedy="sort them")
+        raise InputError("the rows are not in the order of the column ID", where=where, remedy="sort them")
     if commands is None or len(numbers) != len(command) or not np.array_equal(numbers, np.arange(len(command))):
         count = "no" if commands is None else str(len(command))
         raise InputError(

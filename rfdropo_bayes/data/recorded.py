@@ -51,8 +51,8 @@ class SentCommands:
     largest: float | None = None  # largest plausible command, in their unit; None for the default limits
 
     def of_poses(self) -> SentCommands:
-        """The same for rows whose poses belong to the command in their row. A command acts from the middle between its
-        row and the row before, so that simulators with any time step apply it in its row.
+        """Commands in force if the pose in a row belongs to the command in the same row. A command acts from the middle
+        between its row and the row before, so that simulators with any time step apply it in its row.
         """
         time, command = np.asarray(self.command_time), np.asarray(self.command)
         between = 0.5 * (time[:-1] + time[1:])

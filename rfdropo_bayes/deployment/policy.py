@@ -55,7 +55,7 @@ class Pull(NamedTuple):
 
     @classmethod
     def told(cls, facts: Mapping[str, str]) -> Pull:
-        """By the metadata of a policy."""
+        """The tension limits in the metadata of a policy."""
         peak, limit = float(facts.get(PEAK_TENSION, "nan")), float(facts.get(TENSION_LIMIT, "inf"))
         return cls(peak, limit, int(facts.get(STOPPED_EPISODES, "0")), int(facts.get(EVALUATED_EPISODES, "0")))
 

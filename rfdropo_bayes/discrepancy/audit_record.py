@@ -344,7 +344,7 @@ def _where(answer: Answer) -> dict[str, Any]:
 
 
 def _candidates(answer: Answer) -> list[dict[str, Any]]:
-    """Every candidate as the screen of the base model saw it, best first."""
+    """Score tests of all candidates at the base model, the best first."""
     first = answer.causes.screens[0]
     refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]

@@ -232,7 +232,7 @@ def _on_the_way(
 
 
 def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
-    """A fit with several sizes of a probe's one amplitude, of both signs if both are allowed."""
+    """A fit's points with trial values of a probe's amplitude, of both signs if both are allowed."""
     coordinates, (index,) = target.forward.coordinates, probe.amplitudes
     null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
     sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])

@@ -77,7 +77,7 @@ class Named:
         return self.asked.best(self.screen, self.tried, bool(self.steps))
 
     def extended(self, steps: Sequence[Added]) -> Named:
-        """The same with other steps, which are yet to be screened."""
+        """The model with other steps, without score tests."""
         return replace(self, steps=tuple(steps), screen=None, tried=None)
 
     def with_best(self) -> Named:
@@ -146,7 +146,7 @@ def _judged(named: Named) -> Named:
 
 
 def without_needless_steps(named: Named) -> Named:
-    """Without steps that later steps made redundant."""
+    """The model without steps that later steps made redundant."""
     return named.extended(without_needless(named.asked, named.base, named.steps))
 
 

@@ -43,7 +43,7 @@ class InCommandUnit:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> InCommandUnit:
-        """With parameters in the unit that a robot is commanded in."""
+        """The mechanism with parameters in the unit of a robot's commands."""
         return cls(robot.command_unit, robot.usual_command)
 
 

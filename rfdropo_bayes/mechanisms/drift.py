@@ -38,7 +38,7 @@ class Drift:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> Any:
-        """With the parameters that the mechanism has for a robot."""
+        """The drift with the parameters of the mechanism for a robot."""
         kind: Any = cls.kind
         return cls(kind.for_robot(robot) if hasattr(kind, "for_robot") else kind())
 

@@ -1,4 +1,4 @@
-"""Features: the inputs of a law at a port. Each is a number per time step, from time, commands or motion.
+"""Features: the inputs of a law at a port. A feature is a number per time step, from time, commands or motion.
 
 A feature is written as a step with a memory, so that a whole rollout, which scans it, and a session give the same.
 """
@@ -94,11 +94,11 @@ class Feature(NamedTuple):
     of_motion: bool = False
 
     def of(self, channel: int) -> Feature:
-        """The same with a command in the place of `OWN`."""
+        """The feature with a command in the place of `OWN`."""
         return self._replace(channels=tuple(channel if k == OWN else k for k in self.channels))
 
     def in_shape(self, shape: Any) -> Feature:
-        """The same in another shape, which may be traced."""
+        """The feature with another shape, which may be traced."""
         return self._replace(shape=shape)
 
     def commands(self, names: Sequence[str]) -> list[str]:

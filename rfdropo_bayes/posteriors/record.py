@@ -125,11 +125,11 @@ class PosteriorRecord:
         )
 
     def inference_data(self) -> InferenceData:
-        """The same in ArviZ's layout."""
+        """The record in ArviZ's layout."""
         return in_arviz(self.tree())
 
     def tree(self) -> xr.DataTree:
-        """The same as a tree of datasets, one for each of ArviZ's groups."""
+        """The record as a tree of datasets, one for each of ArviZ's groups."""
         products = [{**asdict(p), "powers": dict(p.powers)} for p in self.derived]
         return to_tree(
             self.posterior,

@@ -63,7 +63,7 @@ class _Scale:
         return np.linspace(low, high, number)
 
     def backward(self, place: np.ndarray) -> np.ndarray:
-        """From an even axis to displayed values."""
+        """Map from an even axis to displayed values."""
         return np.exp(place) if self.log else place
 
     def apply(self, axes: Axes, which: str, *, ticks: int = 4) -> None:

@@ -386,7 +386,7 @@ def _chambers(o: RobotOutline) -> list[str]:
 
 
 def _limits(o: RobotOutline) -> list[str]:
-    """How the drive of a cable works, and its limits."""
+    """Kind and limits of a cable's drive."""
     if o.command_unit in ("m", "rad"):
         return [f"displacement_limit_m = [{-o.length:.6g}, {0.5 * o.length:.6g}]"]
     usual = o.bending_force if o.usual_command is None else o.newtons * o.usual_command

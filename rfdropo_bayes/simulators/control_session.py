@@ -105,7 +105,7 @@ class Session:
 
     @property
     def time(self) -> Float[np.ndarray, " lane"]:
-        """Since every lane was started [s]."""
+        """Time of each lane since its start [s]."""
         return self.period * self._past.periods
 
     @property

@@ -175,11 +175,11 @@ class RobotSimulator(ExtendedSimulator):
         return self.engine.lanes
 
     def with_backend(self, backend: Backend) -> Self:
-        """The same, computed by another backend."""
+        """The simulator with another backend."""
         return replace(self, engine=replace(self.engine, backend=backend))  # type: ignore[type-var]
 
     def pushing(self) -> Self:
-        """The same with the cube and the plate of its robot before it.
+        """The simulator with the robot's cube and plate.
 
         Raises:
             InputError: a robot without a cube.

@@ -96,13 +96,13 @@ def installed_priors(
 def parts_of(recording: Trajectory | None, recordings: int, *, rests: bool, timed: bool) -> list[dict[str, Any]]:
     """Rows of each entry of fit and test, the last of which is the test: ``rows`` and ``every``; empty for all rows.
 
-    Of a recording that stands alone the last third is the test. Poses without times have no order, so rows between the
+    The last third of a single recording is the test. Poses without times have no order, so rows between the
     fitted ones are the test if there are enough.
 
     Args:
         recording: the first recording.
         recordings: their number.
-        rests: whether every row is an equilibrium, so that a fit can leave out rows.
+        rests: whether every row is an equilibrium; a fit may then leave out rows.
         timed: whether rows have times.
     """
     count = 0 if recording is None else len(recording.time)

@@ -56,7 +56,7 @@ class Finding(NamedTuple):
 
     @property
     def common_turn(self) -> float:
-        """By which the whole is turned [rad], -pi to pi: the mean over the sections."""
+        """Rotation of the whole robot [rad], -pi to pi: the mean over the sections."""
         return float(np.angle(np.mean(np.exp(1j * np.array(self.arrangement.turns)))))
 
     @property

@@ -67,7 +67,7 @@ def cautions_of_fit(
 
 
 def cautions_of_audit(model: Model, recordings: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
-    """The same for an audit, with ``paths`` of the nominal model."""
+    """Doubts for an audit, with ``paths`` of the nominal model."""
     return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
 
 

@@ -119,7 +119,7 @@ class Series(Channel):
         return None
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Series:
-        """The same channel of some recordings, and of their first rows, only."""
+        """The channel restricted to some recordings and their first rows."""
         own = {"readings": self.readings[index, :rows], "valid": self.valid[index, :rows]}
         return replace(self, **own, known=self.known_of(index))
 

@@ -110,7 +110,7 @@ class ObjectPose(Series):
             seen = np.isfinite(pose).all(axis=1)
             if not seen[0]:
                 raise InputError(
-                    "its first row has no pose of the pushed body",
+                    "the first row has no pose of the pushed body",
                     where=trajectory.name,
                     remedy="remove [model] object_pose = true, or start at a row in which the body is seen",
                 )

@@ -100,7 +100,7 @@ class Autoregression:
         return self if self.paces is None else replace(self, paces=tuple(self.paces[i] for i in index))
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values without recordings; `from_dict` is the inverse."""
+        """The noise as plain values without recordings; `from_dict` is the inverse."""
         arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
         values = {name: None if array is None else array.tolist() for name, array in arrays.items()}
         freedom = self.freedom if np.isfinite(self.freedom) else None
