@@ -251,8 +251,8 @@ class Engine:
             acting = self.section_loads(loads)
             if acting is not None:
                 under, force = loaded(system, prepared, acting, 0)
-            state, found = find_equilibrium(system, under, start, force)
-            residual = found.residual
+            state, equilibrium = find_equilibrium(system, under, start, force)
+            residual = equilibrium.residual
         if len(STAGES[self.integrator]) > 1:
             state = state._replace(commanded=jnp.asarray(start))
         return prepared, state, residual
@@ -313,8 +313,8 @@ class Engine:
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
             options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": self.section_loads(inputs.loads)}
-            found = self.native.rollout(inputs.material, inputs.drive, **begin, **options)
-            return found._replace(solves=None)
+            motion = self.native.rollout(inputs.material, inputs.drive, **begin, **options)
+            return motion._replace(solves=None)
         commands = inputs.drive[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 

@@ -122,8 +122,8 @@ def animated_on_grid(
     changes = np.asarray(value, float) - np.asarray(initial, float)
     steps = animated_commands(changes, every, time_step).reshape(-1, changes.shape[1])
     length = len(grid.step)
-    held = _pad(steps, max(length, len(steps)))[:length]
-    return grid._replace(step=grid.initial + held)
+    constant = _pad(steps, max(length, len(steps)))[:length]
+    return grid._replace(step=grid.initial + constant)
 
 
 def _check_steps(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> None:
@@ -172,12 +172,12 @@ def _ramped(
 ) -> Float[np.ndarray, "step channel"]:
     """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
     given = np.concatenate([[-np.inf], time])
-    held = np.vstack([initial, value])
+    levels = np.vstack([initial, value])
     # Commands before the first command in force count as carried out, so one more or less makes no difference.
     first = np.maximum(np.searchsorted(given, at - ramp, side="right") - 2, 0)
     last = np.searchsorted(given, at, side="right")
     window = np.minimum(first[:, None] + np.arange(np.max(last - first, initial=0) + 1), len(given) - 1)
-    return carried_out(given[window], held[window], at, ramp)
+    return carried_out(given[window], levels[window], at, ramp)
 
 
 def carried_out(

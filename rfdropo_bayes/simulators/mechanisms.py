@@ -278,13 +278,13 @@ def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS
 
 def code_of(mechanisms: Iterable[Mechanism]) -> bytes:
     """Source files of mechanisms: their digests show whether the code of a name has changed."""
-    found: set[bytes] = set()
+    sources: set[bytes] = set()
     for kind in {type(mechanism) for mechanism in mechanisms}:
         try:
-            found.add(Path(inspect.getfile(kind)).read_bytes())
+            sources.add(Path(inspect.getfile(kind)).read_bytes())
         except (OSError, TypeError):  # written in a notebook or at a prompt
-            found.add(f"{kind.__module__}.{kind.__qualname__}".encode())
-    return b"".join(sorted(found))
+            sources.add(f"{kind.__module__}.{kind.__qualname__}".encode())
+    return b"".join(sorted(sources))
 
 
 def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:

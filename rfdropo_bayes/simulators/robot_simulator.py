@@ -85,8 +85,8 @@ def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time sec
         axis=-2,
     )
     largest = jnp.argmax(jnp.stack([a - e - i, e - a - i, i - a - e, a + e + i], axis=-1), axis=-1)
-    found = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
-    return found / jnp.linalg.norm(found, axis=-1, keepdims=True)
+    quaternion = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
+    return quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)
 
 
 class RobotSimulator(ExtendedSimulator):
@@ -285,7 +285,7 @@ class RobotSimulator(ExtendedSimulator):
             InputError: such mechanisms on another body than a rod without a cube.
         """
         pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
-        found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
+        loads = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
         if pushing:
             if not self.engine.carries_loads:
                 raise InputError(
@@ -295,8 +295,8 @@ class RobotSimulator(ExtendedSimulator):
                 )
             initial, command = self.actuated(values, commands, self.time_step)
             levels = jnp.concatenate([initial[None], command])
-            found += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
-        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
+            loads += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
+        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *loads) if loads else None
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.

@@ -178,8 +178,8 @@ def field_of(model: Any, name: str) -> Any:
     owner, _, attribute = name.rpartition(".")
     if not owner:
         return getattr(model, name)
-    found = getattr(getattr(model, owner), attribute)
-    return found if isinstance(found, np.ndarray) else _Scalar(getattr(model, owner), attribute)
+    field = getattr(getattr(model, owner), attribute)
+    return field if isinstance(field, np.ndarray) else _Scalar(getattr(model, owner), attribute)
 
 
 class _Scalar:
@@ -275,7 +275,7 @@ def _nominal(model: Any, places: Sequence[Place], where: str) -> float:
 
 def places_of(model: Any, kind: str, number: int, attribute: Attribute) -> tuple[Place, ...]:
     """Entries of all fields in which an attribute of an element stands."""
-    found = []
+    places = []
     for field, column, sign in attribute.fields:
         rows: Any = number
         if kind == "joint" and field.startswith(("dof_", "qpos_")):
@@ -288,8 +288,8 @@ def places_of(model: Any, kind: str, number: int, attribute: Attribute) -> tuple
             index: tuple[Any, ...] = () if column is None else (column,)
         else:
             index = (rows,) if column is None else (rows, column)
-        found.append(Place(field, index, sign))
-    return tuple(found)
+        places.append(Place(field, index, sign))
+    return tuple(places)
 
 
 def _joint_rows(model: Any, number: int, field: str) -> slice:
