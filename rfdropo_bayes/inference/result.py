@@ -42,8 +42,8 @@ class InferenceResult:
     # (chain, draw, row) log density of each row at each draw, or None
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None
     trace: list[dict[str, Any]] = field(default_factory=list)  # one dictionary per stage
-    rollouts: float = 0.0  # full-length equivalents used; evaluations: parameter sets tried
-    evaluations: int = 0
+    rollouts: float = 0.0  # full-length equivalents used
+    evaluations: int = 0  # parameter sets tried
     excluded: dict[str, int] = field(default_factory=dict)  # parameter sets that got no weight, by reason
     cautions: list[Caution] = field(default_factory=list)  # reasons to doubt the draws
     seconds: float = 0.0  # time spent, earlier parts of a resumed run included

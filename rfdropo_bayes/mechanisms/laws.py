@@ -30,17 +30,11 @@ WIDE = 0.5  # deviation of a shape's prior, as a share of the shape: audits try 
 
 
 class Term(NamedTuple):
-    """One coefficient of a law, and the feature that it belongs to.
+    """One coefficient of a law, and the feature that it belongs to."""
 
-    Attributes:
-        feature: feature with its initial shape.
-        spec: specification of the coefficient.
-        shape: parameter that replaces the feature's shape; None for a fixed shape.
-    """
-
-    feature: Feature
-    spec: ParameterSpec
-    shape: ParameterSpec | None = None
+    feature: Feature  # feature with its initial shape
+    spec: ParameterSpec  # specification of the coefficient
+    shape: ParameterSpec | None = None  # parameter that replaces the feature's shape; None for a fixed shape
 
     def shaped(self, values: Values) -> Feature:
         """The feature with the shape of these values."""

@@ -30,29 +30,17 @@ PLACES = ("base", "middle", "tip")
 
 
 class Port(NamedTuple):
-    """A place at which a signal w(t) may act.
+    """A place at which a signal w(t) may act."""
 
-    Attributes:
-        name: name in files, such as "cable left" or "marker m3 along".
-        stage: "actuation", "body" or "sensing".
-        kind: kind of place.
-        number: index within its kind: a channel, a place or a marker; for "cables" the number of cables.
-        axis: 0 to 2, and 3 along the body; -1 without an axis.
-        unit: unit of the signal.
-        size: size of a typical effect: the scale of priors and of differences.
-        look: check to make at the robot.
-        spoken: its name in sentences, tables and figures, if it differs from the name in files; see `words`.
-    """
-
-    name: str
-    stage: str
-    kind: str
-    number: int
-    axis: int
-    unit: str
-    size: float
-    look: str
-    spoken: str = ""
+    name: str  # name in files, such as "cable left" or "marker m3 along"
+    stage: str  # "actuation", "body" or "sensing"
+    kind: str  # kind of place
+    number: int  # index within its kind: a channel, a place or a marker; for "cables" the number of cables
+    axis: int  # 0 to 2, and 3 along the body; -1 without an axis
+    unit: str  # unit of the signal
+    size: float  # size of a typical effect: the scale of priors and of differences
+    look: str  # check to make at the robot
+    spoken: str = ""  # its name in sentences, tables and figures, if it differs from the name in files; see `words`
 
     @property
     def words(self) -> str:
@@ -61,20 +49,13 @@ class Port(NamedTuple):
 
 
 class PortMap(NamedTuple):
-    """The ports of a robot on an engine, and the composition of signals there.
+    """The ports of a robot on an engine, and the composition of signals there."""
 
-    Attributes:
-        ports: all of them.
-        left_out: ports that the body cannot carry, with the reason.
-        channels: number of commands; places: number of stations for forces, 0 if none.
-        gravity: acceleration [m/s2].
-    """
-
-    ports: tuple[Port, ...]
-    left_out: dict[str, str]
-    channels: int
-    places: int
-    gravity: tuple[float, float, float]
+    ports: tuple[Port, ...]  # all of them
+    left_out: dict[str, str]  # ports that the body cannot carry, with the reason
+    channels: int  # number of commands
+    places: int  # number of stations for forces, 0 if none
+    gravity: tuple[float, float, float]  # acceleration [m/s2]
 
     def named(self, name: str) -> Port | None:
         """A port by its name in files or in sentences; None if there is none."""

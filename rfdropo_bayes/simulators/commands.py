@@ -22,22 +22,16 @@ UNITS = {
 
 
 class Commands(NamedTuple):
-    """A command sequence on a simulator's clock, and when it is observed.
+    """A command sequence on a simulator's clock, and when it is observed."""
 
-    Attributes:
-        initial: command in force before the first step, to which the initial state belongs [m or rad].
-        step: command reached at the end of each time step [m or rad].
-        sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
-            comes later if earlier commands are known.
-        sample_fraction: position of the observation within the following step, in [0, 1).
-        signals: further signals at the ports of the simulator (`ports.PortSignals`); None without signals.
-    """
-
+    # command in force before the first step, to which the initial state belongs [m or rad]
     initial: Float[Array, "*batch channel"]
-    step: Float[Array, "*batch step channel"]
+    step: Float[Array, "*batch step channel"]  # command reached at the end of each time step [m or rad]
+    # last step that ends at or before each observation; 0 is the initial state. The first observation comes later if
+    # earlier commands are known.
     sample_step: Int[Array, "*batch time"]
-    sample_fraction: Float[Array, "*batch time"]
-    signals: Any = None
+    sample_fraction: Float[Array, "*batch time"]  # position of the observation within the following step, in [0, 1)
+    signals: Any = None  # further signals at the ports of the simulator (`ports.PortSignals`); None without signals
 
     def of(self, index: Sequence[int] | np.ndarray) -> Commands:
         """Some of a batch."""

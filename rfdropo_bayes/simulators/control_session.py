@@ -41,8 +41,7 @@ from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import status_of
 
-WHOLE = 1e-6
-"""How far a control period may be from a whole number of time steps, in time steps."""
+WHOLE = 1e-6  # how far a control period may be from a whole number of time steps, in time steps
 
 
 class _Drives(NamedTuple):

@@ -26,8 +26,7 @@ STAGES = ("actuation", "body", "contact", "sensing")
 BODIES = ("rod", "tetrahedra")
 ENGINES = ("jax", "numba")
 MOTIONS = ("dynamic", "quasi-static")
-BLACK_BOX = "black box"
-"""In the place of body and engine: a program whose inside nobody reaches."""
+BLACK_BOX = "black box"  # in the place of body and engine: a program whose inside nobody reaches
 
 
 class Mechanism(Protocol):
@@ -95,17 +94,11 @@ class TimedSensingMechanism(Mechanism, Protocol):
 
 
 class Meanwhile(NamedTuple):
-    """Commands at the cables during a rollout.
+    """Commands at the cables during a rollout."""
 
-    Attributes:
-        levels: commands before the first step and at the end of every step [m or rad].
-        commands: commands, with the observed steps.
-        time_step: time step [s].
-    """
-
-    levels: Float[Array, "row channel"]
-    commands: Commands
-    time_step: float
+    levels: Float[Array, "row channel"]  # commands before the first step and at the end of every step [m or rad]
+    commands: Commands  # commands, with the observed steps
+    time_step: float  # time step [s]
 
 
 @runtime_checkable

@@ -173,15 +173,12 @@ class MeshTrunkSimulator(RobotSimulator):
 
     Mechanisms of the body see the robot's layers and stations; their effect on a layer applies to its elements, and a
     mass at a station rests on the section at its height.
-
-    Attributes:
-        options: settings of the mesh; for the others see `RobotSimulator`.
     """
 
     robot: Robot
     engine: Engine
     assembly: MeshAssembly
-    options: TetrahedraTable
+    options: TetrahedraTable  # settings of the mesh; for the others see `RobotSimulator`
     time_step: float
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
 

@@ -43,8 +43,7 @@ PASSES = 2
 """Number of fixed-point iterations for laws that depend on the motion: after two, a pull and a softening are within 5 %
 of their effect after eight.
 """
-DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
-"""Parameters that a body at rest does not have."""
+DAMPING = ("rayleigh_mass", "rayleigh_stiffness")  # parameters that a body at rest does not have
 SOFT = 1e4
 """[m/N] Compliance between a cable and a drive that holds its tension: a length of 1 m changes the tension by 0.1
 mN.
@@ -94,20 +93,13 @@ class RobotSimulator(ExtendedSimulator):
 
     Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
     mechanisms, and cube -> markers -> sensing mechanisms -> observation. A cube starts at rest at its given pose.
-
-    Attributes:
-        robot: simulated robot.
-        engine: engine of the motion of the body, and of a cube if it has a scene.
-        assembly: the discretised robot that the engine was made for.
-        mechanisms: extensions, applied in the given order within each stage.
-        time_step: time step of the simulation [s].
     """
 
-    robot: Robot
-    engine: Engine
-    assembly: Any
-    mechanisms: Sequence[Mechanism]
-    time_step: float
+    robot: Robot  # simulated robot
+    engine: Engine  # engine of the motion of the body, and of a cube if it has a scene
+    assembly: Any  # the discretised robot that the engine was made for
+    mechanisms: Sequence[Mechanism]  # extensions, applied in the given order within each stage
+    time_step: float  # time step of the simulation [s]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))

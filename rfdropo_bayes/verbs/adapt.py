@@ -129,12 +129,12 @@ def adapt(
 class SessionTask(NamedTuple):
     """A session to which a calibration is adapted."""
 
-    fit: Calibration  # the calibration; model: model of the adapted run
-    model: Model
-    scopes: Scopes  # parameters of the body, the session and its recordings; own: parameters of the session
-    own: Sequence[InferredParameter]
-    head: Trajectory  # the used part of the recording; tested: predicted recordings
-    tested: Sequence[Trajectory]
+    fit: Calibration  # the calibration
+    model: Model  # model of the adapted run
+    scopes: Scopes  # parameters of the body, the session and its recordings
+    own: Sequence[InferredParameter]  # parameters of the session
+    head: Trajectory  # the used part of the recording
+    tested: Sequence[Trajectory]  # predicted recordings
     rest: str  # name of the unused part of the recording among ``tested``; empty without it
     name: str  # name of the session
     model_error: ModelError  # residuals of the model on the fitted recordings
@@ -194,8 +194,8 @@ def _without_a_model(asked: SessionTask) -> dict[str, BaselineErrors]:
 class Adapted(NamedTuple):
     """A fitted session."""
 
-    fit: SessionFit  # draws of body and session; body: earlier draws of the body
-    body: Batch
+    fit: SessionFit  # draws of body and session
+    body: Batch  # earlier draws of the body
     problem: CalibrationProblem  # problem of the recording, with the fitted noise
     predictions: list[RecordingPrediction]  # predictions of the recording and of the unused data
     cautions: list[Caution]  # reasons to doubt them

@@ -103,9 +103,8 @@ class Guess(NamedTuple):
     # why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file
     evidence: Mapping[str, str]
     start: Float[np.ndarray, "marker 3"]  # first seen position of each marker, in the file's frame and unit
-    # commands of the first rows; seen: marker positions in the first rows, both in the file's units
-    sent: Float[np.ndarray, "command channel"]
-    seen: Float[np.ndarray, "row marker 3"]
+    sent: Float[np.ndarray, "command channel"]  # commands of the first rows
+    seen: Float[np.ndarray, "row marker 3"]  # marker positions in the first rows, both in the file's units
     counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
     sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
 

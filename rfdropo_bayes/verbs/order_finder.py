@@ -39,8 +39,8 @@ class Finding(NamedTuple):
     """Result of a search for another arrangement."""
 
     written: Agreement  # agreement of the robot and the commands as written
-    arrangement: Arrangement  # the simplest arrangement as good as the best; agreement: its correlation
-    agreement: float
+    arrangement: Arrangement  # the simplest arrangement as good as the best
+    agreement: float  # its correlation
     alternatives: tuple[tuple[Arrangement, float], ...] = ()  # alternatives of equal quality, and their correlations
     mirror: float = 0.0  # correlation of the robot's mirror image, turned
 

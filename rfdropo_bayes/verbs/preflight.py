@@ -75,11 +75,11 @@ class Preflight:
     parameters: pd.DataFrame
     channels: dict[str, list[str]]  # constant command channels of each recording
     noise: str  # assumed noise of the positions, in words
-    draws: int  # number of prior draws; failed: number of failed rollouts
-    failed: int
+    draws: int  # number of prior draws
+    failed: int  # number of failed rollouts
     rollout_seconds: float  # time to simulate one parameter set, all recordings
-    rollouts: int  # budget of the fit; minutes: its run time
-    minutes: float
+    rollouts: int  # budget of the fit
+    minutes: float  # its run time
     method: str  # method of the fit
     seconds: float  # run time of this analysis
     notes: list[str] = field(default_factory=list)

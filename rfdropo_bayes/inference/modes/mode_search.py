@@ -113,8 +113,8 @@ class Optimisations(NamedTuple):
     positions: Float[np.ndarray, "start d"]  # present point of each optimisation
     log_density: Float[np.ndarray, " start"]  # log posterior there, at the horizon of its last update
     converged: Bool[np.ndarray, " start"]  # whether it converged at that horizon
-    level: int  # index of the present horizon; done: optimisations finished at it
-    done: int
+    level: int  # index of the present horizon
+    done: int  # optimisations finished at it
     noise: Bool[np.ndarray, " d"] | None  # noise coordinates
     # ledger, trace, seconds: as in every method
     ledger: Ledger

@@ -23,23 +23,16 @@ TURNING, SLIDING = "rotational", "linear"
 
 
 class Attribute(NamedTuple):
-    """An attribute of a kind of element.
+    """An attribute of a kind of element."""
 
-    Attributes:
-        fields: fields of MjModel that change by the same factor, each with a column (None for all columns) and a sign.
-        unit: SI unit; one for linear and one for rotational motion if these differ.
-        signed: whether the attribute may be negative.
-        sigma: standard deviation of its logarithm under the default prior.
-        typical: scale of the default prior for attributes that are zero or may be negative; in ``unit``.
-        words: its description.
-    """
-
+    # fields of MjModel that change by the same factor, each with a column (None for all columns) and a sign
     fields: tuple[tuple[str, int | None, float], ...]
-    unit: str | tuple[str, str]
-    signed: bool
-    sigma: float
+    unit: str | tuple[str, str]  # SI unit; one for linear and one for rotational motion if these differ
+    signed: bool  # whether the attribute may be negative
+    sigma: float  # standard deviation of the logarithm under the default prior
+    # scale of the default prior for attributes that are zero or may be negative; in ``unit``
     typical: float | tuple[float, float]
-    words: str
+    words: str  # description
 
 
 def _plain(field: str, unit: str | tuple[str, str], sigma: float, typical: Any, words: str) -> Attribute:
@@ -144,18 +137,12 @@ class Place(NamedTuple):
 
 
 class Edit(NamedTuple):
-    """Effect of one parameter on a model.
+    """Effect of one parameter on a model."""
 
-    Attributes:
-        places: changed entries.
-        nominal: value in the model.
-        form: "value"; "factor" on the model's value; or "offset", added to it.
-        elements: (kind, number, attribute) of the changed elements, for the file of a calibrated model.
-    """
-
-    places: tuple[Place, ...]
-    nominal: float
-    form: str
+    places: tuple[Place, ...]  # changed entries
+    nominal: float  # value in the model
+    form: str  # "value"; "factor" on the model's value; or "offset", added to it
+    # (kind, number, attribute) of the changed elements, for the file of a calibrated model
     elements: tuple[tuple[str, int, str], ...]
 
     def apply(self, model: Any, value: float) -> None:

@@ -44,8 +44,7 @@ PERIOD, LONGEST, STILL = 10, 4000, 1e-7
 """Settling: steps between looks at the kinetic energy, most such periods, and the speed below which a body is at rest
 [m/s or rad/s]."""
 SHAKES = 20  # periods that a body has to stay at rest over, as speed is small wherever it turns round as well
-MARKED = ("site", "body", "geom")
-"""Elements that may be markers, in the order in which a bare name is looked up."""
+MARKED = ("site", "body", "geom")  # elements that may be markers, in the order in which a bare name is looked up
 
 
 def MuJoCo(
