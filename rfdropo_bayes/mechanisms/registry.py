@@ -1,4 +1,4 @@
-"""All mechanisms by name. To add a mechanism, write a class in the module of its stage, and one line here.
+"""All mechanisms by name. To add a mechanism, write a class in the module of its stage.
 
 A mechanism may also be defined in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
 experiment file, replaces a registry name; see docs/mechanisms.md.
@@ -13,109 +13,28 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms.actuation import (
-    ActuatorLag,
-    Backlash,
-    CableGain,
-    CableSlack,
-    CommandDelay,
-    CommandGain,
-    DriveCreep,
-    EndStop,
-    GuideAzimuth,
-    RateLimit,
-    SpoolGrowth,
-    TravelStop,
-)
-from rfdropo_bayes.mechanisms.body_mechanisms import (
-    AxialStiffness,
-    BaseCompliance,
-    BaseTilt,
-    BendTwistCoupling,
-    CableCompliance,
-    CapstanFriction,
-    CoulombFriction,
-    FibreLaw,
-    Payload,
-    PlaneAnisotropy,
-    QuadraticDrag,
-    Softening,
-    SoftPart,
-    StiffnessGradient,
-    ViscoelasticBranch,
-    WallContact,
-)
-from rfdropo_bayes.mechanisms.drift import (
-    CableGainDrift,
-    CameraDrift,
-    CameraTurn,
-    CameraZoom,
-    Drift,
-    DriveDrift,
-    GainDrift,
-)
-from rfdropo_bayes.mechanisms.sensing import (
-    CameraOffset,
-    CameraRotation,
-    CameraScale,
-    ClockOffset,
-    MarkerOffset,
-    SensorLag,
-)
+from rfdropo_bayes.mechanisms import actuation, body_mechanisms, drift, sensing
+from rfdropo_bayes.mechanisms.drift import Drift
 from rfdropo_bayes.mechanisms.sizes import scales_of, sized
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 
-REGISTRY: dict[str, type] = {
-    mechanism.name: mechanism
-    for mechanism in (
-        CommandDelay,
-        ActuatorLag,
-        CommandGain,
-        CableGain,
-        CableSlack,
-        GuideAzimuth,
-        Backlash,
-        EndStop,
-        TravelStop,
-        RateLimit,
-        SpoolGrowth,
-        DriveCreep,
-        DriveDrift,
-        GainDrift,
-        CableGainDrift,
-        Payload,
-        AxialStiffness,
-        StiffnessGradient,
-        SoftPart,
-        BaseCompliance,
-        BaseTilt,
-        CoulombFriction,
-        CapstanFriction,
-        CableCompliance,
-        ViscoelasticBranch,
-        FibreLaw,
-        PlaneAnisotropy,
-        BendTwistCoupling,
-        Softening,
-        QuadraticDrag,
-        WallContact,
-        CameraRotation,
-        CameraScale,
-        CameraOffset,
-        CameraDrift,
-        CameraTurn,
-        CameraZoom,
-        MarkerOffset,
-        SensorLag,
-        ClockOffset,
-    )
-}
+MODULES = (actuation, drift, body_mechanisms, sensing)
+
+
+def defined_in(module: ModuleType) -> list[Any]:
+    """The mechanisms that a module defines, in its order: its classes with a cause."""
+    own = (kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__)
+    return [kind for kind in own if hasattr(kind, "cause")]
+
+
+REGISTRY: dict[str, type] = {kind.name: kind for module in MODULES for kind in defined_in(module)}
 
 
 ACTS = {"actuation": ("actuate",), "body": ("embody",), "contact": ("embody",), "sensing": ("sense", "sense_over_time")}
