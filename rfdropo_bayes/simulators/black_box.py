@@ -282,7 +282,6 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @property
     def time_step(self) -> float:  # type: ignore[override]
-        """Time step of the box."""
         return self.box.time_step
 
     @property
@@ -292,7 +291,6 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @property
     def command_unit(self) -> str:
-        """Unit of the commands."""
         return self.box.command_unit
 
     @cached_property
@@ -383,7 +381,6 @@ class BlackBoxSimulator(ExtendedSimulator):
         return Observation(position, sample(moved.tension, commands), None, status, angle)
 
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
-        """See `ExtendedSimulator.lane_start`."""
         return LaneStart({spec.name: values[spec.name] for spec in self.box.specs}, drives.level, None)
 
     def begin_lanes(self, count: int) -> BodyLanes:
