@@ -91,12 +91,10 @@ class CalibrationProblem:
 
     @property
     def scales(self) -> Mapping[str, tuple[str, ...]]:
-        """See `Hierarchy`."""
         return self.model.scopes.scales
 
     @property
     def typical_scales(self) -> dict[str, float]:
-        """See `Hierarchy`."""
         return self.model.scopes.typical_scales
 
     @cached_property

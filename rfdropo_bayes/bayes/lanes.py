@@ -222,7 +222,6 @@ class RoutedLanes(Lanes):
         steps: int | None = None,
         width: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
-        """See `Lanes.roll`."""
         slow = self._needs_slow(theta)
         routes: list[tuple[np.ndarray, Lanes, Any]] = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
         order, results = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []

@@ -33,7 +33,6 @@ class Dialect(NamedTuple):
 
 
 def cells_of(line: str, separator: str) -> list[str]:
-    """The cells of a line."""
     if separator == " ":
         return line.split()
     if '"' not in line:

@@ -63,7 +63,6 @@ class DrivesTable(_Table):
 
     @property
     def units(self) -> Units:
-        """For the drives."""
         return Units(self.torque_unit, self.speed_unit, self.acceleration_unit)
 
     def check_serial(self, channels: Sequence[str]) -> None:

@@ -88,7 +88,6 @@ def settings_text(value: Any) -> str:
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:
-    """The default of a field."""
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 

@@ -46,7 +46,6 @@ class TrunkEnv(gymnasium.Env):
         return seen[0], self.episodes.begun_with(0)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One action."""
         step = self.episodes.act(np.asarray(action)[None])
         info = {
             "distance": float(step.distance[0]),

@@ -296,7 +296,6 @@ class Robot(RobotTable):
 
     @property
     def command_unit(self) -> str:
-        """Unit of the commands."""
         return self.command.unit
 
     @property
@@ -326,7 +325,6 @@ class Robot(RobotTable):
 
     @property
     def marker_names(self) -> tuple[str, ...]:
-        """Names of the markers."""
         return tuple(marker.name for marker in self.markers)
 
     @property

@@ -280,7 +280,6 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @property
     def time_step(self) -> float:  # type: ignore[override]
-        """Time step of the box."""
         return self.box.time_step
 
     @property
@@ -290,7 +289,6 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @property
     def command_unit(self) -> str:
-        """Unit of the commands."""
         return self.box.command_unit
 
     @cached_property
@@ -381,7 +379,6 @@ class BlackBoxSimulator(ExtendedSimulator):
         return Observation(position, sample(moved.tension, commands), None, status, angle)
 
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
-        """See `ExtendedSimulator.lane_start`."""
         return LaneStart({spec.name: values[spec.name] for spec in self.box.specs}, drives.level, None)
 
     def begin_lanes(self, count: int) -> BodyLanes:

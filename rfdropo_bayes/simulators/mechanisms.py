@@ -178,13 +178,11 @@ class SteppedActuation:
     """Base of mechanisms of actuation that are written as a step; a rollout scans it."""
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Any:
-        """See `SteppedMechanism`."""
         raise NotImplementedError
 
     def advance(
         self, values: Values, memory: Any, given: Float[Array, " channel"], now: float
     ) -> tuple[Any, Float[Array, " channel"]]:
-        """See `SteppedMechanism`."""
         raise NotImplementedError
 
     def actuate(
@@ -203,17 +201,14 @@ class MemorylessActuation:
         raise NotImplementedError
 
     def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
-        """See `ActuationMechanism`."""
         return self.reach(values, constant)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[()]:
-        """See `SteppedMechanism`."""
         return ()
 
     def advance(
         self, values: Values, memory: tuple[()], given: Float[Array, " channel"], now: float
     ) -> tuple[tuple[()], Float[Array, " channel"]]:
-        """See `SteppedMechanism`."""
         return memory, self.reach(values, given)
 
     def actuate(

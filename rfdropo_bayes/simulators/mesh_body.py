@@ -201,7 +201,6 @@ class MeshTrunkSimulator(RobotSimulator):
         return super().commands(time, value, initial, observation_time)
 
     def inputs(self, values: Values, commands: Commands) -> tuple[TetrahedralMaterial, Array, Array]:
-        """See `RobotSimulator`."""
         displacement = self.displacements(values, commands)
         return self.material(values), jnp.zeros_like(displacement[0]), displacement
 
@@ -234,7 +233,6 @@ class MeshTrunkSimulator(RobotSimulator):
         return profile_rod(**self.robot.rod_arrays())
 
     def material(self, values: Values) -> TetrahedralMaterial:
-        """See `RobotSimulator`."""
         layers = self._layers
         masses = jnp.asarray(self.robot.point_masses(values))
         material = self.embodied(values, layers, jnp.ones(layers.elements), masses)

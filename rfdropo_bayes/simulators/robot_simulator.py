@@ -434,12 +434,10 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def integrator(self) -> str | None:
-        """See `ExtendedSimulator.integrator`."""
         return self.engine.integrator
 
     @property
     def command_timing(self) -> tuple[float, float]:
-        """See `ExtendedSimulator.command_timing`."""
         return self.robot.command.ramp_s, self.robot.command.dead_time_s
 
     def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:
@@ -447,7 +445,6 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.travel(recording, command)
 
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
-        """See `ExtendedSimulator.lane_start`."""
         material, cube = self.body_inputs(values)
         return LaneStart(material, self.exerted(values, drives.level), cube)
 
@@ -478,5 +475,4 @@ class RobotSimulator(ExtendedSimulator):
         return self.in_measuring_frame(values, super().measured(values, position, time, meanwhile))
 
     def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """See `ExtendedSimulator.in_measuring_frame`."""
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

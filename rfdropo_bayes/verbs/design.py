@@ -124,7 +124,6 @@ def _design(
     minutes: float | None,
     report: Callable[[str], None],
 ) -> Design:
-    """See `design`."""
     settings = model.settings
     problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(fit))
     clock = Clock(settings.design.minutes if minutes is None else minutes)

@@ -69,12 +69,10 @@ class Series(Channel):
 
     @property
     def measured(self) -> Float[Any, "recording time *reading"]:
-        """See `Channel.measured`."""
         return self.readings
 
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Channel.specs`."""
         return self.gain_specs + (() if self.known is not None else self.noise_specs)
 
     @property
@@ -161,7 +159,6 @@ class Series(Channel):
         return jnp.concatenate([white, size_residuals(size, self.log_size(measured, measured), self.valid)], axis=-1)
 
     def row_log_density(self, seen: Seen, measured: Float[Any, "recording time *reading"]) -> Float[Array, " time"]:
-        """See `Channel.row_log_density`."""
         about = self.expected(seen)
         white, scale = self.whiten(self.deviation(measured, about), seen.values)
         size = self.log_size(about, measured)
@@ -176,23 +173,19 @@ class WhiteSeries(Series):
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.noise_specs`."""
         return (self.size,)
 
     @property
     def independent(self) -> bool:
-        """See `Series.independent`."""
         return self.known is None or super().independent
 
     def whiten_inferred(
         self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
     ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
-        """See `Series.whiten_inferred`."""
         size = values[self.size.name]
         return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
 
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """See `Series.stated`."""
         return Autoregression(np.full(self.valid.shape[-1], values[self.size.name]), np.ones(1), STATED, np.inf)
 
     def draw_errors(self, key: PRNGKeyArray, values: Mapping[str, Any]) -> Float[Any, "recording time column"]:

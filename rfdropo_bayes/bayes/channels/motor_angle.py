@@ -90,5 +90,4 @@ class MotorAngle(WhiteSeries):
         return measured - about
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
-        """See `Channel.draw`."""
         return jnp.where(self.valid, self.expected(seen) + self.draw_errors(key, seen.values), 0.0)

@@ -114,7 +114,6 @@ def _words(values: Any) -> str:
 
 
 def _write(root: ET.Element, element: ET.Element, model: Any, kind: str, number: int, attribute: str) -> None:
-    """Write one attribute of an element."""
     if kind == "body" and attribute in ("mass", "inertia", "com_x", "com_y", "com_z"):
         _write_inertial(root, element, model, number)
     elif kind == "body" and attribute == "gravcomp":
