@@ -136,9 +136,9 @@ def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Arr
 
 def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibrium:
     """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`.
-    A matrix without a solution is tried again without the forces that turn, which near a loss of stability leave it
-    indefinite; they are back after a whole increment. The increments to come are no more than a geometric series that
-    goes on as the last two did.
+    A system without a solution is solved again without the geometric terms, which make the matrix indefinite near a
+    loss of stability. The terms return after a whole increment. The increments to come are no more than a geometric
+    series that goes on as the last two did.
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
@@ -253,9 +253,8 @@ def settled(
     bound: float = ROW_SETTLED,
     moves: Bool[Array, ""] | bool = True,
 ) -> tuple[State, EquilibriumInfo]:
-    """The equilibrium that a state comes to under drives (see `System`), and forces [N] and moments [N m] on the
-    stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
-    radians.
+    """The equilibrium of a state under drives (see `System`), forces [N] and moments [N m] on the stations: one row of
+    quasi-static motion. Iterations end when one moves the body by less than ``bound``, in body lengths and radians.
 
     Friction of the cables continues from the state's memory; viscoelastic effects have relaxed. Needs a clamped
     station.
@@ -320,8 +319,8 @@ def quasi_static_step(
     external_force: Float[Array, "stations 6"] | float = 0.0,
     before: StepInfo | None = None,
 ) -> tuple[State, StepInfo]:
-    """A row of quasi-static motion, in place of ``dynamics.step``. A body that missed an equilibrium ``before`` is not
-    moved: its rollout counts as failed.
+    """A row of quasi-static motion, in place of ``dynamics.step``. A body without an equilibrium in an earlier row
+    (``before``) is not moved, and its rollout counts as failed.
     """
     moves = True if before is None else before.converged & ~before.diverged
     moved, info = settled(system, prepared, state, drive, external_force, moves=moves)

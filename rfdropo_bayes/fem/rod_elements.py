@@ -129,15 +129,15 @@ def taut_resultant(elements: Elements, taut: TautCables, rates: Six) -> Six:
 
 
 def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six, share: Scalar) -> Stiffness:
-    """The stiffness with a share of how the forces of sections and of cables beside them turn with the middles of the
-    elements, in leading order; it is symmetric.
+    """The stiffness with a share of the geometric term: forces of sections and of cables turn with the elements. The
+    term is of leading order and symmetric.
 
     Args:
         elements: shape of all elements.
-        stiffness: their stiffness without it.
+        stiffness: stiffness of the elements without this term.
         resultant: forces and moments of the sections in the elements' frames.
         pull: forces and moments of the cables in space.
-        share: 1 for all of it.
+        share: share of this term, 1 for the whole.
     """
     force = 0.5 * share * (pull[:3] + times(elements.frame, resultant[:3]))
     moment = 0.5 * share * (pull[3:] + times(elements.frame, resultant[3:]))

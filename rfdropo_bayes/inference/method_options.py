@@ -25,7 +25,7 @@ class MethodOptions:
 
     @property
     def call(self) -> str:
-        """The call that makes these options: with all values that differ from their defaults."""
+        """The call that makes these options, with all values that differ from the defaults."""
         own: Any = self
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(own)}
         changed = (

@@ -69,10 +69,10 @@ class Law:
     """Base of the laws of every stage.
 
     Args:
-        port: port at which it acts.
-        terms: terms of its sum.
+        port: port at which the law acts.
+        terms: terms of the sum.
         ports: all ports of the robot.
-        formula: formula that names it.
+        formula: formula that names the law.
     """
 
     stage: str
@@ -95,7 +95,7 @@ def _summed(terms: Sequence[Term], values: Values, levels: Float[Array, "row cha
 
 
 class CableLaw(Law):
-    """Adds its signal to the command of one cable, or of every cable by its own command."""
+    """Adds a signal to the command of one cable, or to each cable's command (then a function of that command)."""
 
     stage = "actuation"
     inside_drive = False
@@ -251,7 +251,7 @@ class ClockedSensingLaw(Law):
 
 
 def law_at(port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> Mechanism:
-    """The law of these terms at a port, in the form that its stage has."""
+    """The law with the given terms at a port, of the class for the port's stage."""
     if port.kind in ("cable", "cables"):
         return CableLaw(port, terms, ports, formula)
     if port.kind == "delay":

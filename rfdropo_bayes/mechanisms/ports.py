@@ -62,7 +62,7 @@ class PortMap(NamedTuple):
         return next((port for port in self.ports if name in (port.name, port.words)), None)
 
     def members(self, port: Port) -> tuple[Port, ...]:
-        """The ports at which a law of this port acts: for "cables" every cable, by its own command."""
+        """The ports at which a law of this port acts: every cable for "cables", each as a function of its command."""
         if port.kind == "cables":
             return tuple(each for each in self.ports if each.kind == "cable")
         return (port,)
@@ -78,7 +78,7 @@ class PortMap(NamedTuple):
         return BodySignals(jnp.zeros((rows, self.places, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
 
     def signals(self, port: Port, w: Float[Array, " row"]) -> PortSignals:
-        """A signal at a port of actuation or of the body, as a rollout takes it; at one with several members none."""
+        """A signal at a port of actuation or of the body, as input of a rollout; None for several members."""
         none = self.silent(len(w))
         if port.kind == "cable":
             return none._replace(command=none.command.at[:, port.number].set(w))

@@ -1,4 +1,4 @@
-"""All mechanisms by name. To add one: write its class in the module of its stage.
+"""All mechanisms by name. To add a mechanism, write a class in the module of its stage.
 
 A mechanism may also be defined in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
 experiment file, replaces a registry name; see docs/mechanisms.md.
@@ -58,7 +58,7 @@ class MechanismChoice:
 
     Attributes:
         source: name under which a file would ask for it.
-        kind: its class, or the mechanism itself.
+        kind: class of the mechanism, or the mechanism itself.
     """
 
     source: str
@@ -106,7 +106,7 @@ def choose_mechanisms(
 
 
 def source_of(mechanism: Any) -> str:
-    """Under which name a file would ask for a mechanism: its name, or ``module:ClassName`` of a class or an object."""
+    """Name of a mechanism in a file: a name of the library, or ``module:ClassName``."""
     if isinstance(mechanism, str):
         return mechanism
     kind = mechanism if isinstance(mechanism, type) else type(mechanism)

@@ -43,14 +43,14 @@ def algorithm_class(name: str, kind: str) -> Any:
 def algorithm_options(
     name: str, kind: str, gamma: float, given: Mapping[str, Any], environments: int = 128
 ) -> dict[str, Any]:
-    """Arguments of an algorithm: the defaults for these tasks, overridden by ``given``.
+    """Arguments of an algorithm: defaults for these tasks, replaced by ``given``.
 
     Args:
         name: name of the algorithm.
         kind: kind of actions.
         gamma: discount factor of one control period, unless ``given`` has another.
         given: options of the algorithm by Stable-Baselines3's own names; ``net_arch``, ``log_std_init`` and
-            ``activation`` (tanh, relu or elu) may stand among them without ``policy_kwargs``.
+        ``activation`` (tanh, relu or elu) need no ``policy_kwargs``.
         environments: number of environments simulated at once; a batch of PPO divides the rows they gather.
 
     Raises:

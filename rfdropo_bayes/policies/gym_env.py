@@ -19,7 +19,7 @@ class TrunkEnv(gymnasium.Env):
     """A task of the paper as one environment.
 
     Args:
-        task: its name, such as ``"TrunkReach-v0"``.
+        task: name of a task, such as ``"TrunkReach-v0"``.
         render_mode: ``"rgb_array"`` or None.
         options: see `make_episodes`.
 

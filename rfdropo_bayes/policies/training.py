@@ -192,7 +192,9 @@ def _leg(
     seed: int,
     log: Path,
 ) -> dict[str, Any]:
-    """Learn until the next evaluation, and evaluate in the same environments: each leg resets them all."""
+    """Learn until the next evaluation, and evaluate in the same environments. Learning and evaluation each begin with a
+    reset of all environments.
+    """
     began, redrawn = time.monotonic(), venv.get_attr("redrawn")[0]
     leg = int(state["leg"]) + 1
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
@@ -230,8 +232,8 @@ def _leg(
 
 
 def _failures(steps: int) -> Any:
-    """A callback that counts training episodes whose simulation failed, has schedules count the whole run's steps, and
-    stops if Ctrl-C was pressed twice.
+    """A callback that counts failed training episodes, bases schedules on the steps of the whole run, and stops if
+    Ctrl-C was pressed twice.
 
     Stable-Baselines3 imports are heavy, so that the class is made here.
     """
@@ -268,7 +270,9 @@ def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint beside the previous checkpoint, then replace it: a kill leaves one of the two."""
+    """Write a checkpoint beside the previous checkpoint, then replace the previous checkpoint, so that a killed process
+    leaves one of the two.
+    """
     partial = folder.with_name(f"{CHECKPOINT}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

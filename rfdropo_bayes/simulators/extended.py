@@ -80,7 +80,7 @@ class ExtendedSimulator:
 
     @property
     def command_timing(self) -> tuple[float, float]:
-        """For how long a change of a command is carried out, and how late [s]."""
+        """Duration and delay of a command's change [s]."""
         return 0.0, 0.0
 
     def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:

@@ -34,8 +34,8 @@ class Mechanism(Protocol):
 
     Attributes:
         name: registry name.
-        stage: one of `STAGES`, in the order in which they act on a rollout.
-        parameters: its parameters; the nominal value of each is its null value, except for parameters with a ``grid``.
+        stage: one of `STAGES`, which are in the order of their action on a rollout.
+        parameters: parameters of the mechanism; nominal values are null values, except for parameters with a ``grid``.
             A null value that is a bound makes the effect one-sided.
         cause: one line on the physical cause.
         remedy: one line on the remedy in a laboratory.
@@ -119,7 +119,7 @@ class PushingMechanism(Mechanism, Protocol):
 
     @property
     def follows_motion(self) -> bool:
-        """Whether it depends on how the body moves."""
+        """Whether the mechanism depends on the motion of the body."""
 
     def push(
         self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float

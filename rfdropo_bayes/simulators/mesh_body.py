@@ -195,7 +195,7 @@ class MeshTrunkSimulator(RobotSimulator):
         initial: Float[np.ndarray, " channel"],
         observation_time: Float[np.ndarray, " time"],
     ) -> Commands:
-        """Recorded commands on this simulator's clock, handed over as its drives do."""
+        """Recorded commands on the simulator's clock, interpolated as by its drives."""
         if self.options.drives == "sofa":
             return animated_on_grid(time, value, initial, observation_time, time_step=self.time_step)
         return super().commands(time, value, initial, observation_time)
@@ -208,7 +208,7 @@ class MeshTrunkSimulator(RobotSimulator):
         """See `RobotSimulator`; the energies are of the body.
 
         Raises:
-            InputError: another integrator than implicit Euler, whose states alone determine the velocities.
+            InputError: the integrator is not implicit Euler; only for Euler do the states determine the velocities.
         """
         if self.engine.integrator != "euler":
             raise InputError(

@@ -286,9 +286,9 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
 def test_what_cannot_be_used_is_refused():
     with pytest.raises(InputError, match="has no motor angles"):
         MotorAngle.gather([recording(angles=False)], 200)
-    with pytest.raises(InputError, match="its commands are in m"):
+    with pytest.raises(InputError, match="the commands are in m"):
         MotorAngle.gather([recording(60, unit="m")], 60)
-    with pytest.raises(InputError, match="none of its motor angles is a new reading"):
+    with pytest.raises(InputError, match="no row has a new reading of the motor angles"):
         MotorAngle.gather([recording(60, hold=3).slice_rows(1, 2)], 2)
     silent = ServoAndBody()
     silent.tells = False

@@ -35,7 +35,7 @@ class Channel(ABC):
     @property
     @abstractmethod
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of its noise and of its gain."""
+        """Parameters of the channel's noise and gain."""
 
     @property
     @abstractmethod
@@ -83,11 +83,11 @@ class Series(Channel):
     @property
     @abstractmethod
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of its noise, if inferred."""
+        """Inferred parameters of the channel's noise."""
 
     @property
     def independent(self) -> bool:
-        """Whether its noise is independent from row to row and from column to column."""
+        """Whether the channel's noise is independent between rows and between columns."""
         return self.known is not None and self.known.order == 0 and self.known.correlation is None
 
     @abstractmethod
@@ -117,7 +117,7 @@ class Series(Channel):
         return None
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Series:
-        """The same channel of some recordings, and of their first rows, only."""
+        """The channel restricted to some recordings and their first rows."""
         own = {"readings": self.readings[index, :rows], "valid": self.valid[index, :rows]}
         return replace(self, **own, known=self.known_of(index))
 
@@ -239,7 +239,8 @@ def size_residuals(
 ) -> Float[Any, "recording time column"]:
     """Residuals whose squares add to twice the logarithms of the sizes, up to a constant; zero if not valid.
 
-    With them the log likelihood is a sum of squares but for terms in the noise alone, as Gauss-Newton wants it.
+    With these residuals the log likelihood is a sum of squares, plus terms of the noise alone, as Gauss-Newton
+    requires.
     """
     return jnp.where(valid, jnp.sqrt(2.0 * (ABOVE_ZERO + size - (0.0 if read is None else read))), 0.0)
 

@@ -1,10 +1,11 @@
 """Measured poses of a pushed body: effects of contact that the robot's markers do not show.
 
-The body starts at its first measured pose (`Placing.with_object_at`); its centre and its turn since then are measured.
+The pushed body starts at its first measured pose (`Placing.with_object_at`). Channels are its centre and its rotation
+since then.
 Model errors of a push are correlated in time, since a body at rest keeps its pose: the noise is an Ornstein-Uhlenbeck
 process (`bayes.noise`) with its own sizes and its own correlation time. If the noise of the positions is white, this
-noise is also white, and `inference.modes.lasting` weights the rows: noise as long as the recording would also absorb a
-wrong push.
+noise is also white, and `inference.modes.lasting` weights the rows: noise that lasts for the whole recording would also
+absorb a wrong push.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Placing(Protocol):
     """A simulator whose object can be placed at a measured pose.
 
     Attributes:
-        pushes: whether it has an object.
+        pushes: whether the simulator has an object.
     """
 
     pushes: bool
@@ -109,7 +110,7 @@ class ObjectPose(Series):
             seen = np.isfinite(pose).all(axis=1)
             if not seen[0]:
                 raise InputError(
-                    "its first row has no pose of the pushed body",
+                    "the first row has no pose of the pushed body",
                     where=trajectory.name,
                     remedy="remove [model] object_pose = true, or start at a row in which the body is seen",
                 )

@@ -38,7 +38,7 @@ class WeighedParts(Channel):
     entries: tuple[Weighed, ...]
 
     def named(self, inferred: Sequence[ParameterInfo]) -> WeighedParts:
-        """The same, each parameter by the name under which it is inferred.
+        """The weighings with the names under which parameters are inferred.
 
         The whole recording's name denotes its only piece: ``payload_mass@a`` for ``payload_mass@a[0:99]``.
 

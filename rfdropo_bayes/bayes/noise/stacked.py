@@ -1,4 +1,4 @@
-"""The known noise of several channels side by side: each has its own memory, and shares no noise with another."""
+"""The known noise of several channels side by side: the channels have different memories and independent noise."""
 
 from __future__ import annotations
 
