@@ -56,7 +56,7 @@ class Model:
             `BlackBox`.
         priors: inferred parameters: {parameter: prior}. A prior is a numpyro distribution, a table such as
             ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default. For
-            a black box, all its parameters with their own priors by default, less its `families`.
+            a black box, by default all parameters except `families`, with their priors.
         mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or your own
             mechanisms, as classes or objects.
         noise: noise of the positions, by name as in an experiment file; or, if it is known, ``{"standard_deviation":

@@ -401,7 +401,7 @@ def _clock(guess: Guess) -> list[str]:
 
 
 def _command_clock(guess: Guess) -> list[str]:
-    """The times of commands in a file of their own."""
+    """The times of commands in a separate file."""
     if guess.command_time is None:
         return []
     return [

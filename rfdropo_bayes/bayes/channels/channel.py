@@ -1,4 +1,4 @@
-"""Interface of every channel of measurements: parameters, residuals, density, and a draw of its noise."""
+"""Interface of every channel of measurements: parameters, residuals, density, and draws of the noise."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Series(Channel):
 
     @abstractmethod
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """Its noise as a known one, at values of its parameters, in rows that are ``step`` seconds apart."""
+        """The channel's noise at given values of its parameters, in rows that are ``step`` seconds apart."""
 
     def log_size(
         self, about: Float[Any, "recording time *reading"], measured: Float[Any, "recording time *reading"]
