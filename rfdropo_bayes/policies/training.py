@@ -140,7 +140,7 @@ def _begin(
     if state is None:
         variance = LEAST_SPREAD**2  # added to variances
         normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=variance)
-        ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
+        ours: dict[str, Any] = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
         try:
             return PPO("MlpPolicy", normalisation, **ours, **options), normalisation
         except Exception as error:  # Stable-Baselines3 asserts, and PyTorch and Python raise whatever they raise
