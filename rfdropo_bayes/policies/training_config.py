@@ -10,7 +10,7 @@ from rfdropo_bayes.signatures import as_options
 
 
 class TrainingTable(BaseModel):
-    """[training]: a task, an algorithm and a budget."""
+    """[training]: a task, options of PPO, and a budget."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -44,9 +44,8 @@ class TrainingTable(BaseModel):
         gt=0.0,
         description="tension [N] beyond which an episode fails and ends, as drives would stop; none by default",
     )
-    algorithm: str = Field(default="PPO", description="name of an algorithm of Stable-Baselines3")
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of the algorithm by their names in Stable-Baselines3; also net_arch"
+        default_factory=dict, description="options of PPO under their names in Stable-Baselines3, with net_arch"
     )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(
@@ -78,10 +77,6 @@ class TrainingTable(BaseModel):
     )
     goals: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
         default=None, description="corners of the box that goals are drawn from [m]; the task's own by default"
-    )
-    normalise: bool = Field(
-        default=True,
-        description="scale observations and rewards by their running moments (deviations plus 0.01 in quadrature)",
     )
     evaluate_every: int = Field(
         default=100_000,
