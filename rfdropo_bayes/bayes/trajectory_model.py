@@ -55,7 +55,7 @@ class TrajectoryModel:
             simulator: see above; scopes: scopes of the simulator's parameters.
             trajectories: the recordings.
             noise: name of the noise of the positions.
-            known: the noise of ``markers``, unless it is inferred.
+            known: noise of ``markers``; None for inferred noise.
 
         Raises:
             InputError: a marker whose noise is not known, or see `gather_recordings`.

@@ -31,7 +31,7 @@ def read_plain_csv(
     Args:
         path: file with the observations, and the commands unless they have their own file.
         columns: mapping of the columns.
-        commands: file of the commands, if it is another.
+        commands: file of the commands, if separate.
         mask_missing: mask lost marker positions instead of rejecting the file.
 
     Raises:

@@ -223,7 +223,7 @@ class Model:
 
         Args:
             meant: keys that describe the run in a file; a model read from a file has them already.
-            given: keys that a call overrides; None if it does not.
+            given: keys and values that replace the file's; None keeps the file's.
         """
         stated = {name: value for name, value in given.items() if value is not None}
         return {**self.tables(), **(meant if self.file is None else {}), **stated}

@@ -45,7 +45,7 @@ class TrainingTable(BaseModel):
         description="tension [N] beyond which an episode fails and ends, as drives would stop; none by default",
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of PPO under their names in Stable-Baselines3, with net_arch"
+        default_factory=dict, description="options of PPO by their names in Stable-Baselines3; also net_arch"
     )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(

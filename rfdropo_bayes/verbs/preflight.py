@@ -172,7 +172,7 @@ def preflight(
         runs: recordings to fit.
         method: and ``rollouts``: its budget; by default from the model's experiment.
         seed: seed of the prior draws.
-        share: rows of ``runs`` over those of the fit, if they are some of its rows only.
+        share: number of rows in ``runs`` divided by the number in the fit.
 
     Raises:
         InputError: no parameter to infer, or no prior draw whose rollouts succeed.

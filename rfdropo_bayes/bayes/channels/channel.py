@@ -210,10 +210,10 @@ def padded_readings(
         length: rows.
         needed: number of recordings, from the first, that must have readings; all by default.
         read: readings of one recording and their mask; None without readings.
-        key: key of [model] that makes them data; words: their name.
+        key: key of [model] that uses the readings as data; words: name of the readings.
 
     Raises:
-        InputError: a recording without readings that needs them.
+        InputError: a recording lacks the readings.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     for index, trajectory in enumerate(trajectories):
