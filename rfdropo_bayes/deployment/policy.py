@@ -131,7 +131,7 @@ class OnnxPolicy:
         self.pull = Pull.told(self._session.get_modelmeta().custom_metadata_map)
         names = [part.name for part in self.layout.observation]
         if "goal" in names and not np.all(np.isfinite(self._goal)):
-            raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
+            raise InputError("the policy needs a goal", where="[goal]", remedy="give x, y and z in metres")
         self.rate_hz = 1.0 / self.layout.period_s
         self.sees_markers = bool({"markers", "moved", EARLIER_MOVED} & set(names))
         self.sees_object = "object" in names
