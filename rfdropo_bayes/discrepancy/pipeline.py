@@ -296,12 +296,13 @@ def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
         kept = replace(kept, named=replace(last, screen=_final_screen(last)))
     found = replace(found, kept=kept).after(GAIN)
     yield found
-    verdict = _verdict(kept, problem, ended=True)
-    if verdict in (PARTLY, UNEXPLAINED) and kept.named.screens[-1].omnibus.p <= problem.rules.extended_passes:
+    verdict, passes = _verdict(kept, problem, ended=True), kept.named.screens[-1].omnibus.p > problem.rules.extended_passes
+    if verdict in (PARTLY, UNEXPLAINED) and not passes:
         found = replace(found, suspected=_suspected(search, as_measured(last.search.target, last.base)))
         yield found
-    # A discrepancy that the library does not explain, or a base model that could not be fitted for it.
-    if verdict in (PARTLY, UNEXPLAINED) or (verdict == NO_VERDICT and not base.converged):
+    # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
+    # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
+    if verdict == UNEXPLAINED or (verdict == PARTLY and not passes) or (verdict == NO_VERDICT and not base.converged):
         for described in describe(problem, last, kept.held_out, report):
             found = replace(found, described=described)
             yield found

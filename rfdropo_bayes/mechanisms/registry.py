@@ -48,15 +48,7 @@ from rfdropo_bayes.mechanisms.body_mechanisms import (
     ViscoelasticBranch,
     WallContact,
 )
-from rfdropo_bayes.mechanisms.drift import (
-    CableGainDrift,
-    CameraDrift,
-    CameraTurn,
-    CameraZoom,
-    Drift,
-    DriveDrift,
-    GainDrift,
-)
+from rfdropo_bayes.mechanisms.drift import Drift, DriveZero, drift_of
 from rfdropo_bayes.mechanisms.sensing import (
     CameraOffset,
     CameraRotation,
@@ -86,9 +78,7 @@ REGISTRY: dict[str, type] = {
         RateLimit,
         SpoolGrowth,
         DriveCreep,
-        DriveDrift,
-        GainDrift,
-        CableGainDrift,
+        *map(drift_of, (DriveZero, CommandGain, CableGain, CableSlack)),
         Payload,
         AxialStiffness,
         StiffnessGradient,
@@ -108,10 +98,8 @@ REGISTRY: dict[str, type] = {
         CameraRotation,
         CameraScale,
         CameraOffset,
-        CameraDrift,
-        CameraTurn,
-        CameraZoom,
         MarkerOffset,
+        *map(drift_of, (CameraOffset, CameraRotation, CameraScale)),
         SensorLag,
         ClockOffset,
     )

@@ -35,7 +35,7 @@ def test_mechanisms_scale_as_their_units_do():
     small, large = arm(), arm(length=0.6, mass=0.7, modulus=1e6 * 5.0 / 9.0)
     assert np.array(scales_of(large)) / scales_of(small) == pytest.approx(np.array(RATIOS))
     before, after = priors(small), priors(large)
-    commanded = {"cable_slack", "backlash", "drive_drift"}
+    commanded = {"cable_slack", "backlash", "drive_zero", "cable_slack_rate", "drive_zero_rate"}
     for name, (unit, size) in before.items():
         if name in commanded or unit in POWERS:
             powers = np.array(Scales(1, 0, 0, 0) if name in commanded else POWERS[unit])
