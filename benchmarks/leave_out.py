@@ -5,7 +5,8 @@
 
 The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
 seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
-fits some rows of them; after an adaptation the first one as far as it was not shown. Climbs start from the prior, or
+fits some rows of them; after an adaptation the first one as far as it was not shown. Optimisations start from the
+prior, or
 where a study has `start`, the folder of a calibration, from its optimum: a day that is left out has chosen the basin
 then, and nothing else. `set` changes entries of the experiment, as ``--set`` does.
 

@@ -29,7 +29,7 @@ class Code(StrEnum):
     """A single replicate or optimisation cannot show that a mode of the posterior was lost."""
     ROLLOUTS_EXCLUDED = "rollouts_excluded"
     """Many rollouts got no weight."""
-    CLIMB_UNFINISHED = "climb_unfinished"
+    OPTIMISATION_UNFINISHED = "optimisation_unfinished"
     """The best optimisation stopped before its optimum."""
     SEVERAL_OPTIMA = "several_optima"
     """One normal distribution does not describe the posterior."""

@@ -69,10 +69,7 @@ def index_page() -> str:
     rows = [
         ("[experiment.md](experiment.md)", "every key of the experiment file, priors, parameters of measurements"),
         ("[robot.md](robot.md)", "every key of a robot file, and the robots that come with the package"),
-        (
-            "[deployment.md](deployment.md)",
-            "every key of a deployment file, for sessions on motors",
-        ),
+        ("[deployment.md](deployment.md)", "every key of a deployment file, for sessions on motors"),
         ("[mechanisms.md](mechanisms.md)", "every mechanism: cause, remedy, parameters, default priors, where it runs"),
         ("[methods.md](methods.md)", "every method of inference and its options"),
         ("[commands.md](commands.md)", "every command of `rfdropo` and its options"),

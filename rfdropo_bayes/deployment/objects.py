@@ -80,12 +80,10 @@ def first_axis(index: int) -> tuple[int, int]:
 PDO_INVALID = 1 << 31
 CSP_BIT = 1 << 7  # of 0x6502
 
-SETPOINT_MAP = ((Object.CONTROLWORD, 0, 16), (Object.TARGET_POSITION, 0, 32))
-"""First RPDO: applied on SYNC."""
+SETPOINT_MAP = ((Object.CONTROLWORD, 0, 16), (Object.TARGET_POSITION, 0, 32))  # First RPDO: applied on SYNC
 COMMAND_MAP = ((Object.CONTROLWORD, 0, 16),)
 """Second RPDO: the controlword alone, applied at once, so that a stop needs no SYNC."""
-STATUS_MAP = ((Object.STATUSWORD, 0, 16), (Object.POSITION, 0, 32), (Object.TORQUE, 0, 16))
-"""First TPDO: sent on SYNC."""
+STATUS_MAP = ((Object.STATUSWORD, 0, 16), (Object.POSITION, 0, 32), (Object.TORQUE, 0, 16))  # First TPDO: sent on SYNC
 
 SETPOINT, COMMAND, STATUS = struct.Struct("<Hi"), struct.Struct("<H"), struct.Struct("<Hih")
 EMERGENCY = struct.Struct("<HB5s")

@@ -21,20 +21,13 @@ POSE = 7  # numbers: centre, and quaternion x, y, z, w
 
 
 class Sighting(NamedTuple):
-    """The newest frame of markers.
+    """The newest frame of markers."""
 
-    Attributes:
-        number: rises with every frame; 0 before the first.
-        time: time of arrival [s, monotonic].
-        position: positions of the markers in the robot's base frame [m].
-        seen: False for a lost marker, whose position is then invalid.
-        object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen.
-    """
-
-    number: int
-    time: float
-    position: Float[np.ndarray, "marker 3"]
-    seen: Bool[np.ndarray, " marker"]
+    number: int  # rises with every frame; 0 before the first
+    time: float  # time of arrival [s, monotonic]
+    position: Float[np.ndarray, "marker 3"]  # positions of the markers in the robot's base frame [m]
+    seen: Bool[np.ndarray, " marker"]  # False for a lost marker, whose position is then invalid
+    # centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen
     object_pose: Float[np.ndarray, "7"] | None = None
 
 

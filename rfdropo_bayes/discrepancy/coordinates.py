@@ -241,10 +241,7 @@ class Coordinates:
         return np.clip(found, *np.transpose([(spec.low, spec.high) for spec in specs]))
 
     def physical_tangents(
-        self,
-        x: Float[np.ndarray, "n d"],
-        directions: Float[np.ndarray, "n d"],
-        slots: Int[np.ndarray, "recording d"],
+        self, x: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"], slots: Int[np.ndarray, "recording d"]
     ) -> Float[np.ndarray, "n recording physical"]:
         """Derivatives of `physical_values` along directions."""
         zero = np.zeros((len(x), len(slots), len(self.physical)))

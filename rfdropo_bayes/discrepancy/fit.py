@@ -30,7 +30,7 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
+from rfdropo_bayes.inference import LaplaceConfig, find_modes, maximise, normal_at, optimisation_cost
 from rfdropo_bayes.inference import Target as Climbed
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.finite_differences import usable_difference
@@ -444,7 +444,7 @@ def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:
     """Expected rollouts of an optimisation of ``parameters`` parameters."""
-    forward, (_, values) = target.forward, climb_cost(0, 0)
+    forward, (_, values) = target.forward, optimisation_cost(0, 0)
     return forward.count * USUAL * (int(values) + forward.lanes.slope_rollouts * parameters)
 
 
@@ -528,9 +528,9 @@ def optimum_rollouts(target: FitTarget) -> int:
     better half continues.
     """
     config, own = _searching(target), target.forward.coordinates
-    beginning, step = climb_cost(own.base, 0)
+    beginning, step = optimisation_cost(own.base, 0)
     climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
-    return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))
+    return target.forward.count * int(config.blocks * config.prior_draws + climbs * (beginning + SEARCHED * step))
 
 
 def poll_rollouts(target: FitTarget) -> int:

@@ -16,6 +16,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.repeat_noise import (
     Groups,
+    departures_from_mean,
     deviations,
     group_recordings,
     mean_error,
@@ -23,7 +24,6 @@ from rfdropo_bayes.bayes.repeat_noise import (
     repeat_shift,
     repeated,
     repeats_apart,
-    spread,
 )
 from rfdropo_bayes.data import Trajectory
 
@@ -199,7 +199,7 @@ def gather_measurements(
         single,
         next((channel for channel in channels if isinstance(channel, WeighedParts)), None),
         np.concatenate(count, axis=-1),
-        np.concatenate([spread(channel, groups) for channel in single], axis=-1),
+        np.concatenate([departures_from_mean(channel, groups) for channel in single], axis=-1),
         apart,
     )
 

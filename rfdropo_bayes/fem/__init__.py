@@ -25,15 +25,7 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.points import point_positions, spread_forces  # noqa: E402
-from rfdropo_bayes.fem.rod import (  # noqa: E402
-    PointMap,
-    Rod,
-    attach,
-    profile_rod,
-    refined,
-    solid_torsion_constant,
-    uniform_rod,
-)
+from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
 
 __all__ = [

@@ -26,16 +26,11 @@ class Ledger:
     """Cost of the work on a problem.
 
     A rollout of horizon h counts as h / n_rows rollouts, because its cost is proportional to its steps.
-
-    Attributes:
-        rollouts: full-length equivalents used.
-        evaluations: parameter sets evaluated, at any horizon.
-        excluded: parameter sets that got no weight, counted by status.
     """
 
-    rollouts: float = 0.0
-    evaluations: int = 0
-    excluded: Counter[str] = field(default_factory=Counter)
+    rollouts: float = 0.0  # full-length equivalents used
+    evaluations: int = 0  # parameter sets evaluated, at any horizon
+    excluded: Counter[str] = field(default_factory=Counter)  # parameter sets that got no weight, counted by status
 
     @property
     def reasons(self) -> str:
@@ -96,14 +91,14 @@ def representable_draws(
     least ``n`` if `REDRAWS` times ``n`` draws suffice. A scale of 1e-400 is excluded: its logarithm is infinite.
     """
     batches: list[tuple[np.ndarray, np.ndarray]] = []
-    drawn = found = 0
-    while found < n and drawn < REDRAWS * n:
+    drawn = kept = 0
+    while kept < n and drawn < REDRAWS * n:
         values = problem.sample_prior(jax.random.fold_in(key, drawn) if drawn else key, n)
         u = np.array(problem.to_unconstrained(values), dtype=float)
         base = evaluate_prior(problem, u)
-        held = np.isfinite(u).all(axis=1) & np.isfinite(base)
-        batches.append((u[held], base[held]))
-        drawn, found = drawn + n, found + int(held.sum())
+        finite = np.isfinite(u).all(axis=1) & np.isfinite(base)
+        batches.append((u[finite], base[finite]))
+        drawn, kept = drawn + n, kept + int(finite.sum())
     positions, densities = zip(*batches, strict=True)
     return np.concatenate(positions), np.concatenate(densities), drawn
 

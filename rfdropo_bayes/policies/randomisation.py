@@ -147,17 +147,12 @@ class Draws:
 
 @dataclass(frozen=True)
 class Days:
-    """Rows of a posterior, each in a new session that no fit has seen.
+    """Rows of a posterior, each in a new session that no fit has seen."""
 
-    Attributes:
-        draws: the rows; their parameters are shared by all sessions.
-        spreads: standard deviations between sessions of the varying parameters, one value per row.
-        ends: hard bounds of these parameters.
-    """
-
-    draws: Draws
+    draws: Draws  # the rows; their parameters are shared by all sessions
+    # standard deviations between sessions of the varying parameters, one value per row
     spreads: Mapping[str, Float[np.ndarray, " draw"]]
-    ends: Mapping[str, tuple[float, float]]
+    ends: Mapping[str, tuple[float, float]]  # hard bounds of these parameters
     kind: str = "posterior"
 
     @property
@@ -182,15 +177,10 @@ class Days:
 
 @dataclass(frozen=True)
 class Layers:
-    """Several randomisations at once; if two vary the same parameter, the later part wins.
+    """Several randomisations at once; if two vary the same parameter, the later part wins."""
 
-    Attributes:
-        parts: randomisations, from fixed values to values that differ between episodes.
-        kind: kind of the part that names the whole.
-    """
-
-    parts: tuple[Randomisation, ...]
-    kind: str
+    parts: tuple[Randomisation, ...]  # randomisations, from fixed values to values that differ between episodes
+    kind: str  # kind of the part that names the whole
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -30,25 +30,15 @@ Batch = dict[str, Float[np.ndarray, " n"]]
 
 
 class DayFit(NamedTuple):
-    """Joint draws of body and session parameters.
+    """Joint draws of body and session parameters."""
 
-    Attributes:
-        values: draws of all parameters, resampled by the evidence of their body.
-        chosen: index of each draw's body.
-        log_evidence: log evidence of each body, up to a constant.
-        power: exponent of the evidences that keeps an effective tenth of the draws; 1 if no less remains.
-        excess: ratio of the noise in the residuals to the stated noise; at least 1.
-        unconverged: number of draws whose fit did not converge.
-        steps: steps of the fits.
-    """
-
-    values: Batch
-    chosen: Int[np.ndarray, " n"]
-    log_evidence: Float[np.ndarray, " n"]
-    power: float
-    excess: float
-    unconverged: int
-    steps: int
+    values: Batch  # draws of all parameters, resampled by the evidence of their body
+    chosen: Int[np.ndarray, " n"]  # index of each draw's body
+    log_evidence: Float[np.ndarray, " n"]  # log evidence of each body, up to a constant
+    power: float  # exponent of the evidences that keeps an effective tenth of the draws; 1 if no less remains
+    excess: float  # ratio of the noise in the residuals to the stated noise; at least 1
+    unconverged: int  # number of draws whose fit did not converge
+    steps: int  # steps of the fits
 
 
 def fit_day(

@@ -28,35 +28,26 @@ SMALLEST_REACH = 1e-6  # [m]
 
 
 class DayError(NamedTuple):
-    """The slow error of a model in an unseen session.
+    """The slow error of a model in an unseen session."""
 
-    Attributes:
-        markers: names of the markers.
-        left: root mean square residual [m] of each marker in the fitted recordings.
-        reach: root mean square of each marker's largest distance from its start [m]; empty if unknown: a recording is
-            then assumed to move as far as the fitted recordings.
-        times: scale of the error in units of ``left``, for a marker at the distance ``reach``.
-        freedom: degrees of freedom: the error is Student's t.
-        constant: share of its variance that is constant over a recording.
-        correlation_time: correlation time of the other share [s].
-        days: error of the last marker [m] in each session left out, by group; empty without such sessions.
-        held: share of the coordinates of these sessions in the 90 % bands, each widened by the other sessions; None
-            without such sessions.
-        shown: distance of each marker in the fitted recording of this session [m]: only motion beyond it adds error;
-            empty without such a recording.
-        missed: sessions that could not be left out, because the others cannot be fitted without them.
-    """
-
-    markers: tuple[str, ...]
-    left: tuple[float, ...]
+    markers: tuple[str, ...]  # names of the markers
+    left: tuple[float, ...]  # root mean square residual [m] of each marker in the fitted recordings
+    # root mean square of each marker's largest distance from its start [m]; empty if unknown: a recording is then
+    # assumed to move as far as the fitted recordings
     reach: tuple[float, ...]
-    times: float = TIMES
-    freedom: float = FREEDOM
-    constant: float = CONSTANT
-    correlation_time: float = CORRELATION_TIME
+    times: float = TIMES  # scale of the error in units of ``left``, for a marker at the distance ``reach``
+    freedom: float = FREEDOM  # degrees of freedom: the error is Student's t
+    constant: float = CONSTANT  # share of its variance that is constant over a recording
+    correlation_time: float = CORRELATION_TIME  # correlation time of the other share [s]
+    # error of the last marker [m] in each session left out, by group; empty without such sessions
     days: Mapping[str, float] = {}
+    # share of the coordinates of these sessions in the 90 % bands, each widened by the other sessions; None without
+    # such sessions
     held: float | None = None
+    # distance of each marker in the fitted recording of this session [m]: only motion beyond it adds error; empty
+    # without such a recording
     shown: tuple[float, ...] = ()
+    # sessions that could not be left out, because the others cannot be fitted without them
     missed: tuple[str, ...] = ()
 
     def unit(
@@ -76,11 +67,7 @@ class DayError(NamedTuple):
         return beyond * np.array(self.left)[index] / (whole * np.sqrt(3.0))
 
     def draw(
-        self,
-        key: PRNGKeyArray,
-        count: int,
-        time: Float[np.ndarray, " time"],
-        unit: Float[np.ndarray, "time marker"],
+        self, key: PRNGKeyArray, count: int, time: Float[np.ndarray, " time"], unit: Float[np.ndarray, "time marker"]
     ) -> Float[np.ndarray, "draw time marker 3"]:
         """Realisations [m]: each draw has one scale for all markers, and a constant and a slow part for each axis."""
         rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))

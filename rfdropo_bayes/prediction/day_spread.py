@@ -15,14 +15,11 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class DayDeviation(NamedTuple):
-    """Normal distribution of a day's deviation of one parameter, for every draw, in the parameter's unit.
+    """Normal distribution of a day's deviation of one parameter, for every draw, in the parameter's unit."""
 
-    Attributes:
-        shift: its mean: the deviation of the day that a posterior was adapted to; zero for any other day.
-        spread: its standard deviation: that between days for a day that no fit has seen; zero for the adapted one.
-    """
-
+    # its mean: the deviation of the day that a posterior was adapted to; zero for any other day
     shift: Float[np.ndarray, " draw"]
+    # its standard deviation: that between days for a day that no fit has seen; zero for the adapted one
     spread: Float[np.ndarray, " draw"]
 
 

@@ -52,25 +52,17 @@ Batch = dict[str, Float[np.ndarray, " n"]]
 
 
 class NewPredictions(NamedTuple):
-    """Predictions of recordings that no fit has seen.
+    """Predictions of recordings that no fit has seen."""
 
-    Attributes:
-        recordings: the predictions.
-        unmatched: number of draws that did not converge on a first row.
-        far: distance of the measured from the simulated first row in units of the model error, by recording, if it
-            exceeds chance.
-        without: cautions on groups that no fit has seen, see `without_cautions`.
-    """
-
-    recordings: list[RecordingPrediction]
-    unmatched: int
+    recordings: list[RecordingPrediction]  # the predictions
+    unmatched: int  # number of draws that did not converge on a first row
+    # distance of the measured from the simulated first row in units of the model error, by recording, if it exceeds
+    # chance
     far: dict[str, float]
-    without: list[Caution]
+    without: list[Caution]  # cautions on groups that no fit has seen, see `without_cautions`
 
 
-def predicted_after_fit(
-    predict: Callable[[], NewPredictions],
-) -> tuple[list[RecordingPrediction], list[Caution]]:
+def predicted_after_fit(predict: Callable[[], NewPredictions]) -> tuple[list[RecordingPrediction], list[Caution]]:
     """Predictions of recordings that a finished fit has not seen, and cautions. If no draw can be simulated under their
     commands, they are left out with a caution, so that the fit is not lost."""
     try:

@@ -30,9 +30,7 @@ class Motor(RobotTable):
     length_limit_m: Pair = Field(description="least and greatest length of cable wound up")
     rate_limit_m_s: Positive = Field(description="greatest rate of the set-points")
     acceleration_limit_m_s2: Positive = Field(description="greatest acceleration of the set-points")
-    tension_limit_n: Pair = Field(
-        description="least tension to hold, and the greatest, at which everything stops",
-    )
+    tension_limit_n: Pair = Field(description="least tension to hold, and the greatest, at which everything stops")
     homing_tension_n: Positive = Field(description="tension at which homing sets length zero")
 
     @model_validator(mode="after")

@@ -36,10 +36,7 @@ class PortSignals(NamedTuple):
 
 
 def reached(
-    signals: PortSignals,
-    initial: Float[Array, " channel"],
-    command: Float[Array, "step channel"],
-    time_step: float,
+    signals: PortSignals, initial: Float[Array, " channel"], command: Float[Array, "step channel"], time_step: float
 ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
     """Commands that reach the cables before the first step and at the end of each, from commands without signals."""
     import jax.numpy as jnp

@@ -435,7 +435,7 @@ def day_scopes(fit: Calibration, model: Model, recordings: Sequence[str], day: s
     """The body's parameters without the noise of the fit, and the parameters of a session, with or without draws."""
     noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
     pooled = pooling(model.spec, model.simulator.parameters, recordings)
-    found = fitted_scopes(fit).of_day(day, recordings, fit.record.attrs[FITTED], pooled)
+    found = fitted_scopes(fit).of_session(day, recordings, fit.record.attrs[FITTED], pooled)
     return replace(found, parameters=tuple(p for p in found.parameters if p.spec.name not in noise))
 
 
@@ -520,10 +520,7 @@ def _checks(
     """Prediction errors of unused recordings before and after the adaptation, by recording."""
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
-        p.name: {
-            "from_first_row": _fared(replace(p, mask=adapted[p.name].mask)),
-            "adapted": _fared(adapted[p.name]),
-        }
+        p.name: {"from_first_row": _fared(replace(p, mask=adapted[p.name].mask)), "adapted": _fared(adapted[p.name])}
         for p in before
         if p.name in adapted
     }

@@ -91,9 +91,7 @@ class ArcSearch:
         asked = self.command[None, :, :, None] * (sign[:, :, None] * gain)[:, None]
         flat = (guesses, columns * slots)
         made = self.chain.markers(
-            asked.reshape(guesses, len(self.command), -1),
-            arm.reshape(*flat, 3, -1),
-            there.reshape(flat),
+            asked.reshape(guesses, len(self.command), -1), arm.reshape(*flat, 3, -1), there.reshape(flat)
         )
         made = np.where(self.seen[None, ..., None], made, 0.0)
         count = np.maximum(self.seen.sum(axis=0), 1)[None, None, :, None]

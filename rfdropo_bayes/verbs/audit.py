@@ -419,10 +419,7 @@ def _finer(spec: ModelSpec, robot: Robot) -> ModelSpec:
 
 
 def _model(
-    spec: ModelSpec,
-    simulator: AnySimulator,
-    trajectories: Sequence[Trajectory],
-    fitted: int,
+    spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory], fitted: int
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and the number of its first parameters, those of the base model.
 

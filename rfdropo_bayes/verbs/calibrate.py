@@ -28,7 +28,7 @@ from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
-    HELD,
+    FIXED,
     DrawsByOwner,
     PosteriorRecord,
     ProductOfPowers,
@@ -77,7 +77,7 @@ LEAST_POSTERIOR = 200
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves
-CLIMBING = ("laplace", "bridge", "smc")  # smc if it starts at the optima
+OPTIMISING = ("laplace", "smc")  # smc if it starts at the optima
 
 
 def calibrate(
@@ -176,7 +176,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
         problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
-    problem = problem.holding(result.held)
+    problem = problem.holding(result.fixed)
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
@@ -195,11 +195,11 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner |
     """
     if fit is None:
         return None
-    if method not in CLIMBING:
+    if method not in OPTIMISING:
         raise InputError(
             f"method {method!r} does not optimise, so it needs no start",
             where="--from",
-            remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
+            remedy=f"leave it out, or use one of {', '.join(OPTIMISING)}",
         )
     if isinstance(fit, Calibration):
         record, content = fit.record, fit.content
@@ -276,7 +276,7 @@ def record_posterior(
             **attributes,
             NOISE: problem.model.noise,
             FITTED: fitted,
-            HELD: [{"parameter": p.info.as_dict(), "value": result.held[p.name]} for p in scopes.known],
+            FIXED: [{"parameter": p.info.as_dict(), "value": result.fixed[p.name]} for p in scopes.known],
             MODEL_ERROR: None if left is None else left._asdict(),
             DAY_ERROR: None if slow is None else slow.as_dict(),
             OPENINGS: openings_of(asked.runs),

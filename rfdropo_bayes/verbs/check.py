@@ -12,13 +12,7 @@ import jax
 import numpy as np
 
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import (
-    Trajectory,
-    check_channels,
-    load_recordings,
-    noise_floor,
-    shared_markers,
-)
+from rfdropo_bayes.data import Trajectory, check_channels, load_recordings, noise_floor, shared_markers
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.thinning import looked_at, thinning_note

@@ -132,10 +132,7 @@ class Guess(NamedTuple):
 
 
 def guess_columns(
-    path: Path,
-    sent: Path | None = None,
-    names: Sequence[str] | None = None,
-    command_names: Sequence[str] | None = None,
+    path: Path, sent: Path | None = None, names: Sequence[str] | None = None, command_names: Sequence[str] | None = None
 ) -> Guess:
     """Guess the meaning of a recording's columns.
 

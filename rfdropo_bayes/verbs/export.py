@@ -99,7 +99,7 @@ def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = Fal
     known = {spec.name: spec for spec in model.robot.specs} if isinstance(model.robot, BlackBox) else {}
     draws = {info.name: record.flat(info.name) for info in record.free if info.name in known}
     values = {name: float(own.mean()) for name, own in draws.items()}
-    held = physical_values(model.spec, model.simulator) | {info.name: value for info, value in record.held}
+    held = physical_values(model.spec, model.simulator) | {info.name: value for info, value in record.fixed}
     values |= {name: value for name, value in held.items() if name in known}
     lines = ["Calibrated by rfdropo_bayes: posterior means; in brackets the 90 % range to randomise over."]
     for name, value in values.items():

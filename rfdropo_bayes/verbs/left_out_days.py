@@ -21,7 +21,7 @@ from rfdropo_bayes.prediction.day_error import DayError, day_error, prior_day_er
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.prediction.predictive import predict_new, thin
 
-CLIMB = LaplaceConfig(starts=1, screen=8, blocks=1, max_steps=10, draws=200)  # from the optimum of all days
+OPTIMISATION = LaplaceConfig(starts=1, prior_draws=8, blocks=1, max_steps=10, draws=200)  # from the optimum of all days
 DRAWS = 100
 OPENINGS = "command_openings"  # of each fitted recording, among the attributes of a posterior
 
@@ -79,8 +79,8 @@ def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[Recordi
     left_out = [recording for recording in days.runs if recording.name in members]
     problem = model.problem(kept, days.start)
     fit_key, new_key = jax.random.split(key)
-    result = run(problem, "laplace", CLIMB, fit_key)
-    held = problem.holding(result.held)
+    result = run(problem, "laplace", OPTIMISATION, fit_key)
+    held = problem.holding(result.fixed)
     return predict_new(
         held.model,
         left_out,

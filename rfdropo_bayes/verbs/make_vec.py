@@ -146,10 +146,7 @@ def steps_of(simulator: AnySimulator) -> str:
 
 
 def randomisation_of(
-    table: TrainingTable,
-    spec: ModelSpec,
-    simulator: AnySimulator,
-    fit: Calibration | Path | None = None,
+    table: TrainingTable, spec: ModelSpec, simulator: AnySimulator, fit: Calibration | Path | None = None
 ) -> Randomisation:
     """Sources of parameters: fixed values, randomised parameters, and parameters that differ between episodes.
 
@@ -278,5 +275,5 @@ def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -
 def _beside_held(found: Randomisation, record: PosteriorRecord | None, simulator: AnySimulator) -> Randomisation:
     """A run's posterior, together with its fixed values of the simulator's parameters."""
     known = {spec.name for spec in simulator.parameters}
-    held = {} if record is None else {info.name: value for info, value in record.held if info.name in known}
+    held = {} if record is None else {info.name: value for info, value in record.fixed if info.name in known}
     return Layers((Point(held), found), found.kind) if held else found

@@ -37,15 +37,7 @@ from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, recorded_model_error
-from rfdropo_bayes.prediction.predictive import (
-    BEGUN,
-    FITTED,
-    KNOWN_NOISE,
-    NOISE,
-    match_cautions,
-    predict_new,
-    thin,
-)
+from rfdropo_bayes.prediction.predictive import BEGUN, FITTED, KNOWN_NOISE, NOISE, match_cautions, predict_new, thin
 from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
@@ -205,7 +197,7 @@ def fitted_scopes(fit: Calibration) -> Scopes:
     """Inferred and fixed parameters of a calibration."""
     model, record = model_of(fit), fit.record
     fixed = fixed_values(model.spec, model.simulator)
-    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.held)
+    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.fixed)
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:

@@ -69,10 +69,7 @@ def compared(position, quaternion, motion, section, held):
 
     (ra, aa), (rb, ab) = ((motion[:3, part], motion[3:, part]) for part in (slice(0, -1), slice(1, None)))
     first = jnp.concatenate(
-        [
-            apply(k.c, ra - rb) - apply(k.a, aa) - apply(k.b, ab),
-            back(k.a, rb - ra) + apply(k.aa, aa) + back(k.ba, ab),
-        ]
+        [apply(k.c, ra - rb) - apply(k.a, aa) - apply(k.b, ab), back(k.a, rb - ra) + apply(k.aa, aa) + back(k.ba, ab)]
     )
     second = jnp.concatenate(
         [apply(k.c, rb - ra) + apply(k.a, aa) + apply(k.b, ab), back(k.b, rb - ra) + apply(k.ba, aa) + apply(k.bb, ab)]

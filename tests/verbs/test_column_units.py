@@ -8,13 +8,7 @@ import pytest
 
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.verbs.column_units import (
-    command_time_unit,
-    command_unit,
-    time_unit,
-    told_unit,
-    unit_of_places,
-)
+from rfdropo_bayes.verbs.column_units import command_time_unit, command_unit, time_unit, told_unit, unit_of_places
 
 ROWS = 161
 NOISE = np.random.default_rng(0).normal(size=(2 * ROWS, 3))

@@ -95,7 +95,12 @@ def test_a_policy_is_trained_under_a_calibration_with_one_command(tmp_path) -> N
     runs = rb.read("virtual/reach_1.nc", folder=REPOSITORY / "experiments")
     model = rb.Model("virtual_trunk", priors={"young_modulus": {}}, noise="white", simulator=SINGLE)
     rb.calibrate(
-        model, runs, rb.Laplace(starts=1, screen=4, max_steps=3, draws=16), seed=0, show=False, out=tmp_path / "fit"
+        model,
+        runs,
+        rb.Laplace(starts=1, prior_draws=4, max_steps=3, draws=16),
+        seed=0,
+        show=False,
+        out=tmp_path / "fit",
     )
     settings = [part for entry in [*QUICK, 'training.critic="parameters"'] for part in ("--set", entry)]
     told = rfdropo("train", "--from", tmp_path / "fit", "--task", "reach", "--goal", "0.01,-0.03,0.13", *settings)

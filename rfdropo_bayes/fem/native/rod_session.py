@@ -138,11 +138,7 @@ class RodSession:
         return lanes.motion._replace(pose=pose)
 
     def advance(
-        self,
-        drive: Float[np.ndarray, "lane steps drives"],
-        *,
-        stride: int = 1,
-        loads: SectionLoads | None = None,
+        self, drive: Float[np.ndarray, "lane steps drives"], *, stride: int = 1, loads: SectionLoads | None = None
     ) -> Motion:
         """Take steps to the drives at their ends, under the loads of each step; recorded before the
         first, and every ``stride``.

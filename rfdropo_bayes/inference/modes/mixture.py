@@ -17,14 +17,14 @@ from numpyro.diagnostics import effective_sample_size
 from scipy.special import softmax
 
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 
 MIXTURES = ("equal", "evidence", "best")
 CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
 STRONG = 3.0  # nats by which it must also be worse: less is no strong evidence under any noise (Kass & Raftery 1995)
 
 
-def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
+def alternatives(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
     """Mask of the optima that explain the data about as well as the best, from the log density of rows.
 
     An optimum is excluded if its sum over rows is lower by more than 3 nats and by more than two standard errors of
@@ -76,6 +76,6 @@ def mixture_cautions(weights: Float[np.ndarray, " mode"], mixture: str) -> list[
     use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
     sentence = (
         f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does "
-        "not describe this posterior; use the bridge or SMC if the noise model is right"
+        "not describe this posterior; use SMC if the noise model is right"
     )
     return [Caution(Code.SEVERAL_OPTIMA, sentence)]

@@ -25,8 +25,8 @@ from scipy.stats import multivariate_normal, multivariate_t
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.modes.mixture import draw_mixture
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.smc.moves import host_generator
 
 CANDIDATE_SHARE = 0.25  # of a budget that optimisations leave to candidates
@@ -40,19 +40,13 @@ LIKE = 0.1  # share of the candidates that counts if the normal describes the po
 
 
 class Reweighted(NamedTuple):
-    """Draws of equal weight.
+    """Draws of equal weight."""
 
-    Attributes:
-        position: unconstrained.
-        rows: log density of each data row at each of them; None for draws of the normals, which no rollout has seen.
-        effective: number of independent draws that they are worth.
-        candidates: number of candidates with a posterior density.
-    """
-
-    position: Float[np.ndarray, "draw d"]
+    position: Float[np.ndarray, "draw d"]  # unconstrained
+    # log density of each data row at each of them; None for draws of the normals, which no rollout has seen
     rows: Float[np.ndarray, "draw row"] | None
-    effective: float
-    candidates: int
+    effective: float  # number of independent draws that they are worth
+    candidates: int  # number of candidates with a posterior density
 
 
 def reweighted(
@@ -120,9 +114,9 @@ def _by_share(
 ) -> Float[np.ndarray, " n"]:
     """Weights of candidates: each optimum gets its share of the mixture, or its share under the exact posterior."""
     mass = by_mode.sum(axis=0)
-    found = mass > 0.0
-    share = mass[found] if by_evidence else weights[found]
-    return by_mode[:, found] @ (share / share.sum() / mass[found])
+    reached = mass > 0.0
+    share = mass[reached] if by_evidence else weights[reached]
+    return by_mode[:, reached] @ (share / share.sum() / mass[reached])
 
 
 def _effective(weight: Float[np.ndarray, " n"]) -> float:
@@ -157,8 +151,8 @@ def _widened(mode: Laplace, u: Float[np.ndarray, "n d"], weight: Float[np.ndarra
     if weight.sum() == 0.0:
         return multivariate_t(mode.mean, 2.0 * mode.covariance, DEGREES)
     mean = weight @ u / weight.sum()
-    spread = (weight * (u - mean).T) @ (u - mean) / weight.sum()
-    return multivariate_t(mean, spread + mode.covariance, DEGREES)
+    covariance = (weight * (u - mean).T) @ (u - mean) / weight.sum()
+    return multivariate_t(mean, covariance + mode.covariance, DEGREES)
 
 
 def _counts(weights: Float[np.ndarray, " mode"], count: int) -> Int[np.ndarray, " mode"]:
@@ -174,14 +168,18 @@ def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) 
     return np.minimum(chosen, len(weight) - 1)[np.asarray(jax.random.permutation(order_key, count))]
 
 
-def reweighting_cautions(found: Reweighted | None) -> list[Caution]:
+def reweighting_cautions(comparison: Reweighted | None) -> list[Caution]:
     """Cautions from the comparison of the normal approximation with the exact posterior; None means no comparison."""
-    remedy = "allow more rollouts, or use the bridge or SMC"
-    if found is None:
+    remedy = "allow more rollouts, or use SMC"
+    if comparison is None:
         sentence = f"no rollouts were left to check the normal approximation that the draws are from: {remedy}"
         return [Caution(Code.NORMAL_DIFFERS, sentence)]
-    if found.effective >= ENOUGH:
+    if comparison.effective >= ENOUGH:
         return []
-    unlike = ": a normal distribution does not describe this posterior" * (found.effective < LIKE * found.candidates)
-    sentence = f"the draws are worth {found.effective:.0f} of {found.candidates} independent ones{unlike}; {remedy}"
-    return [Caution(Code.NORMAL_DIFFERS, sentence, grave=found.effective < TOO_FEW)]
+    unlike = ": a normal distribution does not describe this posterior" * (
+        comparison.effective < LIKE * comparison.candidates
+    )
+    sentence = (
+        f"the draws are worth {comparison.effective:.0f} of {comparison.candidates} independent ones{unlike}; {remedy}"
+    )
+    return [Caution(Code.NORMAL_DIFFERS, sentence, grave=comparison.effective < TOO_FEW)]

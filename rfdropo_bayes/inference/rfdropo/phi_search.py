@@ -87,16 +87,11 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
 
 
 class SearchState(NamedTuple):
-    """History of the search; the optimiser's state is a function of it.
+    """History of the search; the optimiser's state is a function of it."""
 
-    Attributes:
-        candidates: candidates of every finished generation.
-        losses: their losses, each generation at its own horizon.
-        ledger, trace, seconds: as in every method.
-    """
-
-    candidates: Float[np.ndarray, "generation population k"]
-    losses: Float[np.ndarray, "generation population"]
+    candidates: Float[np.ndarray, "generation population k"]  # candidates of every finished generation
+    losses: Float[np.ndarray, "generation population"]  # their losses, each generation at its own horizon
+    # ledger, trace, seconds: as in every method
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float
@@ -179,8 +174,8 @@ def step(
     m, d, horizon = config.rollouts_per_candidate, len(plan.space.names), plan.horizons[i]
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
     simulated = _simulated(horizon, problem.n_rows, config.levels)
-    found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
-    values = -row_scores(problem, plan, found, horizon).sum(axis=1)
+    rollouts = simulate(problem, plan, asked, uniform, simulated, state.ledger)
+    values = -row_scores(problem, plan, rollouts, horizon).sum(axis=1)
     facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
     return state._replace(
@@ -205,12 +200,7 @@ def choose_finalists(state: SearchState, plan: ScorePlan, centre: Float[np.ndarr
     return np.stack(chosen[: max(1, plan.finalists)] if plan.finalists > 1 else chosen[1:2])
 
 
-def run(
-    problem: Problem,
-    config: RfdropoConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: RfdropoConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Search phi and draw from the distribution found.
 
     Raises:
@@ -240,7 +230,7 @@ def run(
         cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
-        held=dict(plan.fixed),
+        fixed=dict(plan.fixed),
         details=details,
     )
 
@@ -290,8 +280,8 @@ def _choose(
     finalists = choose_finalists(state, plan, centre)
     m, n = config.rollouts_per_candidate, problem.n_rows
     uniform = uniforms(jax.random.fold_in(key, FINAL), m, len(plan.space.names), stratified=True)
-    found = simulate(problem, plan, finalists, uniform, n, state.ledger)
-    scores = -row_scores(problem, plan, found, n).sum(axis=1)
+    rollouts = simulate(problem, plan, finalists, uniform, n, state.ledger)
+    scores = -row_scores(problem, plan, rollouts, n).sum(axis=1)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     return finalists[int(np.argmin(scores))], details
@@ -380,11 +370,11 @@ class CrossEntropy:
         return np.minimum(folded, 2.0 * self.high - folded)
 
     def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
-        """Refit to the elite; the spread is taken about the OLD mean, so that it cannot collapse on the way."""
+        """Refit to the elite. Deviations are taken from the OLD mean, so that the width does not collapse early."""
         best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
-        spread = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
+        deviation = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
         self.mean = self.smoothing * best.mean(axis=0) + (1.0 - self.smoothing) * self.mean
-        self.sd = self.smoothing * spread + (1.0 - self.smoothing) * self.sd
+        self.sd = self.smoothing * deviation + (1.0 - self.smoothing) * self.sd
 
     @property
     def centre(self) -> Float[np.ndarray, " d"]:

@@ -110,43 +110,25 @@ class SmcConfig(MethodOptions, called="SMC"):
 
 
 class ReplicatePlan(NamedTuple):
-    """Sizes that are fixed before a replicate starts.
+    """Sizes that are fixed before a replicate starts."""
 
-    Attributes:
-        particles: number of particles.
-        horizons: prefix lengths at the ends of the blocks.
-        budget: rollouts of this replicate; infinite for no limit.
-    """
-
-    particles: int
-    horizons: tuple[int, ...]
-    budget: float
+    particles: int  # number of particles
+    horizons: tuple[int, ...]  # prefix lengths at the ends of the blocks
+    budget: float  # rollouts of this replicate; infinite for no limit
 
 
 class SmcState(NamedTuple):
-    """State of a replicate between two stages.
+    """State of a replicate between two stages."""
 
-    Attributes:
-        population: particles; their rows reach to the end of the present block.
-        block: index of the present block; -1 before the first.
-        stage: number of stages done; random keys derive from it.
-        log_evidence: log p(rows passed).
-        prefix_log_evidence: log evidence at every prefix passed, NaN elsewhere.
-        ledger: cost and exclusions.
-        trace: one dictionary per stage.
-        seconds: time spent.
-        finished: the last stage is done.
-    """
-
-    population: Population
-    block: int
-    stage: int
-    log_evidence: float
-    prefix_log_evidence: Float[np.ndarray, " n_rows"]
-    ledger: Ledger
-    trace: list[dict[str, Any]]
-    seconds: float
-    finished: bool
+    population: Population  # particles; their rows reach to the end of the present block
+    block: int  # index of the present block; -1 before the first
+    stage: int  # number of stages done; random keys derive from it
+    log_evidence: float  # log p(rows passed)
+    prefix_log_evidence: Float[np.ndarray, " n_rows"]  # log evidence at every prefix passed, NaN elsewhere
+    ledger: Ledger  # cost and exclusions
+    trace: list[dict[str, Any]]  # one dictionary per stage
+    seconds: float  # time spent
+    finished: bool  # the last stage is done
 
 
 def decided(n_rows: int, config: SmcConfig) -> SmcConfig:
@@ -230,7 +212,7 @@ def step(
     tuning = config.tuning
     population, info = stage(key, state.population, float(horizon), evaluate, tuning, moves)
     if not np.isfinite(info.log_evidence_increment):
-        raise _nothing_left(state, horizon)
+        raise _no_remainder(state, horizon)
     finished = population.progress == problem.n_rows
     evidence = state.log_evidence + info.log_evidence_increment
     prefix = state.prefix_log_evidence.copy()
@@ -241,8 +223,10 @@ def step(
         moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
         last_key = jax.random.fold_in(key, 1)
         population, done = refresh(last_key, population, info, evaluate, tuning, moves)
-        left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
-        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
+        affordable = (
+            _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
+        )
+        rounds = min(affordable // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
         population = prolong(jax.random.fold_in(key, 2), population, evaluate, tuning, done.moves, rounds)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
@@ -275,11 +259,11 @@ def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows
     if not np.isfinite(plan.budget):
         return 10**9
     looks = sum(plan.horizons[state.block + 1 :]) / n_rows
-    left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
+    remaining = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
     cost = plan.particles * horizon / n_rows
-    if left < cost:
+    if remaining < cost:
         return 0
-    return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
+    return max(1, int((remaining if last else 0.5 * remaining) / cost + 1e-9))
 
 
 def _facts(info: StageInfo) -> dict[str, Any]:
@@ -287,7 +271,7 @@ def _facts(info: StageInfo) -> dict[str, Any]:
     return {name: getattr(info, name) for name in kept}
 
 
-def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
+def _no_remainder(state: SmcState, horizon: int) -> NoLikelihoodError:
     return NoLikelihoodError(
         "the prior excludes the data: no parameter set has a positive likelihood "
         f"up to row {horizon} ({state.ledger.reasons})",
@@ -296,12 +280,7 @@ def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
     )
 
 
-def run(
-    problem: Problem,
-    config: SmcConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Sample a problem's posterior with independent replicates.
 
     Raises:

@@ -38,61 +38,37 @@ Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Population(NamedTuple):
-    """Weighted particles on their way along a path.
+    """Weighted particles on their way along a path."""
 
-    Attributes:
-        position: unconstrained particles.
-        base: log density of the path's starting target.
-        rows: log density still to come in, and already in, row by row; minus infinity is a dead particle.
-        log_weights: normalised.
-        progress: position s on the path, in rows.
-        scale: step size of the proposals, carried from stage to stage.
-    """
-
-    position: Float[np.ndarray, "n d"]
-    base: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n d"]  # unconstrained particles
+    base: Float[np.ndarray, " n"]  # log density of the path's starting target
+    # log density still to come in, and already in, row by row; minus infinity is a dead particle
     rows: Float[np.ndarray, "n h"]
-    log_weights: Float[np.ndarray, " n"]
-    progress: float
-    scale: float
+    log_weights: Float[np.ndarray, " n"]  # normalised
+    progress: float  # position s on the path, in rows
+    scale: float  # step size of the proposals, carried from stage to stage
 
 
 class Tuning(NamedTuple):
-    """Settings of a stage's moves.
+    """Settings of a stage's moves."""
 
-    Attributes:
-        target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        max_moves: most moves in a stage.
-    """
-
-    target_ess: float
-    max_moves: int
+    target_ess: float  # effective sample size kept from one target to the next, as a share of the live particles
+    max_moves: int  # most moves in a stage
 
 
 class StageInfo(NamedTuple):
-    """Facts about one stage.
+    """Facts about one stage."""
 
-    Attributes:
-        progress: position on the path at its end.
-        log_evidence_increment: its increment of the log evidence.
-        row_log_evidence: log evidence, relative to the start of the stage, at each whole row it passed.
-        passed: these rows, as prefix lengths.
-        ess: effective sample size before resampling, as a share of all particles.
-        moves: number of moves of every particle, 0 if weights were kept instead.
-        acceptance: mean acceptance over the moves.
-        scale: step size at the end.
-        correlation: slowest remaining correlation after the moves.
-    """
-
-    progress: float
-    log_evidence_increment: float
+    progress: float  # position on the path at its end
+    log_evidence_increment: float  # its increment of the log evidence
+    # log evidence, relative to the start of the stage, at each whole row it passed
     row_log_evidence: Float[np.ndarray, " passed"]
-    passed: Int[np.ndarray, " passed"]
-    ess: float
-    moves: int
-    acceptance: float
-    scale: float
-    correlation: float
+    passed: Int[np.ndarray, " passed"]  # these rows, as prefix lengths
+    ess: float  # effective sample size before resampling, as a share of all particles
+    moves: int  # number of moves of every particle, 0 if weights were kept instead
+    acceptance: float  # mean acceptance over the moves
+    scale: float  # step size at the end
+    correlation: float  # slowest remaining correlation after the moves
 
 
 def path_density(rows: Float[np.ndarray, "n h"], progress: float) -> Float[np.ndarray, " n"]:
@@ -162,12 +138,12 @@ def cross_references(population: Population) -> tuple[Reference, Reference]:
     weights = np.exp(population.log_weights)
     halves = (slice(n // 2, n), slice(0, n // 2))
     whole = fit_reference(population.position, weights / weights.sum())
-    found = []
+    references = []
     for half in halves:
         share = weights[half].sum()
         usable = share > 0.0 and distinct_size(population.position[half], weights[half]) > 2.0
-        found.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
-    return found[0], found[1]
+        references.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
+    return references[0], references[1]
 
 
 def resample(key: PRNGKeyArray, population: Population) -> tuple[Population, Int[np.ndarray, " n"]]:
@@ -245,12 +221,7 @@ def _by_halves(
 
 
 def stage(
-    key: PRNGKeyArray,
-    population: Population,
-    stop: float,
-    evaluate: Evaluate,
-    tuning: Tuning,
-    moves: int,
+    key: PRNGKeyArray, population: Population, stop: float, evaluate: Evaluate, tuning: Tuning, moves: int
 ) -> tuple[Population, StageInfo]:
     """Reweight towards ``stop``; resample and move unless the end was reached with enough effective particles.
 
@@ -263,12 +234,7 @@ def stage(
 
 
 def refresh(
-    key: PRNGKeyArray,
-    population: Population,
-    info: StageInfo,
-    evaluate: Evaluate,
-    tuning: Tuning,
-    moves: int,
+    key: PRNGKeyArray, population: Population, info: StageInfo, evaluate: Evaluate, tuning: Tuning, moves: int
 ) -> tuple[Population, StageInfo]:
     """Resample to equal weights and move under the present target."""
     resample_key, move_key = jax.random.split(key)
@@ -292,13 +258,15 @@ def prolong(
     The key must differ from the key of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``,
     and moves with the same random numbers end near their start.
     """
-    found = [population]
+    populations = [population]
     for index in range(rounds):
         second = np.arange(len(population.base)) >= len(population.base) // 2
         round_key = jax.random.fold_in(key, 1 + index)
-        found.append(move(round_key, found[-1], cross_references(found[-1]), second, evaluate, tuning, moves)[0])
+        populations.append(
+            move(round_key, populations[-1], cross_references(populations[-1]), second, evaluate, tuning, moves)[0]
+        )
     joined: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in found]) for name in ("position", "base", "rows")
+        name: np.concatenate([getattr(p, name) for p in populations]) for name in ("position", "base", "rows")
     }
     count = len(joined["base"])
     return population._replace(log_weights=np.full(count, -np.log(count)), **joined)

@@ -68,10 +68,7 @@ class MuJoCoLanes:
         return ctrl
 
     def _moved(
-        self,
-        rows: np.ndarray,
-        commands: Float[np.ndarray, "row step channel"],
-        held: Float[np.ndarray, "row channel"],
+        self, rows: np.ndarray, commands: Float[np.ndarray, "row step channel"], held: Float[np.ndarray, "row channel"]
     ) -> Motion:
         """Take a step for each command, and one more under ``held`` that shows the state before it."""
         steps, clock = commands.shape[1], self.rollouts.model.opt.timestep

@@ -10,13 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.adapters.mujoco_elements import (
-    ATTRIBUTES,
-    element_names,
-    field_of,
-    places_of,
-    plain_name,
-)
+from rfdropo_bayes.simulators.adapters.mujoco_elements import ATTRIBUTES, element_names, field_of, places_of, plain_name
 
 INFERRED = (
     ("body", "mass"),
