@@ -316,7 +316,7 @@ class LawSearch:
         return law
 
     def laws(self, target: FitTarget, fit: Fit, forced: bool = False) -> Iterator[FoundLaw]:
-        """Ports of an effect that the model lacks, then its law after each term. If the time is up, the last law stands.
+        """Ports of an effect that the model lacks, then its law after each term. The last law stands if the time is up.
 
         Args:
             target: target of the model's fit.

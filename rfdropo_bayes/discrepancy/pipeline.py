@@ -296,7 +296,8 @@ def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
         kept = replace(kept, named=replace(last, screen=_final_screen(last)))
     found = replace(found, kept=kept).after(GAIN)
     yield found
-    verdict, passes = _verdict(kept, problem, ended=True), kept.named.screens[-1].omnibus.p > problem.rules.extended_passes
+    verdict = _verdict(kept, problem, ended=True)
+    passes = kept.named.screens[-1].omnibus.p > problem.rules.extended_passes
     if verdict in (PARTLY, UNEXPLAINED) and not passes:
         found = replace(found, suspected=_suspected(search, as_measured(last.search.target, last.base)))
         yield found

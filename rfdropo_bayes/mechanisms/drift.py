@@ -133,7 +133,7 @@ def drift_of(kind: Any) -> type:
 
 
 class DriveZero(InCommandUnit, MemorylessActuation):
-    """The zero of all drives is shifted: the base of its drift; the zeros of a robot's cables are its own parameters."""
+    """The zero of all drives is shifted, of which a drift is made: the zeros of cables are parameters of a robot."""
 
     name = "drive_zero"
     in_metres = (ParameterSpec("drive_zero", "m", -0.1, 0.1, 0.0, normal(0.005), "shift of the zero of every drive"),)
