@@ -16,7 +16,6 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 
-SPACINGS = ("geometric", "linear")
 NOT_A_NUMBER = "not_a_number"
 REDRAWS = 256  # most prior draws, as a multiple of the requested number
 
@@ -103,24 +102,14 @@ def representable_draws(
     return np.concatenate(positions), np.concatenate(densities), drawn
 
 
-def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tuple[int, ...]:
-    """Prefix lengths of a sequential method; strictly increasing, ending at ``n_rows``.
-
-    Args:
-        n_rows: rows of data.
-        blocks: number of blocks wanted; fewer if there are too few rows.
-        spacing: ``"geometric"`` doubles (the sum of all prefixes stays below ``2 n_rows``), ``"linear"`` has equal
-            blocks.
+def block_boundaries(n_rows: int, blocks: int) -> tuple[int, ...]:
+    """Prefix lengths of a sequential method: at most ``blocks``, which double and end at ``n_rows``. Their sum stays
+    below ``2 n_rows``.
 
     Raises:
-        InputError: no row, no block, or an unknown spacing.
+        InputError: no row, or no block.
     """
     if n_rows < 1 or blocks < 1:
         raise InputError("a schedule needs at least one row and one block", where="[inference] blocks")
-    if spacing == "linear":
-        raw = [n_rows * (k + 1) / blocks for k in range(blocks)]
-    elif spacing == "geometric":
-        raw = [n_rows * 2.0 ** (k + 1 - blocks) for k in range(blocks)]
-    else:
-        raise InputError(f"unknown spacing {spacing!r}", where="[inference] spacing", remedy=f"use one of {SPACINGS}")
+    raw = [n_rows * 2.0 ** (k + 1 - blocks) for k in range(blocks)]
     return tuple(sorted({max(1, math.ceil(value - 1e-9)) for value in raw}))

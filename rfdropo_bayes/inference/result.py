@@ -129,8 +129,7 @@ def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
     if sd > SCATTERED:
         sentence = (
             f"the log evidences of {len(log_evidence)} replicates scatter by {sd:.2g}: compare models "
-            "only if they differ by several times that, or take more particles or a target_ess closer to "
-            "1"
+            "only if they differ by several times that, or take more particles"
         )
         cautions.append(Caution(Code.EVIDENCE_SCATTERED, sentence))
     apart = {}

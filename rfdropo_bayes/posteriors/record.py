@@ -27,7 +27,7 @@ from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, Scope
 
 AXES = ("x", "y", "z")
 DRAWS = "draws"  # attribute of a prediction: how many draws are its own
-FIXED = "held_parameters"  # attribute of a posterior
+FIXED = "fixed_parameters"  # attribute of a posterior
 
 
 @dataclass(frozen=True)

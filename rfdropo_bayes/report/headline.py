@@ -16,7 +16,7 @@ def headline(summary: Mapping[str, Any]) -> list[str]:
             _fitted(summary),
             _errors(summary),
             _against(summary),
-            (summary.get("unseen_days") or {}).get("sentence", ""),
+            (summary.get("unseen_sessions") or {}).get("sentence", ""),
             _objects(summary),
             _bounds(summary),
             _excluded(summary),

@@ -216,7 +216,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "objects": {name: asdict(scores) for name, scores in facts.objects.items()},
         "cautions": [caution.as_dict() for caution in facts.cautions],
         "warnings": [caution.sentence for caution in facts.cautions],
-        "unseen_days": dict(facts.unseen_days) or None,
+        "unseen_sessions": dict(facts.unseen_sessions) or None,
         "limits": list(facts.limits),
         "outline": facts.outline and dict(facts.outline),
         "versions": dict(facts.versions),

@@ -109,9 +109,9 @@ class ArcSearch:
         table = np.zeros((columns, kinds, AZIMUTHS))
         for _ in range(int(moving.sum())):
             waiting = [int(c) for c in np.flatnonzero(moving) if not use[c]]
-            found = {c: self._scan(c, kind, azimuth, sign, use) for c in waiting}
-            best = max(waiting, key=lambda c: found[c].max())
-            kind[best], azimuth[best] = self._argmax(found[best])
+            scores = {c: self._scan(c, kind, azimuth, sign, use) for c in waiting}
+            best = max(waiting, key=lambda c: scores[c].max())
+            kind[best], azimuth[best] = self._argmax(scores[best])
             use[best] = True
         score = -1.0
         for _ in range(SWEEPS):
@@ -137,21 +137,21 @@ class ArcSearch:
 
     def best(self) -> list[Arrangement]:
         """The arrangements that explain the motion best, with each sign of all commands that may explain it."""
-        found = {sign: self.relaxed(sign) for sign in (1, -1)}
-        left = {sign: 1.0 - max(float(table.max()), 0.0) ** 2 for sign, (_, table) in found.items()}
-        likely = [sign for sign in found if left[sign] <= HOPELESS * min(left.values())]
-        return [self.improved(self.turned(self._assigned(*found[sign], sign))) for sign in likely]
+        relaxed = {sign: self.relaxed(sign) for sign in (1, -1)}
+        unexplained = {sign: 1.0 - max(float(table.max()), 0.0) ** 2 for sign, (_, table) in relaxed.items()}
+        likely = [sign for sign in relaxed if unexplained[sign] <= HOPELESS * min(unexplained.values())]
+        return [self.improved(self.turned(self._assigned(*relaxed[sign], sign))) for sign in likely]
 
     def improved(self, arrangement: Arrangement) -> Arrangement:
         """An arrangement that no exchange of two columns or two sections betters, sections turned anew."""
         for _ in range(SWEEPS):
             others = list(neighbours(arrangement, self.sections))
             likely = np.argsort(-self.score_of(others))[:TURNED]
-            found = [arrangement, *(self.turned_far(others[k]) for k in likely)]
-            scores = self.score_of(found)
+            tried = [arrangement, *(self.turned_far(others[k]) for k in likely)]
+            scores = self.score_of(tried)
             if scores.max() <= scores[0] + GAIN:
                 break
-            arrangement = found[int(np.argmax(scores))]
+            arrangement = tried[int(np.argmax(scores))]
         return arrangement
 
     def score_of(self, arrangements: Sequence[Arrangement]) -> np.ndarray:

@@ -92,18 +92,18 @@ class Arcs(NamedTuple):
     def _placed(self, bent: Float[np.ndarray, "guess row 3 arc"]) -> Float[np.ndarray, "guess row marker 3"]:
         shape = bent.shape[:2]
         place, frame = np.zeros((*shape, 3)), np.broadcast_to(np.eye(3), (*shape, 3, 3))
-        found = np.zeros((*shape, len(self.marker_arc), 3))
+        placed = np.zeros((*shape, len(self.marker_arc), 3))
         for arc, length in enumerate(self.length):
             for marker in np.flatnonzero(self.marker_arc == arc):
                 share = float(self.marker_share[marker])
                 way, turned = _arc(share * bent[..., arc], share * length)
                 there = place + np.einsum("...ij,...j->...i", frame, way)
                 offset = turned[..., :2] @ self.marker_offset[marker]
-                found[:, :, marker] = there + np.einsum("...ij,...j->...i", frame, offset)
+                placed[:, :, marker] = there + np.einsum("...ij,...j->...i", frame, offset)
             way, turned = _arc(bent[..., arc], length)
             place = place + np.einsum("...ij,...j->...i", frame, way)
             frame = frame @ turned
-        return found
+        return placed
 
 
 def _tensions(

@@ -27,8 +27,8 @@ from rfdropo_bayes.verbs.column_units import (
     command_unit,
     length_unit,
     time_unit,
-    told_time_units,
-    told_unit,
+    time_units_in_names,
+    unit_in_names,
 )
 
 TIME = re.compile(
@@ -90,7 +90,7 @@ class Guess(NamedTuple):
         tensions, motor_angles: columns of measured forces and angles, one per command; else empty.
         motor_angle_unit: unit of motor angles.
         counts_per_turn: counts per turn of the spool, if a unit is "counts".
-        left: other columns.
+        unused: other columns.
         format: format of the file, one of `mapped_formats.MAPPED`.
         command_time, command_time_unit: column and unit of the commands' own times; None without them.
         units: units of columns other than command_unit or position_unit.
@@ -111,7 +111,7 @@ class Guess(NamedTuple):
     tensions: list[str]
     motor_angles: list[str]
     motor_angle_unit: str
-    left: list[str]
+    unused: list[str]
     format: str
     command_time: str | None
     command_time_unit: str
@@ -158,11 +158,11 @@ def guess_columns(
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
     commands = _commands(source, free, any_name=own or sent is not None)
-    _check_found(path, format, columns, positions, commands)
+    _check_columns(path, format, columns, positions, commands)
     tensions = tensions if len(tensions) == len(commands) else []
     units = {
         "command_unit": command_unit(sending, source, commands),
-        "position_unit": (Unit(unit) if unit else told_unit(whole, names_of(positions), named_columns.METRES))
+        "position_unit": (Unit(unit) if unit else unit_in_names(whole, names_of(positions), named_columns.METRES))
         or length_unit(table[names_of(positions)]),
         "time_unit": Unit("s")
         if format == rosbag.FORMAT
@@ -180,7 +180,7 @@ def guess_columns(
         markers=_marker_names(list(triples), None if own else STRUCTURE),
         tensions=tensions,
         motor_angles=angles,
-        left=[name for name in columns if name not in used],
+        unused=[name for name in columns if name not in used],
         format=format,
         command_time=clock,
         units={**units["command_unit"].others, **units["position_unit"].others},
@@ -207,9 +207,11 @@ def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[
     return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *angles)]
 
 
-def _check_found(path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]) -> None:
-    for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
-        if not found:
+def _check_columns(
+    path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]
+) -> None:
+    for what, names in (("positions (columns in x, y and z)", positions), ("commands", commands)):
+        if not names:
             shown = ", ".join(columns[:MOST_SHOWN]) + (", ..." if len(columns) > MOST_SHOWN else "")
             raise InputError(
                 f"found no {what} among the columns {shown}",
@@ -224,7 +226,7 @@ def _measured_angles(whole: CsvTable, table: pd.DataFrame, angles: list[str], se
     """Columns of measured angles that are of use beside commands in the unit ``sent``, and their unit."""
     if not angles:
         return [], Unit("rad")
-    unit = told_unit(whole, angles, ANGLES) or angle_unit(table, angles)
+    unit = unit_in_names(whole, angles, ANGLES) or angle_unit(table, angles)
     if unit.others or (unit.unit == named_columns.COUNTS and sent not in ANGLES):
         return [], Unit("rad")  # nothing would use them, and their size is not known
     return angles, unit
@@ -281,7 +283,7 @@ def _clock_of(table: CsvTable) -> str | None:
     """The first column that is called a time and holds times; else the first in a unit of time that always rises."""
     names = [str(name) for name in table.frame.columns]
     called = next((name for name in names if TIME.search(name) and _holds_times(table, name)), None)
-    return called or next((name for name in names if told_time_units(table, name) and _rises(table, name)), None)
+    return called or next((name for name in names if time_units_in_names(table, name) and _rises(table, name)), None)
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
@@ -290,16 +292,16 @@ def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
         common: names for common, names in triples.items() if not (NO_PLACE.search(common) or SENT.search(common))
     }
     for chosen in (BODY, MARKER):
-        found = {common: names for common, names in places.items() if chosen.search(common)}
-        if found:
-            return found
+        chosen_places = {common: names for common, names in places.items() if chosen.search(common)}
+        if chosen_places:
+            return chosen_places
     return {common: names for common, names in places.items() if not DERIVED.search(common)} or places
 
 
 def _commands(table: pd.DataFrame, names: list[str], *, any_name: bool) -> list[str]:
     """Columns of commands; if no name matches, all columns in files of a user's own format."""
-    told = [name for name in names if SENT.search(name)]
-    names = told or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
+    sent = [name for name in names if SENT.search(name)]
+    names = sent or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
     turns = {name for four in _quaternions(table, names) for name in four}
     names = [name for name in names if name not in turns]
     called = [name for name in names if COMMAND.search(name)]
@@ -318,14 +320,14 @@ def _counts_rows(values: pd.Series) -> bool:
 
 def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
     """Four columns side by side that are of unit length in all rows, and not at rest on an axis."""
-    found = []
+    quaternions = []
     for first in range(len(names) - 3):
         four = names[first : first + 4]
         values = table[four].to_numpy(dtype=float)
         seen = values[np.isfinite(values).all(axis=1)]
         if len(seen) > MOST_SHOWN and np.all(np.abs(np.linalg.norm(seen, axis=1) - 1.0) < UNIT_LENGTH):
-            found += [four] if (np.abs(seen).max(axis=1) < 1.0).any() else []
-    return found
+            quaternions += [four] if (np.abs(seen).max(axis=1) < 1.0).any() else []
+    return quaternions
 
 
 def names_of(positions: list[list[str]]) -> list[str]:
@@ -335,12 +337,12 @@ def names_of(positions: list[list[str]]) -> list[str]:
 
 def _triples(names: list[str]) -> dict[str, list[str]]:
     """Columns that differ in one letter, x, y or z: their common name, and the three in this order."""
-    found: dict[str, dict[str, str]] = {}
+    triples: dict[str, dict[str, str]] = {}
     for name in names:
         for match in AXIS.finditer(name):
             common = f"{name[: match.start()]}*{name[match.end() :]}".lower()
-            found.setdefault(common, {})[match[0].lower()] = name
-    return {common: [axes[a] for a in "xyz"] for common, axes in found.items() if set(axes) == set("xyz")}
+            triples.setdefault(common, {})[match[0].lower()] = name
+    return {common: [axes[a] for a in "xyz"] for common, axes in triples.items() if set(axes) == set("xyz")}
 
 
 def _array_triples(names: list[str]) -> dict[str, list[str]]:
@@ -348,14 +350,14 @@ def _array_triples(names: list[str]) -> dict[str, list[str]]:
     arrays: dict[str, list[str]] = {}
     for name in names:
         arrays.setdefault(name.partition("[")[0], []).append(name)
-    found = _triples(names)
+    triples = _triples(names)
     for array, columns in arrays.items():
         other = any(pattern.search(f"{array}[") for pattern in (COMMAND, SENT, FORCE, MEASURED, NO_COMMAND))
-        if len(columns) % 3 or other or any(name in triple for triple in found.values() for name in columns):
+        if len(columns) % 3 or other or any(name in triple for triple in triples.values() for name in columns):
             continue
         for k in range(0, len(columns), 3):
-            found[f"{array}[{k // 3}]*" if len(columns) > 3 else f"{array}*".lower()] = columns[k : k + 3]
-    return found
+            triples[f"{array}[{k // 3}]*" if len(columns) > 3 else f"{array}*".lower()] = columns[k : k + 3]
+    return triples
 
 
 def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list[str]:

@@ -77,13 +77,13 @@ def installed_priors(
         pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording)
         if pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
-    turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.left_over, frame.shift)
-    found = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.3g} % of the motion there"
+    turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.remaining_turn, frame.shift)
+    explained = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.3g} % of the motion there"
     for axis, place in zip("xyz", shift, strict=True):
         words = f"origin of the measuring frame: {ORIGIN:g} of the body's length"
         normal(f"offset_{axis}", ORIGIN * robot.length, words, place)
     for axis, angle, wide in zip("xyz", turn, (TILT, TILT, TURN), strict=True):
-        normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{found}", angle)
+        normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{explained}", angle)
     if robot.command_unit == "m":
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")

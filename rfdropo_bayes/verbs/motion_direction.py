@@ -76,23 +76,23 @@ def _across(position: np.ndarray) -> np.ndarray:
     return plane - plane.mean()
 
 
-def direction_doubt(found: Direction, axes: tuple[str, str, str] | None) -> str | None:
+def direction_doubt(direction: Direction, axes: tuple[str, str, str] | None) -> str | None:
     """Doubt about the frame or the order of the cables from a direction, in words; None without doubt.
 
     Args:
-        found: the direction.
+        direction: direction of the motion.
         axes: axes of [data.columns] used to read the recordings; None for formats that have none.
     """
-    if found.agreement >= AGREEING and abs(found.turn) > TURNED:
-        degrees = np.degrees(found.turn)
+    if direction.agreement >= AGREEING and abs(direction.turn) > TURNED:
+        degrees = np.degrees(direction.turn)
         return (
             f"the measured motion is turned about z by {degrees:.0f} degrees, counted from +x towards +y, from the "
-            f"motion that the commands ask for (agreement {found.agreement:.2f}): {_remedy(found.turn, axes)}"
+            f"motion that the commands ask for (agreement {direction.agreement:.2f}): {_remedy(direction.turn, axes)}"
         )
-    if found.agreement < AGREEING <= found.mirrored:
+    if direction.agreement < AGREEING <= direction.mirrored:
         return (
-            f"the markers move as in a mirror (agreement {found.mirrored:.2f}, without the mirror "
-            f"{found.agreement:.2f}): {_mirror_remedy(found.mirror_turn, axes)}"
+            f"the markers move as in a mirror (agreement {direction.mirrored:.2f}, without the mirror "
+            f"{direction.agreement:.2f}): {_mirror_remedy(direction.mirror_turn, axes)}"
         )
     return None
 

@@ -39,18 +39,18 @@ def recording_cautions(
         recordings: recordings as read.
         columns: table used to read them; None for formats that have none.
     """
-    found = [
+    cautions = [
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
         for recording in recordings
         for note in recording.notes
     ]
     for recording in recordings:
-        found += _misnamed(recording, robot.marker_names)
+        cautions += _misnamed(recording, robot.marker_names)
     if isinstance(robot, Robot):
         for recording in recordings:
-            found += _unasked(recording, robot) + _beyond_the_body(recording, robot)
-        found += _placements(robot, recordings, columns)
-    return found + _copies(recordings)
+            cautions += _unasked(recording, robot) + _beyond_the_body(recording, robot)
+        cautions += _placements(robot, recordings, columns)
+    return cautions + _copies(recordings)
 
 
 def cautions_of_fit(

@@ -107,7 +107,7 @@ OWN = "own"
 def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
     """Priors of the inferred parameters of a robot at rest, without parameters of single recordings."""
     drawn = scopes.sample(jax.random.key(0), DRAWS)
-    found = []
+    scales = []
     for parameter in scopes.parameters:
         draws, spec = np.asarray(drawn[parameter.name]), parameter.spec
         if parameter.name not in known or not np.ptp(draws) > 0.0:
@@ -116,8 +116,8 @@ def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
         logarithmic = family in ("LogNormal", "LogUniform") and bool(np.all(draws > 0.0))
         inside = np.log(draws) if logarithmic else draws
         middle, sd = float(np.median(inside)), float(np.std(inside))
-        found.append(Scale(spec.name, spec.unit, logarithmic, middle, sd, spec.low, spec.high))
-    return found
+        scales.append(Scale(spec.name, spec.unit, logarithmic, middle, sd, spec.low, spec.high))
+    return scales
 
 
 def least_squares(
@@ -137,18 +137,18 @@ def least_squares(
     size = float(np.std(measured[seen])) or 1.0
 
     def residuals(made: Float[np.ndarray, "set number"]) -> Float[np.ndarray, "set number"]:
-        left = measured[seen] - made[:, seen]
-        return np.where(np.isfinite(left), left, size)
+        residual = measured[seen] - made[:, seen]
+        return np.where(np.isfinite(residual), residual, size)
 
     for _ in range(ITERATIONS):
-        left = residuals(predict(z + STEP * np.vstack([np.zeros(count), np.eye(count)])))
-        noise = max(float(np.sqrt(np.mean(left[0] ** 2))), SMALLEST)
-        slope = (left[0] - left[1:]) / STEP / noise
+        residual = residuals(predict(z + STEP * np.vstack([np.zeros(count), np.eye(count)])))
+        noise = max(float(np.sqrt(np.mean(residual[0] ** 2))), SMALLEST)
+        slope = (residual[0] - residual[1:]) / STEP / noise
         information = np.eye(count) + slope @ slope.T
-        step = np.linalg.solve(information, slope @ left[0] / noise - z)
+        step = np.linalg.solve(information, slope @ residual[0] / noise - z)
         tried = z + np.geomspace(1.0, SHORTEST, count + 1)[:, None] * step
         cost = np.sum((residuals(predict(tried)) / noise) ** 2, axis=1) + np.sum(tried**2, axis=1)
-        before = float(np.sum((left[0] / noise) ** 2) + np.sum(z**2))
+        before = float(np.sum((residual[0] / noise) ** 2) + np.sum(z**2))
         if cost.min() >= before:
             break
         z = tried[int(np.argmin(cost))]
@@ -190,12 +190,14 @@ def fit_at_rest(
     counts = [len(run.time) for run in (*fit, *test)]
     number = np.repeat(np.arange(len(counts)), counts)
     ways = np.concatenate([_ways(run.command_at(run.time - late)) for run in (*fit, *test)])
-    held = number >= len(fit) if test else np.ones(len(number), dtype=bool)
-    index = np.unique(np.concatenate([_even(np.flatnonzero(held), SHOWN), _even(np.flatnonzero(~held), SHOWN // 2)]))
-    shown, judged = whole.of(index), held[index]
+    tested = number >= len(fit) if test else np.ones(len(number), dtype=bool)
+    index = np.unique(
+        np.concatenate([_even(np.flatnonzero(tested), SHOWN), _even(np.flatnonzero(~tested), SHOWN // 2)])
+    )
+    shown, rated = whole.of(index), tested[index]
     residual = shown.position - made(z[None], shown)[0]
     without = {
-        name: _rms(shown.position - path[index], judged) for name, path in _without_physics(fit, test, robot).items()
+        name: _rms(shown.position - path[index], rated) for name, path in _without_physics(fit, test, robot).items()
     }
     start, end = (rows.position - each[0] for each in (made(np.zeros((1, len(z))), rows), made(z[None], rows)))
     fitted = np.ones(len(rows.time), dtype=bool)
@@ -204,10 +206,10 @@ def fit_at_rest(
         robot.shown,
         _rms(start, fitted),
         _rms(end, fitted),
-        {OWN: _rms(residual, judged), **without},
-        tuple(_rms(residual[:, : k + 1], judged) for k in range(len(robot.shown))),
+        {OWN: _rms(residual, rated), **without},
+        tuple(_rms(residual[:, : k + 1], rated) for k in range(len(robot.shown))),
         len(rows.time),
-        int(judged.sum()),
+        int(rated.sum()),
         bool(test),
         shown,
         residual,
@@ -226,14 +228,14 @@ def _without_physics(
         "linear FIR": fit_fir(fit, groups, degree=1).predict,
         "mean pose": mean_pose(fit),
     }
-    found = {}
+    predictions = {}
     for name, predict in predictors.items():
         paths = []
         for run in (*fit, *test):
             chosen = [run.marker_names.index(marker) for marker in robot.shown]
             paths.append(predict(run)[:, chosen])
-        found[name] = np.concatenate(paths)
-    return found
+        predictions[name] = np.concatenate(paths)
+    return predictions
 
 
 def _estimate(scale: Scale, z: float, kept: float) -> Estimate:

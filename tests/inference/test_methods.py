@@ -24,7 +24,7 @@ OTHERS = ("nuts", "nested")
     [
         ("smd", {}, "did you mean 'smc'"),
         ("smc", {"particels": 100}, "did you mean 'particles'"),
-        ("smc", {"variance_floor": 1e-5}, "unknown option 'variance_floor'"),
+        ("smc", {"finalists": 5}, "unknown option 'finalists'"),
         ("smc", {"metod": "laplace"}, "did you mean 'method'"),
         ("rfdropo", {"rolouts": 100}, "did you mean 'rollouts'"),
         ("smc", {"particles": "many"}, "'many' is not of type int"),

@@ -23,7 +23,7 @@ from .toys import Decay, Spring
 
 KEY = jax.random.key(12)
 OPTIONS = {
-    "smc": {"particles": 40, "replicates": 2, "blocks": 2, "target_ess": 0.3},
+    "smc": {"particles": 40, "replicates": 2, "blocks": 2},
     "laplace": {"starts": 2, "blocks": 2, "draws": 50},
     "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
 }
@@ -185,7 +185,7 @@ def test_a_checkpoint_of_another_run_is_refused(change, tmp_path):
     methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
     options, key = dict(OPTIONS["smc"]), KEY
     if change == "options":
-        options["target_ess"] = 0.6
+        options["particles"] = 50
     elif change == "key":
         key = jax.random.key(13)
     elif change == "data":

@@ -24,7 +24,7 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.report import page
 from rfdropo_bayes.verbs import adapt as adaptation
-from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
+from rfdropo_bayes.verbs.left_out_sessions import of_unseen_sessions, openings_of
 from tests.undrawn import without_panels
 from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
@@ -270,7 +270,7 @@ def test_a_day_that_the_model_cannot_fit_has_a_caution(known, zeros):
     run = recorded(["b"], zeros[1:2], 51)[0]
     drift = 10.0 * SIGMA * np.sqrt(3.0) * np.sin(40.0 * run.time)
     off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + xr.DataArray(drift, dims="time")))
-    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.DAY_UNMATCHED]
+    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.SESSION_UNMATCHED]
     times = float(said[0].sentence.removeprefix("the session is fitted ").partition(" ")[0])
     assert times == pytest.approx(np.sqrt(1.0 + 10.0**2 * 3.0 / 2.0), rel=0.25)
     assert not [c for c in rb.adapt(known, run, show=False).cautions if "times worse" in c.sentence]
@@ -327,8 +327,8 @@ def test_fitted_days_under_other_commands_are_unseen(zeros):
     repeat, new = (fitted[0].with_attributes(name=name) for name in ("day_0_b", "new"))
     other = recorded(["day_0_c"], zeros[:1], 77)[0]
     days = ["day_0", "day_1"]
-    assert of_unseen_days([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
-    assert of_unseen_days([repeat, other, new], DAYS, days, None) == ["new"]
+    assert of_unseen_sessions([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
+    assert of_unseen_sessions([repeat, other, new], DAYS, days, None) == ["new"]
 
 
 @pytest.mark.slow

@@ -32,13 +32,7 @@ from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
-from rfdropo_bayes.inference.modes.mixture import (
-    MIXTURES,
-    alternatives,
-    draw_mixture,
-    mixture_cautions,
-    mixture_weights,
-)
+from rfdropo_bayes.inference.modes.mixture import alternatives, draw_mixture, mixture_cautions, shares
 from rfdropo_bayes.inference.modes.optimisation import (
     Laplace,
     LevenbergState,
@@ -82,8 +76,6 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
         tolerance: predicted gain of a step below which an optimisation ends [nat].
         jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximations, weighted by the exact posterior and resampled.
-        mixture: weights of the optima that explain the data about equally well, see `mixture.alternatives`: "equal",
-            "evidence" (Laplace's), or "best" for the best alone.
         rollouts: budget in full-length rollouts, shared by the optimisations, with at most `PILOT_SHARE` for a
             pilot run; the rest, at least a quarter, weights the draws. None for no limit.
     """
@@ -97,7 +89,6 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
     jacobian: str = "auto"
     draws: int = 2000
     rollouts: float | None = None
-    mixture: str = "equal"
 
     def __post_init__(self) -> None:
         for name in ("starts", "prior_draws", "blocks", "max_steps", "draws"):
@@ -110,10 +101,6 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
             )
         if self.tolerance <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
             raise InputError("tolerance and rollouts must be positive", where="[inference]")
-        if self.mixture not in MIXTURES:
-            raise InputError(
-                f"unknown mixture {self.mixture!r}", where="[inference]", remedy=f"use one of {', '.join(MIXTURES)}"
-            )
         if self.jacobian not in JACOBIANS:
             raise InputError(
                 f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"use one of {', '.join(JACOBIANS)}"
@@ -312,14 +299,7 @@ def pilot_run(
     blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
     # The sampler assumes rows of equal cost in a block, which overestimates short prefixes.
     whole = None if config.rollouts is None else PILOT_SHARE * config.rollouts * problem.n_rows / horizons[-1]
-    sampling = sampler.SmcConfig(
-        rollouts=whole,
-        particles=config.pilot_particles,
-        blocks=len(horizons),
-        spacing="linear",
-        max_moves=PILOT_MOVES,
-        draws=1,
-    )
+    sampling = sampler.SmcConfig(rollouts=whole, particles=config.pilot_particles, draws=1)
     checkpoint = logbook.checkpoint("pilot_run", run_digest(blocks, "pilot_run", sampling, run_key))
     populations, state = _populations(blocks, sampling, run_key, checkpoint, logbook)
     _charge(problem, horizons, state.trace, ledger)
@@ -337,11 +317,12 @@ def _populations(
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], sampler.SmcState]:
     """Positions and rows of the particles at the end of each block, and the sampler's last state."""
     init_key, stage_key = jax.random.split(key)
-    plan = sampler.make_plan(blocks, config)
+    every = tuple(range(1, blocks.n_rows + 1))
+    plan = sampler.make_plan(blocks, config, every)._replace(most_moves=PILOT_MOVES)
     ends: list[tuple[np.ndarray, np.ndarray]] = []
     saved = checkpoint.load()
     if saved is None:
-        state = sampler.init(init_key, blocks, plan, config)
+        state = sampler.init(init_key, blocks, plan)
     else:
         arrays, meta = saved
         state = sampler.unpack(arrays, meta)
@@ -444,7 +425,7 @@ def begun_anew(
     """
     ends = zip(search.positions, search.log_density, search.converged, strict=True)
     modes = [normal_at(target, LevenbergState(u, float(density), 0.0, bool(done))) for u, density, done in ends]
-    drawn = draw_mixture(modes, mixture_weights("equal", [mode.log_evidence for mode in modes]), prior_draws, key)
+    drawn = draw_mixture(modes, prior_draws, key)
     u = np.concatenate([search.positions, drawn])
     density = _heights(problem, u, horizon, search.ledger)
     order = _spread(u, density, len(modes))
@@ -554,15 +535,13 @@ def run(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, logbook: Log
     modes, exact, rows = optima.modes, None, None
     compared = not (isinstance(whole, Hierarchy) and fixed)
     if isinstance(whole, Hierarchy) and fixed:
-        draws, modes, weights = _with_scales(whole, problem, fixed, modes, config, draw_key)
+        draws, modes = _with_scales(whole, problem, fixed, modes, config, draw_key)
     else:
-        weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
         affordable = (
             config.draws if config.rollouts is None else min(config.draws, int(config.rollouts - ledger.rollouts))
         )
-        by_evidence = config.mixture == "evidence"
-        exact = reweighted(problem, modes, weights, affordable, draw_key, ledger, config.draws, by_evidence)
-        position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
+        exact = reweighted(problem, modes, affordable, draw_key, ledger, config.draws)
+        position = draw_mixture(modes, config.draws, draw_key) if exact is None else exact.position
         draws = chains(problem, [position])
         rows = None if exact is None or exact.rows is None else _whole_rows(exact.rows, problem, problem is whole)
     best, seconds = modes[0], optima.search.seconds + time.monotonic() - began
@@ -577,7 +556,7 @@ def run(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, logbook: Log
         excluded=dict(ledger.excluded),
         cautions=[
             *optima.cautions,
-            *mixture_cautions(weights, config.mixture),
+            *mixture_cautions(len(modes)),
             *(reweighting_cautions(exact) if compared else []),
             *lasting_cautions(lasting),
             *prior_cautions(whole, draws),
@@ -585,7 +564,7 @@ def run(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, logbook: Log
         ],
         seconds=seconds,
         optimum={**mode_values(problem, best), **fixed},
-        details=_details(problem, optima._replace(modes=modes), lasting, weights, exact),
+        details=_details(problem, optima._replace(modes=modes), lasting, exact),
     )
 
 
@@ -600,11 +579,7 @@ def _whole_rows(
 
 
 def _details(
-    problem: Problem,
-    optima: Modes,
-    lasting: Mapping[str, Lasting],
-    weights: Float[np.ndarray, " mode"],
-    exact: Reweighted | None,
+    problem: Problem, optima: Modes, lasting: Mapping[str, Lasting], exact: Reweighted | None
 ) -> dict[str, Any]:
     """Further numbers of a result."""
     modes = optima.modes
@@ -614,8 +589,8 @@ def _details(
         "covariance_unconstrained": modes[0].covariance.tolist(),
         "noise_coordinates": np.flatnonzero(np.asarray(optima.search.noise)).tolist(),
         "optima": [
-            {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
-            for weight, mode in zip(weights, modes, strict=True)
+            {"weight": 1.0 / len(modes), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
+            for mode in modes
         ],
         "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
     }
@@ -628,9 +603,9 @@ def _with_scales(
     modes: Sequence[Laplace],
     config: LaplaceConfig,
     key: PRNGKeyArray,
-) -> tuple[Draws, list[Laplace], Float[np.ndarray, " mode"]]:
-    """Draws of a hierarchy whose modes were found at fixed standard deviations; the modes in the order of their
-    evidence once these are integrated out, and the weights of their mixture."""
+) -> tuple[Draws, list[Laplace]]:
+    """Draws of a hierarchy whose modes were found at fixed standard deviations, and the modes in the order of their
+    evidence once these are integrated out."""
     members = [[problem.names.index(name) for name in whole.scales[scale]] for scale in fixed]
     order_key, *keys = jax.random.split(key, len(modes) + 1)
     values = np.array(list(fixed.values()))
@@ -639,8 +614,7 @@ def _with_scales(
         for mode, k in zip(modes, keys, strict=True)
     ]
     order = np.argsort([-each.log_evidence for each in mixed])
-    weights = mixture_weights(config.mixture, [mixed[i].log_evidence for i in order])
-    ends = np.diff(np.round(np.cumsum(weights) * config.draws).astype(int), prepend=0)
+    ends = shares(len(order), config.draws)
     shuffled = np.asarray(jax.random.permutation(order_key, config.draws))
     position = np.concatenate([mixed[i].position[:n] for i, n in zip(order, ends, strict=True)])[shuffled]
     scales = np.concatenate([mixed[i].scales[:n] for i, n in zip(order, ends, strict=True)])[shuffled]
@@ -649,7 +623,7 @@ def _with_scales(
         modes[i]._replace(log_density=modes[i].log_density + mixed[i].log_evidence - modes[i].log_evidence)
         for i in order
     ]
-    return {name: draws[name] for name in whole.names}, integrated, weights
+    return {name: draws[name] for name in whole.names}, integrated
 
 
 def _counted(problem: Problem, optima: Modes, config: LaplaceConfig) -> tuple[Problem, Modes, dict[str, Lasting]]:

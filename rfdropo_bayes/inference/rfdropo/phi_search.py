@@ -32,6 +32,11 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 
 OPTIMISERS = ("cma", "cem")
 HORIZONS = ("paper", "linear", "full")
+STEP = 0.3  # initial step of an optimiser, as a share of the search range
+LEVELS = 8  # rollouts are simulated to one of this many horizons, the shortest sufficient horizon
+# Added to the variances, in squared units of the trajectory's root mean square motion; unless the published pipeline is
+# asked for, the observation noise at the prior's medians is also added.
+FLOOR = 1e-5
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
 
@@ -45,11 +50,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         evaluations: number of candidates if there is no budget (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
         optimiser: "cma" or "cem".
-        sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
-        levels: rollouts are simulated to one of this many horizons, the shortest sufficient horizon.
-        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion. If
-            ``mended``, the observation noise at the prior's medians is also added.
         finalists: number of candidates scored again at the full horizon.
         parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
@@ -62,10 +63,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
     evaluations: int = 5000
     rollouts_per_candidate: int = 100
     optimiser: str = "cma"
-    sigma: float = 0.3
     horizon: str = "paper"
-    levels: int = 8
-    variance_floor: float = 1e-5
     finalists: int = 10
     parameters: tuple[str, ...] = ()
     search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -78,12 +76,10 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
             raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"use one of {OPTIMISERS}")
         if self.horizon not in HORIZONS:
             raise InputError(f"unknown horizon {self.horizon!r}", where=where, remedy=f"use one of {HORIZONS}")
-        least = {"evaluations": 1, "rollouts_per_candidate": 4, "levels": 1, "finalists": 1, "draws": 1}
+        least = {"evaluations": 1, "rollouts_per_candidate": 4, "finalists": 1, "draws": 1}
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
                 raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
-        if self.variance_floor <= 0.0 or self.sigma <= 0.0:
-            raise InputError("variance_floor and sigma must be positive", where=where)
 
 
 class SearchState(NamedTuple):
@@ -114,7 +110,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     if config.rollouts is not None:
         generations = _affordable_generations(problem.n_rows, population, finalists, config)
     horizons = _horizons(generations, problem.n_rows, config)
-    floor = np.full(np.asarray(problem.observed_mask).shape[1], config.variance_floor)
+    floor = np.full(np.asarray(problem.observed_mask).shape[1], FLOOR)
     if config.mended:
         middle = {name: float(np.median(values)) for name, values in prior.items()}
         floor = floor + (np.asarray(problem.noise_deviation(middle), dtype=float) / scale) ** 2
@@ -129,10 +125,10 @@ def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int
     return tuple(paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
 
 
-def _simulated(horizon: int, n_rows: int, levels: int) -> int:
-    """The shortest of ``levels`` even horizons that covers one: few shapes, so that little is compiled."""
-    level = -(-horizon * levels // n_rows)
-    return min(n_rows, -(-level * n_rows // levels))
+def _simulated(horizon: int, n_rows: int) -> int:
+    """The shortest of `LEVELS` even horizons that covers one: few shapes, so that little is compiled."""
+    level = -(-horizon * LEVELS // n_rows)
+    return min(n_rows, -(-level * n_rows // LEVELS))
 
 
 def _affordable_generations(n_rows: int, population: int, finalists: int, config: RfdropoConfig) -> int:
@@ -142,7 +138,7 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
 
     def cost(generations: int) -> float:
         taus = _horizons(generations, n_rows, config)
-        return population * sum(_simulated(tau, n_rows, config.levels) for tau in taus) / n_rows
+        return population * sum(_simulated(tau, n_rows) for tau in taus) / n_rows
 
     if cost(1) > budget:
         least = config.rollouts_per_candidate * (finalists + cost(1))
@@ -173,7 +169,7 @@ def step(
     i = len(state.losses)
     m, d, horizon = config.rollouts_per_candidate, len(plan.space.names), plan.horizons[i]
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
-    simulated = _simulated(horizon, problem.n_rows, config.levels)
+    simulated = _simulated(horizon, problem.n_rows)
     rollouts = simulate(problem, plan, asked, uniform, simulated, state.ledger)
     values = -row_scores(problem, plan, rollouts, horizon).sum(axis=1)
     facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
@@ -246,9 +242,7 @@ def _search(
     """All generations; a resumed optimiser is given its history again."""
     k = plan.space.dimension
     seed = int(host_generator(key).integers(2**31))
-    optimiser = make_optimiser(
-        config.optimiser, k, high=WIDTH, sigma=config.sigma, population=plan.population, seed=seed
-    )
+    optimiser = make_optimiser(config.optimiser, k, high=WIDTH, sigma=STEP, population=plan.population, seed=seed)
     saved = checkpoint.load()
     nothing = np.empty((0, plan.population, k)), np.empty((0, plan.population))
     empty = SearchState(*nothing, Ledger(), [], 0.0)

@@ -38,7 +38,7 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
-from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
+from rfdropo_bayes.inference.smc.tempering import EFFECTIVE, log_effective_sample_size
 
 FROM_OPTIMA = "smc_from_optima"
 OPTIMISING = 0.25  # share of the budget for optimisations
@@ -158,7 +158,7 @@ def _from_optima(
 ) -> InferenceResult:
     sample_key, score_key = jax.random.split(key)
     remaining = _remaining(config, optima.search.ledger)
-    prefixed = len(block_boundaries(problem.n_rows, config.blocks, config.spacing)) > 1
+    prefixed = len(block_boundaries(problem.n_rows, config.blocks)) > 1
     scoring = None if remaining is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
     sampling = None if remaining is None else remaining - scoring  # type: ignore[operator]
     once = replace(config, rollouts=sampling, blocks=1)
@@ -190,7 +190,7 @@ def _prefixes(
 ) -> tuple[list[PrefixEvidence], Ledger]:
     """Evidence at the ends of all blocks but the last, whose evidence is the sampler's."""
     ledger = Ledger()
-    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)[:-1]
+    horizons = block_boundaries(problem.n_rows, config.blocks)[:-1]
     assert optima.search.noise is not None
     if not horizons:
         return [], ledger
@@ -229,20 +229,18 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
     jacobian = np.where(target.noise | ~np.isfinite(jacobian).all(axis=0), 0.0, jacobian)
     information = jacobian.T @ jacobian + np.diag(np.where(target.noise, 2.0 * np.count_nonzero(residuals), 0.0))
     mode = Laplace(point, bridge.joint_covariance(information, covariance), 0.0)
-    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
-    return way_from_prior(problem, mode, horizons, config.target_ess, way_key)
+    horizons = block_boundaries(problem.n_rows, config.blocks)
+    return way_from_prior(problem, mode, horizons, way_key)
 
 
-def way_from_prior(
-    problem: Problem, mode: Laplace, horizons: tuple[int, ...], target_ess: float, key: PRNGKeyArray, n: int = 1000
-) -> Way:
+def way_from_prior(problem: Problem, mode: Laplace, horizons: tuple[int, ...], key: PRNGKeyArray, n: int = 1000) -> Way:
     """Expected stages and rollouts of a sampler that starts at the prior and adds the data at ``horizons``."""
     prior = np.asarray(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
     information, offset = _whitened(prior.mean(axis=0), np.atleast_2d(np.cov(prior.T)), mode)
     share = np.geomspace(1e-3 / max(float(information.max()), 1.0), 1.0, 2000)
     growth = 1.0 + share[:, None] * information
     speed = 0.5 * (information / growth) ** 2 + (information * offset) ** 2 / growth**3
-    rate = np.sqrt(speed.sum(axis=1) / np.log(1.0 / target_ess))
+    rate = np.sqrt(speed.sum(axis=1) / np.log(1.0 / EFFECTIVE))
     stages = 0.5 * (rate[1:] + rate[:-1]) * np.diff(share)
     prefix = np.asarray(horizons) / problem.n_rows
     cost = prefix[np.minimum(np.searchsorted(prefix, share[1:] - 1e-12), len(prefix) - 1)]

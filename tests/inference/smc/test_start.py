@@ -188,7 +188,7 @@ def test_the_estimated_way_grows_with_the_logarithm_of_the_sharpness():
     for noise in (1e-1, 1e-3, 1e-5):
         problem = LinearGaussian(n_rows=40, noise=noise)
         mean, covariance = problem.posterior()
-        ways.append(way_from_prior(problem, Laplace(mean, covariance, 0.0), (10, 20, 40), 0.5, KEY))
+        ways.append(way_from_prior(problem, Laplace(mean, covariance, 0.0), (10, 20, 40), KEY))
         _, prior = np.linalg.slogdet(np.diag(problem.sd**2))
         lost = 0.5 * (prior - np.linalg.slogdet(covariance)[1])
         assert ways[-1].information == pytest.approx(lost, abs=0.2)
@@ -243,5 +243,4 @@ def test_a_budget_decides_on_replicates_and_without_one_there_is_one():
     assert sampler.decided(30, SmcConfig(rollouts=1000.0)).chains == 1
     assert sampler.decided(30, SmcConfig(rollouts=5000.0)).chains == 2
     assert sampler.decided(30, SmcConfig(rollouts=1e5)).chains == 4
-    assert sampler.decided(200, SmcConfig(rollouts=5000.0, spacing="linear", blocks=200)).chains == 1
     assert sampler.decided(30, SmcConfig()).chains == 1

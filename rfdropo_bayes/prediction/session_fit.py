@@ -29,7 +29,7 @@ from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
 Batch = dict[str, Float[np.ndarray, " n"]]
 
 
-class DayFit(NamedTuple):
+class SessionFit(NamedTuple):
     """Joint draws of body and session parameters."""
 
     values: Batch  # draws of all parameters, resampled by the evidence of their body
@@ -41,7 +41,7 @@ class DayFit(NamedTuple):
     steps: int  # steps of the fits
 
 
-def fit_day(
+def fit_session(
     problem: CalibrationProblem,
     body: Batch,
     own: Sequence[InferredParameter],
@@ -49,7 +49,7 @@ def fit_day(
     report: Callable[[int, float], None] = lambda step, share: None,
     *,
     share: float = 1.0,
-) -> DayFit:
+) -> SessionFit:
     """Draws of a session's parameters and of the body, given one recording of the session.
 
     Args:
@@ -89,7 +89,9 @@ def fit_day(
     power, _ = next_step(partial(np.multiply, evidence), 1.0, LEAST_SHARE)
     chosen = np.asarray(resampling.systematic(choice_key, softmax(power * evidence), count))
     unconverged = int((~fit.converged).sum())
-    return DayFit(values_at(fit.point[chosen], chosen), chosen, evidence, float(power), excess, unconverged, fit.steps)
+    return SessionFit(
+        values_at(fit.point[chosen], chosen), chosen, evidence, float(power), excess, unconverged, fit.steps
+    )
 
 
 def physical_of_normal(
