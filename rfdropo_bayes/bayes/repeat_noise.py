@@ -22,7 +22,7 @@ SURE = 1e-4  # p-value under the noise within recordings, below which shifts are
 LEAST = 0.5  # of the noise's standard deviation: smaller differences change no conclusion
 ROWS = 10  # fewer rows do not distinguish a constant from slow noise
 
-Groups = tuple[tuple[int, ...], ...]  # Indices of the recordings in each group of repeats
+Groups = tuple[tuple[int, ...], ...]  # indices of the recordings in each group of repeats
 
 
 def group_recordings(recordings: RecordingSet, trajectories: Sequence[Trajectory]) -> Groups:

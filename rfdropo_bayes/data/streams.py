@@ -22,7 +22,7 @@ from rfdropo_bayes.data.csv_table import closest
 from rfdropo_bayes.data.recorded import continuous_quaternions
 from rfdropo_bayes.errors import InputError
 
-ADJACENT = 1.5  # Largest gap between neighbouring readings, in rows; a gap of two rows means a lost reading
+ADJACENT = 1.5  # largest gap between neighbouring readings, in rows; a gap of two rows means a lost reading
 
 
 class Stream(NamedTuple):

@@ -31,7 +31,7 @@ from rfdropo_bayes.robots.policy_layout import (
     PolicyLayout,
 )
 
-METADATA = "rfdropo_layout"  # Key of the layout in the metadata of the ONNX file
+METADATA = "rfdropo_layout"  # key of the layout in the metadata of the ONNX file
 
 
 class PolicyScene(NamedTuple):

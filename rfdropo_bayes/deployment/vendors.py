@@ -155,8 +155,8 @@ def _agree(value: float, expected: float) -> bool:
     return abs(value - expected) <= 0.02 * expected + 1.0  # drives round to whole units
 
 
-POSITION_REVERSED = 1 << 7  # Bit of object 0x607E
-COUNTER = -(2**31), 2**31 - 1  # Least and greatest position of 32 bits
+POSITION_REVERSED = 1 << 7  # bit of object 0x607E
+COUNTER = -(2**31), 2**31 - 1  # least and greatest position of 32 bits
 
 
 def check_polarity(word: int, where: str) -> None:

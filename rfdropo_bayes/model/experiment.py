@@ -195,7 +195,7 @@ class SimulatorTable(ExperimentTable):
         return self
 
 
-ROLLOUTS = 20000  # Budget of an experiment that states none
+ROLLOUTS = 20000  # budget of an experiment that states none
 
 
 class InferenceTable(BaseModel):

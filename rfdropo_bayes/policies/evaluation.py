@@ -21,7 +21,7 @@ from rfdropo_bayes.errors import InputError
 THRESHOLDS = (0.005, 0.01, 0.01525, 0.02157, 0.030)
 """Distances [m] within which an episode succeeds; the last three are the paper's."""
 EVALUATION_SEED = 2_000_003  # None of the seeds that training or its evaluations use
-Act = Callable[[Float[np.ndarray, "lane size"]], np.ndarray]  # From observations to actions of the environments
+Act = Callable[[Float[np.ndarray, "lane size"]], np.ndarray]  # from observations to actions of the environments
 
 
 @dataclass(frozen=True)

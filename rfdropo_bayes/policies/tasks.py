@@ -27,10 +27,10 @@ from rfdropo_bayes.robots.policy_layout import (
 Actions = Literal["discrete", "continuous"]
 Observed = Literal["full", "paper", "markers"]
 
-EPISODE = 100  # Actions of an episode
+EPISODE = 100  # actions of an episode
 PERIOD = 0.05
 """Control period [s]: five steps of SOFA's 10 ms. The authors' robot was driven at 10 Hz, a period of 0.1 s."""
-STEP = 0.005  # Largest movement of a cable by an action [m], by default
+STEP = 0.005  # largest movement of a cable by an action [m], by default
 TRACKED_HEIGHTS = (0.0363, 0.0792, 0.1292, 0.179)
 """Heights along the axis at which motion capture tracks the physical trunk [m]."""
 
@@ -114,7 +114,7 @@ def reward(
     return (beginning - potential(distance)) / beginning - 0.05
 
 
-NEAREST = 0.005  # Least initial distance that scales the rewards [m]: the potential goes through zero at a millimetre
+NEAREST = 0.005  # least initial distance that scales the rewards [m]: the potential goes through zero at a millimetre
 FLOOR = -1.05
 """Reward for each action that is missing after a failed simulation: the reward at about twice the initial distance.
 After a stop by the tension limit the episode's worst reward is used if it is lower.

@@ -30,7 +30,7 @@ from rfdropo_bayes.policies.training_config import TrainingTable
 EVALUATION_SEED = 1_000_003  # evaluations play other episodes than the first of a training
 CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
 LAST, BEST = "", "best_"  # prefixes of a checkpoint's files
-STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")  # Keys of a checkpoint's state.json
+STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")  # keys of a checkpoint's state.json
 
 NO_END = 1e300  # in the place of an infinite distance, for quantiles
 LEAST_SPREAD = 0.01

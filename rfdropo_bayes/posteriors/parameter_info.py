@@ -82,7 +82,7 @@ class ParameterInfo:
         return np.full(count, float(self.prior["scale"]))
 
 
-DrawsByOwner = Mapping[str, Draws]  # Draws by parameter and by owner, see `Scope`
+DrawsByOwner = Mapping[str, Draws]  # draws by parameter and by owner, see `Scope`
 
 
 def by_owner(infos: Iterable[ParameterInfo], draws: Draws) -> dict[str, dict[str, Float[np.ndarray, " n"]]]:

@@ -15,7 +15,7 @@ from rfdropo_bayes.report.object_scores import ObjectScore
 from rfdropo_bayes.report.residuals import ResidualCheck
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
-LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")  # Packages that policies are made with
+LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")  # packages that policies are made with
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-FEW_DRAWS = 100  # Effective draws that central intervals need
+FEW_DRAWS = 100  # effective draws that central intervals need
 
 
 def headline(summary: Mapping[str, Any]) -> list[str]:

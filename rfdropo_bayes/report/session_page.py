@@ -23,8 +23,8 @@ SECTIONS = (
     ("reproduce", "To reproduce"),
 )
 PLANNED = "finished"
-ROUTINE = "checked"  # The kind of event that every drive has, whatever happens
-CLIPPED = 1e-9  # Rounding error of a command, in its own unit; larger differences mean that it was clipped
+ROUTINE = "checked"  # the kind of event that every drive has, whatever happens
+CLIPPED = 1e-9  # rounding error of a command, in its own unit; larger differences mean that it was clipped
 REMEDIES = {
     "deadlines_missed": "Keep other work off this machine, and give the loop real-time scheduling: rfdropo doctor "
     "measures both.",

@@ -17,7 +17,7 @@ from rfdropo_bayes.groups import whole
 from rfdropo_bayes.robots.table import RobotTable
 from rfdropo_bayes.tables import nearest
 
-ROUNDING = 1e-9  # How far [m or rad] a sum of commands may be beyond a limit that it reaches exactly
+ROUNDING = 1e-9  # how far [m or rad] a sum of commands may be beyond a limit that it reaches exactly
 
 Values = float | tuple[float, ...]
 

@@ -12,24 +12,24 @@ import numpy as np
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, body_tables, section_profile
 
-SILICONE = 1070.0  # Density [kg/m3] if no mass is given; typical of silicone rubbers
+SILICONE = 1070.0  # density [kg/m3] if no mass is given; typical of silicone rubbers
 GRAVITY = 9.81
 DIRECTIONS = {f"{sign}{axis}": (sign, "xyz".index(axis)) for sign in "+-" for axis in "xyz"}
 SHAPES = ("cylinder", "cone", "tube", "disks")
-CABLES_AT = 0.75  # Distance of cables from the axis over the body's radius, if it is not given
-DISKS = 10  # Disks of a body if their number is not given, or the next number that shares out over the segments
+CABLES_AT = 0.75  # distance of cables from the axis over the body's radius, if it is not given
+DISKS = 10  # disks of a body if their number is not given, or the next number that shares out over the segments
 LEAST_GUIDES, GUIDES_PER_SEGMENT = 8, 4
 """Heights of guides, and layers of a body that does not taper: their elements are within .2 % of the limit if four
 cables bend a silicone arm by up to 1.5 rad, and .6 % for a body five times softer. A cone with a tip of .6 of its
 base's radius has twice this number (.6 %), and at .3 four times this number (.4 % up to half a radian).
 """
-DRIVES = {"Pa": ("chamber", "pressure")}  # Words for a drive and its command, if they are not a cable and its pull
+DRIVES = {"Pa": ("chamber", "pressure")}  # words for a drive and its command, if they are not a cable and its pull
 COMMANDS = ("m", "rad", "N", "N m", "Pa", "-")
-CHAMBER_RADIUS = 0.2  # Radius of a chamber over the body's, if it is not given
+CHAMBER_RADIUS = 0.2  # radius of a chamber over the body's, if it is not given
 VACUUM = -101325.0  # [Pa] Least pressure above the surroundings
-USUAL_PULL = 0.15  # Usual pull of a cable over the body's length
-FORCE_LIMIT = 5.0  # Ratio of a drive's largest tension to the tension of a usual command
-KNOWN, ASSUMED = 0.3, 1.0  # Standard deviation of the logarithm in the prior of a given value, and of a default
+USUAL_PULL = 0.15  # usual pull of a cable over the body's length
+FORCE_LIMIT = 5.0  # ratio of a drive's largest tension to the tension of a usual command
+KNOWN, ASSUMED = 0.3, 1.0  # standard deviation of the logarithm in the prior of a given value, and of a default
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ ARGUMENTS = {
 """Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is the deviation of the
 logarithm.
 """
-ENDS = {"TruncatedNormal": ("low", "high")}  # Optional arguments: the ends of a truncated normal inside the hard bounds
+ENDS = {"TruncatedNormal": ("low", "high")}  # optional arguments: the ends of a truncated normal inside the hard bounds
 
 
 class Parameter(RobotTable):

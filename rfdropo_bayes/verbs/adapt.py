@@ -127,26 +127,17 @@ def adapt(
 
 
 class SessionTask(NamedTuple):
-    """A session to which a calibration is adapted.
+    """A session to which a calibration is adapted."""
 
-    Attributes:
-        fit: the calibration; model: model of the adapted run.
-        scopes: parameters of the body, the session and its recordings; own: parameters of the session.
-        head: the used part of the recording; tested: predicted recordings.
-        rest: name of the unused part of the recording among ``tested``; empty without it.
-        name: name of the session.
-        model_error: residuals of the model on the fitted recordings.
-    """
-
-    fit: Calibration
+    fit: Calibration  # the calibration; model: model of the adapted run
     model: Model
-    scopes: Scopes
+    scopes: Scopes  # parameters of the body, the session and its recordings; own: parameters of the session
     own: Sequence[InferredParameter]
-    head: Trajectory
+    head: Trajectory  # the used part of the recording; tested: predicted recordings
     tested: Sequence[Trajectory]
-    rest: str
-    name: str
-    model_error: ModelError
+    rest: str  # name of the unused part of the recording among ``tested``; empty without it
+    name: str  # name of the session
+    model_error: ModelError  # residuals of the model on the fitted recordings
 
 
 def _adapt(asked: SessionTask, draws: int, seed: int, show: bool | None, out: Path | None, text: str) -> Calibration:
@@ -201,24 +192,15 @@ def _without_a_model(asked: SessionTask) -> dict[str, BaselineErrors]:
 
 
 class Adapted(NamedTuple):
-    """A fitted session.
+    """A fitted session."""
 
-    Attributes:
-        fit: draws of body and session; body: earlier draws of the body.
-        problem: problem of the recording, with the fitted noise.
-        predictions: predictions of the recording and of the unused data.
-        cautions: reasons to doubt them.
-        rollouts: number of rollouts.
-        slow: remaining error of the session for motion beyond the used recording.
-    """
-
-    fit: SessionFit
+    fit: SessionFit  # draws of body and session; body: earlier draws of the body
     body: Batch
-    problem: CalibrationProblem
-    predictions: list[RecordingPrediction]
-    cautions: list[Caution]
-    rollouts: float
-    slow: SessionError | None
+    problem: CalibrationProblem  # problem of the recording, with the fitted noise
+    predictions: list[RecordingPrediction]  # predictions of the recording and of the unused data
+    cautions: list[Caution]  # reasons to doubt them
+    rollouts: float  # number of rollouts
+    slow: SessionError | None  # remaining error of the session for motion beyond the used recording
 
 
 def _fitted(asked: SessionTask, draws: int, key: jax.Array, show: bool | None) -> Adapted:

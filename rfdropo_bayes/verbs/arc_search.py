@@ -19,32 +19,21 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arcs import arcs_of, arms
 from rfdropo_bayes.verbs.arrangement import Arrangement, motion_of, neighbours, sections_of
 
-GAIN = 1e-4
-"""Agreement that another round must gain to be worth its time."""
-SWEEPS = 6
-"""Most rounds."""
+GAIN = 1e-4  # agreement that another round must gain to be worth its time
+SWEEPS = 6  # most rounds
 FINE = np.radians(15.0) * np.array([-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0])
 """Trial turns of a section about its present position."""
-TURNED = 4
-"""Number of the best exchanges after which sections are turned again."""
-HOPELESS = 3.0
-"""Ratio of unexplained motion above which the worse sign is discarded."""
-IN_PLACE = 1e-6
-"""Agreement by which a column that makes no difference is given to its own channel."""
-AZIMUTHS = 24
-"""Azimuths at which a column's cables are tried."""
+TURNED = 4  # number of the best exchanges after which sections are turned again
+HOPELESS = 3.0  # ratio of unexplained motion above which the worse sign is discarded
+IN_PLACE = 1e-6  # agreement by which a column that makes no difference is given to its own channel
+AZIMUTHS = 24  # azimuths at which a column's cables are tried
 
 
 class Placed(NamedTuple):
-    """Apparent courses of the cables of each column, regardless of the robot's description.
+    """Apparent courses of the cables of each column, regardless of the robot's description."""
 
-    Attributes:
-        kind: number of the kind of channel.
-        azimuth: azimuth [rad].
-    """
-
-    kind: tuple[int, ...]
-    azimuth: tuple[float, ...]
+    kind: tuple[int, ...]  # number of the kind of channel
+    azimuth: tuple[float, ...]  # azimuth [rad]
 
 
 class ArcSearch:

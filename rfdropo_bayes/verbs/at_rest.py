@@ -23,8 +23,7 @@ from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE
 from rfdropo_bayes.simulators.trunk import TrunkSimulator, assemble
 from rfdropo_bayes.verbs.command_lag import JUST_BEFORE
 
-MOVING = ("time_step", "integrator")
-"""Keys of [simulator] that a body at rest does not have."""
+MOVING = ("time_step", "integrator")  # keys of [simulator] that a body at rest does not have
 
 
 class Rows(NamedTuple):

@@ -83,8 +83,7 @@ from rfdropo_bayes.verbs.left_out_sessions import (
 from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
 PRIOR_DRAWS = 2000
-LEAST_POSTERIOR = 200
-"""Draws of a posterior, if its budget is small."""
+LEAST_POSTERIOR = 200  # draws of a posterior, if its budget is small
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves

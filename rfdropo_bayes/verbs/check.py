@@ -47,32 +47,24 @@ from rfdropo_bayes.verbs.recording_doubts import asked_pulls, drives_beyond, rec
 from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
-LONG = 60.0
-"""Recordings of more seconds make whoever checks them wait for minutes."""
-IRREGULAR = 1.5
-"""Gaps longer than this multiple of the median sample time are reported."""
+LONG = 60.0  # recordings of more seconds make whoever checks them wait for minutes
+IRREGULAR = 1.5  # gaps longer than this multiple of the median sample time are reported
 
 Result = TypeVar("Result")
 
 
 @dataclass
 class Check:
-    """Result of `run_check`.
+    """Result of `run_check`."""
 
-    Attributes:
-        lines: facts, as pairs of a label and a text; an empty label continues the previous pair.
-        notes: valid facts worth knowing.
-        doubts: valid but suspicious facts: the recordings or their description look wrong.
-        problems: faults that keep the experiment from running.
-        files: pictures, one per recording.
-        ahead: combinations that a fit can determine; None if not requested, or if nothing can be fitted.
-    """
-
+    # facts, as pairs of a label and a text; an empty label continues the previous pair
     lines: list[tuple[str, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # valid facts worth knowing
+    # valid but suspicious facts: the recordings or their description look wrong
     doubts: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    files: list[Path] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)  # faults that keep the experiment from running
+    files: list[Path] = field(default_factory=list)  # pictures, one per recording
+    # combinations that a fit can determine; None if not requested, or if nothing can be fitted
     ahead: Preflight | None = None
 
 

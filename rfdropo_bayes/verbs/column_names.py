@@ -39,8 +39,7 @@ FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
 MEASURED = re.compile(
     r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
 )
-SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)
-"""If any columns match, only they are commands."""
+SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)  # if any columns match, only they are commands
 COMMAND = re.compile(
     r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
     re.IGNORECASE,
@@ -64,66 +63,51 @@ DERIVED = re.compile(r"(?<![a-z])[vwq][_. ]?\*", re.IGNORECASE)
 RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
 BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
 """Solved poses of bodies: if there are any, the underlying markers are not used."""
-MARKER = re.compile(r"^Marker\.(?!Unlabeled)", re.IGNORECASE)
-"""Markers that Motive measured and somebody named."""
+MARKER = re.compile(r"^Marker\.(?!Unlabeled)", re.IGNORECASE)  # markers that Motive measured and somebody named
 STRUCTURE = re.compile(
     r"(rigid|body|bodies|rigidbodies|markers?|position|poses?|point|transforms?|translation|tf|static|mocap|vrpn|"
     r"optitrack|vicon|qualisys|natnet|observation|state)"
 )
 """Words that formats put around the name of a marker."""
-LOOKED_AT = 2000
-"""Rows that sizes are taken from."""
-MOST_SHOWN = 12
-"""Columns that an error names; and rows from which a pattern of values is told."""
-UNIT_LENGTH = 1e-3
-"""By how much the length of a quaternion may differ from one."""
+LOOKED_AT = 2000  # rows that sizes are taken from
+MOST_SHOWN = 12  # columns that an error names; and rows from which a pattern of values is told
+UNIT_LENGTH = 1e-3  # by how much the length of a quaternion may differ from one
 
 
 class Guess(NamedTuple):
-    """Columns of a file, by their part.
+    """Columns of a file, by their part."""
 
-    Attributes:
-        time, time_unit: column and unit of times, "s" for dates; None without times.
-        commands, command_unit: columns and unit of the commands.
-        positions, position_unit: columns of x, y and z of each marker, and their unit.
-        markers: a name for each marker, made of its columns'; numbered if the columns have no names.
-        tensions, motor_angles: columns of measured forces and angles, one per command; else empty.
-        motor_angle_unit: unit of motor angles.
-        counts_per_turn: counts per turn of the spool, if a unit is "counts".
-        unused: other columns.
-        format: format of the file, one of `mapped_formats.MAPPED`.
-        command_time, command_time_unit: column and unit of the commands' own times; None without them.
-        units: units of columns other than command_unit or position_unit.
-        names, command_names: given names of all columns, for files without names.
-        sample_time: given time from row to row [s]; None for rows with times, or without any.
-        evidence: why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file.
-        start: first seen position of each marker, in the file's frame and unit.
-        sent: commands of the first rows; seen: marker positions in the first rows, both in the file's units.
-    """
-
+    # time, time_unit: column and unit of times, "s" for dates; None without times
     time: str | None
     time_unit: str
+    # commands, command_unit: columns and unit of the commands
     commands: list[str]
     command_unit: str
+    # positions, position_unit: columns of x, y and z of each marker, and their unit
     positions: list[list[str]]
     position_unit: str
-    markers: list[str]
+    markers: list[str]  # a name for each marker, made of its columns'; numbered if the columns have no names
+    # tensions, motor_angles: columns of measured forces and angles, one per command; else empty
     tensions: list[str]
     motor_angles: list[str]
-    motor_angle_unit: str
-    unused: list[str]
-    format: str
+    motor_angle_unit: str  # unit of motor angles
+    unused: list[str]  # other columns
+    format: str  # format of the file, one of `mapped_formats.MAPPED`
+    # command_time, command_time_unit: column and unit of the commands' own times; None without them
     command_time: str | None
     command_time_unit: str
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # units of columns other than command_unit or position_unit
+    # names, command_names: given names of all columns, for files without names
     names: list[str] | None
     command_names: list[str] | None
+    # why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file
     evidence: Mapping[str, str]
-    start: Float[np.ndarray, "marker 3"]
+    start: Float[np.ndarray, "marker 3"]  # first seen position of each marker, in the file's frame and unit
+    # commands of the first rows; seen: marker positions in the first rows, both in the file's units
     sent: Float[np.ndarray, "command channel"]
     seen: Float[np.ndarray, "row marker 3"]
-    counts_per_turn: float | None = None
-    sample_time: float | None = None
+    counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
+    sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
 
     @property
     def counts(self) -> bool:

@@ -34,8 +34,7 @@ FOREIGN = {
 }
 """Units of commands that are neither a length of cable nor an angle of a motor."""
 PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
-PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0
-"""Largest pressures in chambers of soft robots in kPa, and in bar."""
+PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0  # largest pressures in chambers of soft robots in kPa, and in bar
 ANGLES = ("rad", "deg", named_columns.COUNTS)
 ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
 TIME_UNITS = {
@@ -45,22 +44,18 @@ TIME_UNITS = {
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
 }
 """Words in the name of a column of times, and their unit."""
-SINCE_1970 = (0.9e9, 4.2e9)
-"""Seconds since 1970 in the years 1998 to 2103: stamps between them have a known unit."""
+SINCE_1970 = (0.9e9, 4.2e9)  # seconds since 1970 in the years 1998 to 2103: stamps between them have a known unit
 LONGEST_STEP = 100.0
 """Longest time between rows [s] with which such stamps are believed: a counter may run through the same numbers."""
 USUAL_STEP, USUAL_RATE = 0.02, 0.5
 """Times between rows [s] and rates of motion [Hz] that recordings of soft robots have, to within decades."""
-FASTEST_MOTION = 20.0
-"""Rate of motion [Hz] that no soft robot has: the mean rate, by its speed over its spread."""
+FASTEST_MOTION = 20.0  # rate of motion [Hz] that no soft robot has: the mean rate, by its speed over its spread
 NOT_TOLD, NOT_WHOLE = 2.0, 4.0
 """How much speaks for seconds that no name tells another unit, and that stamps have decimals, in squared decades."""
-RESTING = 3e-3
-"""Share of the largest coordinate: markers that spread by less rest, and show the rate of noise."""
+RESTING = 3e-3  # share of the largest coordinate: markers that spread by less rest, and show the rate of noise
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
-METRES_UP_TO = 0.2
-"""Largest plausible pull of a cable of a soft arm [m]."""
+METRES_UP_TO = 0.2  # largest plausible pull of a cable of a soft arm [m]
 
 
 BENT, UPRIGHT = 2.0, 1.1
@@ -69,17 +64,11 @@ from its height: its origin need not be the base."""
 
 
 class Unit(NamedTuple):
-    """A unit of columns.
+    """A unit of columns."""
 
-    Attributes:
-        unit: unit of most of them.
-        others: columns in other units, which convert to it.
-        evidence: why it was guessed; empty if the names or a line of units have it.
-    """
-
-    unit: str
-    others: Mapping[str, str] = {}
-    evidence: str = ""
+    unit: str  # unit of most of them
+    others: Mapping[str, str] = {}  # columns in other units, which convert to it
+    evidence: str = ""  # why it was guessed; empty if the names or a line of units have it
 
 
 def unit_in_names(

@@ -14,28 +14,18 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.sample_times import sample_time
 
-DELAYS = (0.0, 0.1, 0.2, 0.4)
-"""Tried delays of the motion behind its commands [s]."""
-MOST_ROWS = 2000
-"""Rows of a recording that are used."""
-JUST_BEFORE = 1e-6
-"""[s] before a row: a command that is sent in it does not act yet."""
-RIDGE = 1e-6
-"""Ridge penalty of the maps, as a share of the mean square of their features."""
-CLEARLY = 0.9
-"""Ratio of the root mean square residuals of two maps below which the better map is reported."""
+DELAYS = (0.0, 0.1, 0.2, 0.4)  # tried delays of the motion behind its commands [s]
+MOST_ROWS = 2000  # rows of a recording that are used
+JUST_BEFORE = 1e-6  # [s] before a row: a command that is sent in it does not act yet
+RIDGE = 1e-6  # ridge penalty of the maps, as a share of the mean square of their features
+CLEARLY = 0.9  # ratio of the root mean square residuals of two maps below which the better map is reported
 
 
 class LagError(NamedTuple):
-    """Residual of the markers' motion after a quadratic map of the commands.
+    """Residual of the markers' motion after a quadratic map of the commands."""
 
-    Attributes:
-        rows: rows by which the commands precede the markers; 0 is the same row.
-        error: root mean square residual [m].
-    """
-
-    rows: int
-    error: float
+    rows: int  # rows by which the commands precede the markers; 0 is the same row
+    error: float  # root mean square residual [m]
 
 
 def errors_by_row(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)) -> list[LagError]:

@@ -33,10 +33,8 @@ from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
-CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
-"""Formats that come from motion capture, which loses markers now and then."""
-FAR_ORIGIN = 0.1
-"""Share of the body's length: a frame whose origin lies farther from the base is moved there."""
+CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion capture, which loses markers now and then
+FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
 

@@ -20,17 +20,13 @@ from rfdropo_bayes.verbs.registration import Frame
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
 1.5 mm, and a slack of 2 mm on another day."""
-ORIGIN = 0.05
-"""Standard deviation of the frame's origin over the body's length."""
+ORIGIN = 0.05  # standard deviation of the frame's origin over the body's length
 TILT, TURN = 0.1, 0.5
 """Standard deviations of the frame's tilt, and of its turn about the body's axis [rad]. That arm's frame was turned by
 0.3 rad."""
-GAIN = 0.1
-"""Standard deviation of the relative error of a command in metres of cable."""
-UNKNOWN = 0.5
-"""The same of a robot whose cables' distance from the axis, or whose length, was not given."""
-FEWEST_ROWS = 60
-"""Rows of a recording whose last third, 20 rows, is worth a test."""
+GAIN = 0.1  # standard deviation of the relative error of a command in metres of cable
+UNKNOWN = 0.5  # the same of a robot whose cables' distance from the axis, or whose length, was not given
+FEWEST_ROWS = 60  # rows of a recording whose last third, 20 rows, is worth a test
 ROWS_AT_REST = 200
 """Rows at rest that a fit takes, seven for each parameter of a robot with nine cables. There 405 of 1,620 rows left the
 error on unseen rows as it was; with 203 the minutes hold twice the rollouts."""

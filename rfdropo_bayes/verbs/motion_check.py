@@ -36,14 +36,12 @@ from rfdropo_bayes.verbs.motion_size import (
 )
 from rfdropo_bayes.verbs.order_finder import ROWS, Finding, arranged, find_arrangement, order_lines
 
-MOST = 5
-"""Recordings that count."""
+MOST = 5  # recordings that count
 UNEXPLAINED = 0.4
 """Another arrangement is named if it leaves at most this share of the motion that the present one leaves."""
 LITTLE, SEEN = 0.4, 1e-3
 """Agreement below which markers do not follow the commands, and the least nominal motion [m] for this statement."""
-SOLVED = 0.5
-"""Least share of the rows in which the rod must have an equilibrium for a comparison."""
+SOLVED = 0.5  # least share of the rows in which the rod must have an equilibrium for a comparison
 
 
 class Proposal(NamedTuple):
@@ -56,17 +54,14 @@ class Proposal(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Recordings beside the nominal model.
+    """Recordings beside the nominal model."""
 
-    Attributes:
-        direction, size: direction and size of the motion.
-        proposal: another arrangement of the commands that explains the motion much better; None without.
-        unit: another unit of the commands and the size of the motion under it; None without.
-    """
-
+    # direction, size: direction and size of the motion
     direction: Direction
     size: Size
+    # another arrangement of the commands that explains the motion much better; None without
     proposal: Proposal | None = None
+    # another unit of the commands and the size of the motion under it; None without
     unit: tuple[Unit, Size] | None = None
 
 
@@ -114,17 +109,11 @@ def _proposed(direction: Direction, proposal: Proposal, axes: tuple[str, str, st
 
 
 class Compared(NamedTuple):
-    """Comparison with the robot at rest.
+    """Comparison with the robot at rest."""
 
-    Attributes:
-        words: summary.
-        cautions: cautions on frame, order and unit of the commands.
-        arrangement: best arrangement of the commands; None without equilibria under them.
-    """
-
-    words: str
-    cautions: list[Caution]
-    arrangement: Arrangement | None
+    words: str  # summary
+    cautions: list[Caution]  # cautions on frame, order and unit of the commands
+    arrangement: Arrangement | None  # best arrangement of the commands; None without equilibria under them
 
 
 def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> Compared:

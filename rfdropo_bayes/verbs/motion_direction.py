@@ -17,24 +17,16 @@ of 3 s by five robots in the right frame are reported as turned and none as mirr
 agree less.
 """
 TURNED = np.pi / 4.0
-QUARTER = np.pi / 12.0
-"""A turn as near to a number of quarters is written as ``axes``."""
+QUARTER = np.pi / 12.0  # A turn as near to a number of quarters is written as ``axes``
 
 
 class Direction(NamedTuple):
-    """Direction of the measured motion across the body relative to the nominal motion.
+    """Direction of the measured motion across the body relative to the nominal motion."""
 
-    Attributes:
-        turn: angle [rad] about +z from the simulated motion to the measured one.
-        agreement: correlation of both after that turn, 0 to 1.
-        mirrored: the same after a mirror, y to -y, and a turn.
-        mirror_turn: the angle [rad] of the latter.
-    """
-
-    turn: float
-    agreement: float
-    mirrored: float
-    mirror_turn: float = 0.0
+    turn: float  # angle [rad] about +z from the simulated motion to the measured one
+    agreement: float  # correlation of both after that turn, 0 to 1
+    mirrored: float  # the same after a mirror, y to -y, and a turn
+    mirror_turn: float = 0.0  # the angle [rad] of the latter
 
     @property
     def straight(self) -> float:

@@ -20,16 +20,14 @@ from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.mechanisms import motions_of
 from rfdropo_bayes.simulators.protocol import Result
 
-FINER, MORE_ELEMENTS = 4, 2
-"""The time step is divided by this, and the number of elements is multiplied by the second."""
+FINER, MORE_ELEMENTS = 4, 2  # the time step is divided by this, and the number of elements is multiplied by the second
 LIMIT = MORE_ELEMENTS**2 / (MORE_ELEMENTS**2 - 1)
 """Distance from the limit of infinitely many elements over the distance from `MORE_ELEMENTS` times the elements; the
 rod is of second order.
 """
 LONGEST, LONGEST_MESH = 20.0, 2.0
 """Longest simulated part of a recording [s], of a rod and of tetrahedra, whose steps take 100 times as long."""
-SOLVES = 4.0
-"""Linear solves that a row of a quasi-static motion takes on average, at most."""
+SOLVES = 4.0  # linear solves that a row of a quasi-static motion takes on average, at most
 ENOUGH = 0.01
 """Share of the markers' way by which a quasi-static motion may differ from a dynamic one and still be enough."""
 
@@ -88,8 +86,7 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
     return NumericalError(min(longest, float(recording.time[-1])), finer, elements, _way(here), rest)
 
 
-MOVING = ("time_step", "integrator")
-"""Keys of [simulator] that a quasi-static motion does not have."""
+MOVING = ("time_step", "integrator")  # keys of [simulator] that a quasi-static motion does not have
 
 
 def longest_of(rod: bool) -> float:

@@ -25,34 +25,24 @@ from rfdropo_bayes.verbs.arrangement import (
 )
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, spread_rows
 
-ROWS, SEARCHED = 100, 60
-"""Rows that are simulated by the rod at rest, and of them by arcs."""
-WELL = 0.98
-"""Agreement at or above which no other arrangement is looked for."""
+ROWS, SEARCHED = 100, 60  # rows that are simulated by the rod at rest, and of them by arcs
+WELL = 0.98  # agreement at or above which no other arrangement is looked for
 ALIKE = 1.3
 """Ratio of two shares of unexplained motion below which the simpler arrangement is taken, and alternatives are
 named.
 """
-ALTERNATIVES = 6
-"""Number of simulated alternatives."""
+ALTERNATIVES = 6  # number of simulated alternatives
 SAME_TURN = np.radians(1.0)
 
 
 class Finding(NamedTuple):
-    """Result of a search for another arrangement.
+    """Result of a search for another arrangement."""
 
-    Attributes:
-        written: agreement of the robot and the commands as written.
-        arrangement: the simplest arrangement as good as the best; agreement: its correlation.
-        alternatives: alternatives of equal quality, and their correlations.
-        mirror: correlation of the robot's mirror image, turned.
-    """
-
-    written: Agreement
-    arrangement: Arrangement
+    written: Agreement  # agreement of the robot and the commands as written
+    arrangement: Arrangement  # the simplest arrangement as good as the best; agreement: its correlation
     agreement: float
-    alternatives: tuple[tuple[Arrangement, float], ...] = ()
-    mirror: float = 0.0
+    alternatives: tuple[tuple[Arrangement, float], ...] = ()  # alternatives of equal quality, and their correlations
+    mirror: float = 0.0  # correlation of the robot's mirror image, turned
 
     @property
     def unexplained(self) -> float:

@@ -17,10 +17,8 @@ from rfdropo_bayes.robots import Robot
 
 FAR = 0.4
 """Share of the robot's length: undeformed markers that are farther off than this, root mean square, are looked at."""
-NEAR = 0.15
-"""Share of the robot's length; a remedy that brings the markers this near is reported as the cause."""
-STRETCHED = 1.15
-"""Ratio to the distance of two markers on the undeformed robot above which they are reported."""
+NEAR = 0.15  # share of the robot's length; a remedy that brings the markers this near is reported as the cause
+STRETCHED = 1.15  # ratio to the distance of two markers on the undeformed robot above which they are reported
 
 
 class Start(NamedTuple):
@@ -55,17 +53,11 @@ def far_from_rest(robot: Robot, trajectory: Trajectory) -> dict[str, float] | No
 
 
 class Read(NamedTuple):
-    """Transformation of a file's positions to the frame of the base: subtract the origin, then turn.
+    """Transformation of a file's positions to the frame of the base: subtract the origin, then turn."""
 
-    Attributes:
-        turn: rotation from the file's frame to the base frame.
-        origin: origin of the base in the file's frame [m].
-        unit: unit of the file's positions and of ``origin`` in [data.columns]; "" for formats without that table.
-    """
-
-    turn: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
-    unit: str
+    turn: Float[np.ndarray, "3 3"]  # rotation from the file's frame to the base frame
+    origin: Float[np.ndarray, "3"]  # origin of the base in the file's frame [m]
+    unit: str  # unit of the file's positions and of ``origin`` in [data.columns]; "" for formats without that table
 
     @classmethod
     def by(cls, columns: CsvColumns | None) -> Read:

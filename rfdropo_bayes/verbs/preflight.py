@@ -49,20 +49,15 @@ BY_ITSELF = "measured by itself"
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of parameters that recordings leave undetermined.
+    """A combination of parameters that recordings leave undetermined."""
 
-    Attributes:
-        together: relative changes of the parameters, logarithmic for scale parameters; the largest is 1 in prior
-            standard deviations.
-        kept: posterior over prior standard deviation.
-        ended_by: measurements that would determine it, with the remaining share of the deviation, best first.
-        sentence: the same in words.
-    """
-
+    # relative changes of the parameters, logarithmic for scale parameters; the largest is 1 in prior standard
+    # deviations
     together: dict[str, float]
-    kept: float
+    kept: float  # posterior over prior standard deviation
+    # measurements that would determine it, with the remaining share of the deviation, best first
     ended_by: dict[str, float]
-    sentence: str
+    sentence: str  # the same in words
 
     @property
     def needs_own_measurement(self) -> bool:
@@ -72,32 +67,21 @@ class Direction:
 
 @dataclass(frozen=True)
 class Preflight:
-    """Information of recordings on a model's parameters, before a fit.
+    """Information of recordings on a model's parameters, before a fit."""
 
-    Attributes:
-        directions: undetermined combinations, the worst first.
-        parameters: share of the prior standard deviation that remains for each parameter: ``alone`` with all other
-            parameters known, and ``kept``.
-        channels: constant command channels of each recording.
-        noise: assumed noise of the positions, in words.
-        draws: number of prior draws; failed: number of failed rollouts.
-        rollout_seconds: time to simulate one parameter set, all recordings.
-        rollouts: budget of the fit; minutes: its run time.
-        method: method of the fit.
-        seconds: run time of this analysis.
-    """
-
-    directions: list[Direction]
+    directions: list[Direction]  # undetermined combinations, the worst first
+    # share of the prior standard deviation that remains for each parameter: ``alone`` with all other parameters known,
+    # and ``kept``
     parameters: pd.DataFrame
-    channels: dict[str, list[str]]
-    noise: str
-    draws: int
+    channels: dict[str, list[str]]  # constant command channels of each recording
+    noise: str  # assumed noise of the positions, in words
+    draws: int  # number of prior draws; failed: number of failed rollouts
     failed: int
-    rollout_seconds: float
-    rollouts: int
+    rollout_seconds: float  # time to simulate one parameter set, all recordings
+    rollouts: int  # budget of the fit; minutes: its run time
     minutes: float
-    method: str
-    seconds: float
+    method: str  # method of the fit
+    seconds: float  # run time of this analysis
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[tuple[str, str]]:

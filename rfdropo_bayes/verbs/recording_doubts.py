@@ -21,12 +21,10 @@ from rfdropo_bayes.verbs.motion_direction import Paths, direction_of
 from rfdropo_bayes.verbs.motion_size import size_of
 from rfdropo_bayes.verbs.placement import NEAR, placement_hints
 
-DOUBTS = "doubts"
-"""Attribute of a posterior: cautions of the recordings that it is of."""
+DOUBTS = "doubts"  # attribute of a posterior: cautions of the recordings that it is of
 MILLIMETRES = 1e3
 MOST_NAMES = 12
-FEWEST_DRAWS = 8
-"""Least number of prior draws whose median may replace the nominal model."""
+FEWEST_DRAWS = 8  # least number of prior draws whose median may replace the nominal model
 
 
 def recording_cautions(

@@ -28,24 +28,19 @@ from rfdropo_bayes.verbs.motion_direction import AGREEING
 from rfdropo_bayes.verbs.order_finder import ALIKE, ROWS, SEARCHED, arranged, find_arrangement
 from rfdropo_bayes.verbs.placement import right_angles
 
-EXPLAINED = 0.5
-"""Least share of the squared motion that the rod explains in a frame that is taken from it."""
+EXPLAINED = 0.5  # least share of the squared motion that the rod explains in a frame that is taken from it
 BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
 """Factors of the bend of a command that are tried if no answer sets it, a factor of 1.4 apart. An arm whose cables lie
 at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
 
 
 class Frame(NamedTuple):
-    """The measured positions are ``scale * rotation @ simulated + shift``.
-
-    Attributes:
-        explained: share of the squared motion that this leaves no part of.
-    """
+    """The measured positions are ``scale * rotation @ simulated + shift``."""
 
     rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]  # [m]
     scale: float
-    explained: float
+    explained: float  # share of the squared motion that this leaves no part of
 
     @property
     def quarter(self) -> Float[np.ndarray, "3 3"]:
@@ -59,19 +54,13 @@ class Frame(NamedTuple):
 
 
 class Registration(NamedTuple):
-    """How a recording lies to its robot at rest.
+    """How a recording lies to its robot at rest."""
 
-    Attributes:
-        frame: frame that brings the robot to the recording; None if the robot explains the motion in no frame.
-        arrangement: order of the commands, if it explains much more than the written order.
-        evidence: reason for the arrangement, in words.
-        bend: bend of the body that explains the recording, over that of the robot as written.
-    """
-
+    # frame that brings the robot to the recording; None if the robot explains the motion in no frame
     frame: Frame | None
-    arrangement: Arrangement | None = None
-    evidence: str = ""
-    bend: float = 1.0
+    arrangement: Arrangement | None = None  # order of the commands, if it explains much more than the written order
+    evidence: str = ""  # reason for the arrangement, in words
+    bend: float = 1.0  # bend of the body that explains the recording, over the bend of the robot as written
 
 
 def frame_of(

@@ -19,20 +19,13 @@ from rfdropo_bayes.report.baselines import mean_pose
 from rfdropo_bayes.report.fir import fit_fir
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, rows_of, spread_rows
 
-FITTED, SHOWN = 60, 240
-"""Rows that are fitted, and rows whose residuals are shown."""
-ITERATIONS, SETTLED = 10, 1e-3
-"""Most steps, and the least relative decrease of the cost by a step."""
-STEP = 0.01
-"""Step of derivatives, in standard deviations of the prior."""
-DRAWS = 400
-"""Number of prior draws for its location and size."""
-SHORTEST = 1e-2
-"""Shortest trial step, relative to the full step."""
-KEPT = 0.7
-"""Share of its prior standard deviation at or above which a parameter counts as undetermined."""
-SMALLEST = 1e-5
-"""Smallest noise [m]."""
+FITTED, SHOWN = 60, 240  # rows that are fitted, and rows whose residuals are shown
+ITERATIONS, SETTLED = 10, 1e-3  # most steps, and the least relative decrease of the cost by a step
+STEP = 0.01  # step of derivatives, in standard deviations of the prior
+DRAWS = 400  # number of prior draws for its location and size
+SHORTEST = 1e-2  # shortest trial step, relative to the full step
+KEPT = 0.7  # share of its prior standard deviation at or above which a parameter counts as undetermined
+SMALLEST = 1e-5  # smallest noise [m]
 
 
 class Scale(NamedTuple):
@@ -53,55 +46,41 @@ class Scale(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Result of a fit for a parameter.
-
-    Attributes:
-        value, prior: estimate, and middle of the prior, in its unit.
-        sd: its standard deviation, relative if ``logarithmic``.
-        kept: posterior over prior standard deviation.
-    """
+    """Result of a fit for a parameter."""
 
     name: str
     unit: str
+    # value, prior: estimate, and middle of the prior, in its unit
     value: float
     prior: float
-    sd: float
+    sd: float  # its standard deviation, relative if ``logarithmic``
     logarithmic: bool
-    kept: float
+    kept: float  # posterior over prior standard deviation
 
 
 class RestFit(NamedTuple):
-    """A fit at rest.
+    """A fit at rest."""
 
-    Attributes:
-        estimates: results for the parameters.
-        markers: names; the errors are those of the last marker, root mean square [m].
-        before, after: errors on the fitted rows.
-        unseen: errors on unfitted rows of the fit and of predictors without physics, by name.
-        each: error of every marker on the unfitted rows.
-        fitted, other: numbers of fitted rows and of rows with these errors.
-        tested: whether these are rows of test recordings.
-        rows: shown rows of all recordings; residual: measured less computed [m]; ways: whether each command was
-            last changed upwards (1) or downwards (-1); recording: number of each row's recording.
-    """
-
-    estimates: tuple[Estimate, ...]
-    markers: tuple[str, ...]
+    estimates: tuple[Estimate, ...]  # results for the parameters
+    markers: tuple[str, ...]  # names; errors are of the last marker, root mean square [m]
+    # before, after: errors on the fitted rows
     before: float
     after: float
-    unseen: Mapping[str, float]
-    each: tuple[float, ...]
+    unseen: Mapping[str, float]  # errors on unfitted rows of the fit and of predictors without physics, by name
+    each: tuple[float, ...]  # error of every marker on the unfitted rows
+    # fitted, other: numbers of fitted rows and of rows with these errors
     fitted: int
     other: int
-    tested: bool
+    tested: bool  # whether these are rows of test recordings
+    # shown rows of all recordings; residual: measured less computed [m]; ways: whether each command was last changed
+    # upwards (1) or downwards (-1); recording: number of each row's recording
     rows: Rows
     residual: Float[np.ndarray, "row marker 3"]
     ways: Float[np.ndarray, "row channel"]
     recording: np.ndarray
 
 
-OWN = "own"
-"""Key of the fitted robot among errors."""
+OWN = "own"  # key of the fitted robot among errors
 
 
 def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:

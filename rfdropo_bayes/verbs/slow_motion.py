@@ -8,10 +8,8 @@ from jaxtyping import Float
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import Robot
 
-LAGGING = 0.01
-"""Share of its way by which a body may stay behind its commands and count as slow."""
-SETTLED = 10.0
-"""Times a body's slowest period and its damping's time after which it has come to rest."""
+LAGGING = 0.01  # share of its way by which a body may stay behind its commands and count as slow
+SETTLED = 10.0  # times a body's slowest period and its damping's time after which it has come to rest
 
 
 def first_period(robot: Robot) -> float:

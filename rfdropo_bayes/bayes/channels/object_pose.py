@@ -26,7 +26,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-OFFSETS = ("offset_x", "offset_y", "offset_z")  # Parameters that shift measured against simulated positions [m]
+OFFSETS = ("offset_x", "offset_y", "offset_z")  # parameters that shift measured against simulated positions [m]
 
 LEVER = 0.02  # [m] Distance from the centre of the point whose path stands for a turn among the features
 
