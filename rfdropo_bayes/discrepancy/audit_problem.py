@@ -36,7 +36,7 @@ class AuditProblem:
         stated_noise: noise of the experiment file, used if nothing was repeated; None without it.
         start: start values of base parameters from an earlier calibration; None for a search.
         rules, seed: see `Rules`.
-        left_out: mechanisms that do not run on this body or engine, with the reason.
+        left_out: mechanisms that do not run on this body, engine or data, with the reason.
         groups: groups of recordings with their own candidates; None without groups.
         ports: ports of the simulator for the search for unknown causes; None if not requested.
     """
