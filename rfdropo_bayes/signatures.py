@@ -107,7 +107,7 @@ def see_keywords(
     """See that ``source`` can be called with these keywords.
 
     Raises:
-        InputError: a keyword that it does not have, with the nearest that it has; or keywords that are missing.
+        InputError: a keyword that the function lacks (the message offers the nearest), or missing keywords.
     """
     known = {name: entry for name, entry in inspect.signature(source).parameters.items() if name not in without}
     for name in given:

@@ -1,5 +1,6 @@
-"""Prior distributions from the tables of an experiment file, confined to a parameter's hard bounds, and the tables of
-priors that are given as distributions of numpyro."""
+"""Prior distributions from the tables of an experiment file, truncated to a parameter's hard bounds; and the reverse,
+tables of numpyro's distributions.
+"""
 
 from __future__ import annotations
 

@@ -146,14 +146,14 @@ class Scopes:
         return {whole(name) for name in (*fitted, *(p.scope.owner for p in self.parameters if p.of_recording))}
 
     def holding(self, values: Mapping[str, float]) -> Scopes:
-        """The same without some parameters, which are known."""
+        """The scopes with some parameters known instead of inferred."""
         kept = [p for p in self.parameters if p.name not in values]
         kept = [p.scaled(values[p.scope.scaled_by]) if p.scope.scaled_by in values else p for p in kept]
         known = tuple(p for p in self.parameters if p.name in values)
         return replace(self, parameters=tuple(kept), fixed={**self.fixed, **values}, known=(*self.known, *known))
 
     def with_further(self, parameters: Iterable[InferredParameter]) -> Scopes:
-        """The same with parameters after all others."""
+        """The scopes with further parameters at the end."""
         return replace(self, parameters=(*self.parameters, *parameters))
 
     def extended(self, recordings: Sequence[str], fitted: Sequence[str], groups: Patterns) -> Extension:

@@ -65,9 +65,7 @@ def _say_results(folder: Path) -> list[str]:
 
 def view(
     source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="experiment or recording to draw")],
-    out: Annotated[
-        Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
-    ] = Path("runs/view.png"),
+    out: Annotated[Path, typer.Option("--out", help=".png, .svg, .pdf, .gif or .mp4")] = Path("runs/view.png"),
     recording: Annotated[
         str | None, typer.Option(help="recording of the experiment to draw; the first by default")
     ] = None,
@@ -82,8 +80,8 @@ def view(
     """Draw a motion. Simulates an experiment, or reads a NetCDF file of simulate or predict."""
     from rfdropo_bayes.verbs.view import run_view
 
-    written = run_view(source, out, overrides or [], recording, robot)
-    typer.echo(f"{written[0]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
+    run_view(source, out, overrides or [], recording, robot)
+    typer.echo(out)
 
 
 def export(

@@ -44,7 +44,7 @@ LARGEST_LIST = 256  # longer lists are pictures, scans and clouds of points
 
 
 class _Reading(NamedTuple):
-    """Numbers of one message, or of one element with its own header."""
+    """Numbers of one message, or of one element with a header."""
 
     name: str
     header: Any

@@ -256,7 +256,7 @@ def _check_split(fit: list[_Source], test: list[_Source]) -> None:
 
 
 def _distinct_names(recordings: list[Trajectory], sources: list[_Source], listed: list[_Source]) -> list[Trajectory]:
-    """Recordings whose files have one name in several folders, of either role, get the folders into their names."""
+    """Recordings whose files have equal names in different folders get names that include the folder."""
     names = [recording.name for recording in recordings]
     distinct = []
     for recording, source in zip(recordings, sources, strict=True):

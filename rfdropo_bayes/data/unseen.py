@@ -37,7 +37,7 @@ def load_unseen(
 
     Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv", and
     formats whose columns [data.columns] names with a CSV of commands alone, take it from the first row of ``start``, or
-    start from an unknown pose.
+    begin at an unknown pose.
 
     Args:
         spec: the [data] table of the experiment; its recordings are not read.

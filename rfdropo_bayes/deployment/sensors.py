@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import DATAGRAM, MAGIC
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
@@ -52,7 +51,7 @@ class SensorTable(BaseModel):
         multicast: whether Motive streams by multicast (natnet).
         rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
         object_body: identifier of the rigid body that the robot pushes (natnet); its pivot is the object's centre.
-            Create it in Motive while the object is aligned with the robot's base.
+            Create the rigid body in Motive while the object is aligned with the robot's base.
         rotation: rows of the matrix from the sensor's frame to the robot's base frame.
         origin_m: origin of the base frame in the sensor's frame.
         port: UDP port that a simulation sends to (simulated).
@@ -148,35 +147,6 @@ class SimulatedMarkers:
         self._socket.close()
 
 
-class RecordedMarkers:
-    """The markers of a recording at the pace at which they were seen; time starts with the first call.
-
-    Read recordings with the importers of `data` ("csv", "optitrack-csv", ...).
-    """
-
-    def __init__(self, recording: Trajectory, robot: Robot) -> None:
-        if recording.marker_names != robot.marker_names:
-            raise InputError(
-                f"has markers {', '.join(recording.marker_names)}; the robot has {', '.join(robot.marker_names)}",
-                where=recording.name,
-                remedy="play a recording of this robot",
-            )
-        self._recording = recording
-        self._start: float | None = None
-
-    def latest(self) -> Sighting:
-        """The row that is due; the last row is repeated."""
-        now = time.monotonic()
-        self._start = now if self._start is None else self._start
-        row = int(np.searchsorted(self._recording.time, now - self._start, side="right")) - 1
-        at, poses = self._start + float(self._recording.time[row]), self._recording.object_pose
-        pose = None if poses is None or not np.all(np.isfinite(poses[row])) else poses[row]
-        return Sighting(row + 1, at, self._recording.position[row], self._recording.position_mask[row], pose)
-
-    def close(self) -> None:
-        """Nothing to let go of."""
-
-
 class NatNetMarkers:
     """Rigid bodies that OptiTrack's Motive streams, by the package natnet; each stands for one marker.
 
@@ -268,7 +238,7 @@ def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
     """The sensor that the table describes.
 
     Raises:
-        InputError: if it cannot be reached.
+        InputError: the server cannot be reached.
     """
     makers: Mapping[str, Callable[[], MarkerSensor]] = {
         "natnet": lambda: NatNetMarkers(table, robot),

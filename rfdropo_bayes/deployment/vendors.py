@@ -126,7 +126,7 @@ def check_rated_torque(reported: int, torque_n_m: float, unit: TorqueUnit, where
         where: location for messages.
 
     Raises:
-        InputError: if they differ by more than two per cent; names the unit that would make them agree.
+        InputError: the values differ by more than two per cent; the message names the unit in which they agree.
     """
     expected = torque_n_m / _TORQUE[unit]
     if _agree(reported, expected):
@@ -160,7 +160,7 @@ COUNTER = -(2**31), 2**31 - 1  # least and greatest position of 32 bits
 
 
 def check_polarity(word: int, where: str) -> None:
-    """Refuse a drive that reverses positions: some reverse their targets alone, and none need reverse its torque.
+    """Refuse a drive that reverses positions: some drives reverse only their targets, and torques may stay as they are.
 
     Args:
         word: content of 0x607E.
@@ -255,7 +255,7 @@ def check_guards(lacking: Collection[int], unguarded: Collection[int], where: st
         where: location for messages.
 
     Raises:
-        InputError: with every missing guard and its consequence.
+        InputError: guards are missing; the message lists each with its consequence.
     """
     if Object.PRODUCER_HEARTBEAT in lacking:
         raise InputError(

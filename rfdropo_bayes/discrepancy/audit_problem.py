@@ -1,4 +1,4 @@
-"""The problem of an audit: a simulator with every candidate in it, recordings, and rules."""
+"""The problem of an audit: a simulator with all candidates, recordings, and rules."""
 
 from __future__ import annotations
 

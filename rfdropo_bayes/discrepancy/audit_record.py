@@ -280,8 +280,8 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
 
 
 def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
-    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free, so
-    that only ratios are known if no force was measured. First-order error propagation in logarithms.
+    """Masses, forces and stiffnesses over Young's modulus. With imposed cable lengths and no measured force only these
+    ratios are determined. First-order error propagation in logarithms.
     """
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}
@@ -344,7 +344,7 @@ def _where(answer: Answer) -> dict[str, Any]:
 
 
 def _candidates(answer: Answer) -> list[dict[str, Any]]:
-    """Every candidate as the screen of the base model saw it, best first."""
+    """Score tests of all candidates at the base model, the best first."""
     first = answer.causes.screens[0]
     refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]

@@ -1,8 +1,8 @@
 """Last part of an audit: an effect on the robot that the library lacks, described as a law at a port.
 
-It runs if the library leaves a misfit: beside the base model and, if that is no better than the named mechanisms,
-beside the model with them. A library candidate that is clearly worse than a law on unseen recordings is a substitute
-for the law, and is not adopted as a cause.
+The search runs if the library leaves a misfit. It extends the base model and, if that is no better than the named
+mechanisms, the model with these mechanisms. A library candidate that is clearly worse than a law on unseen recordings
+is a substitute for the law, and is not adopted as a cause.
 """
 
 from __future__ import annotations

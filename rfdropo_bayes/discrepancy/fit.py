@@ -51,26 +51,17 @@ FAILED = 1e6  # whitened residual of a rollout that failed: no step is ever take
 
 @dataclass(frozen=True)
 class Fit:
-    """A mode and the normal approximation around it.
+    """A mode and the normal approximation around it."""
 
-    Attributes:
-        x: coordinates of all parameters.
-        free: indices of fitted coordinates.
-        residual: whitened residuals of all channels.
-        jacobian: derivative of the whitened prediction with respect to the free coordinates.
-        covariance: covariance of the free coordinates, prior included.
-        log_evidence: Laplace's, up to the noise's normaliser, which all models under the same noise share; the prior
-            counts with its density and its curvature.
-        promise: predicted gain of a further Gauss-Newton step [nat]; see `converged`.
-    """
-
-    x: Float[np.ndarray, " d"]
-    free: Int[np.ndarray, " free"]
-    residual: Float[np.ndarray, " n"]
-    jacobian: Float[np.ndarray, "n free"]
-    covariance: Float[np.ndarray, "free free"]
+    x: Float[np.ndarray, " d"]  # coordinates of all parameters
+    free: Int[np.ndarray, " free"]  # indices of fitted coordinates
+    residual: Float[np.ndarray, " n"]  # whitened residuals of all channels
+    jacobian: Float[np.ndarray, "n free"]  # derivative of the whitened prediction with respect to the free coordinates
+    covariance: Float[np.ndarray, "free free"]  # covariance of the free coordinates, prior included
+    # Laplace's, up to the noise's normaliser, which all models under the same noise share; the prior counts with its
+    # density and its curvature
     log_evidence: float
-    promise: float
+    promise: float  # predicted gain of a further Gauss-Newton step [nat]; see `converged`
 
     @property
     def converged(self) -> bool:
@@ -108,11 +99,11 @@ class FitTarget:
 
     @property
     def measured(self) -> FitTarget:
-        """The same under the noise of the measurement."""
+        """The target under the noise of the measurement."""
         return self if self.known is None else self.known
 
     def on(self, forward: Forward) -> FitTarget:
-        """The same with another simulator."""
+        """The target with another simulator."""
         known = None if self.known is None else replace(self.known, forward=forward)
         return replace(self, forward=forward, known=known)
 
@@ -260,16 +251,11 @@ class Posterior(ProblemDefaults):
     """The posterior over some coordinates, with the others fixed, as a problem of `bayes.problem`.
 
     A row is one row of every group of repeats, whitened given the earlier rows. The noise is known.
-
-    Attributes:
-        target: target of the fit.
-        start: all coordinates.
-        free: indices of free coordinates.
     """
 
-    target: FitTarget
-    start: Float[np.ndarray, " d"]
-    free: Int[np.ndarray, " free"]
+    target: FitTarget  # target of the fit
+    start: Float[np.ndarray, " d"]  # all coordinates
+    free: Int[np.ndarray, " free"]  # indices of free coordinates
     jacobian: str = "central"
 
     @property
@@ -356,7 +342,7 @@ class Posterior(ProblemDefaults):
         return np.where(fine[:, None], np.concatenate([white.reshape(len(white), -1), weighed], axis=1), np.inf)
 
     def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
-        """The same of one set of values."""
+        """Residuals at one set of values."""
         return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
 
     def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

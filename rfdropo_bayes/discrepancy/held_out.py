@@ -79,7 +79,7 @@ class HeldOut:
         return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
 
     def after(self, steps: int) -> HeldOut:
-        """The same with at most ``steps`` steps."""
+        """The predictions of the base model and of at most ``steps`` steps."""
         parts = ("predictions", "patterns", "judges", "spreads")
         return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
 
@@ -88,7 +88,7 @@ class HeldOut:
         return self.supported_from(0)
 
     def supported_from(self, first: int) -> int:
-        """The same for the steps after the first ``first``, which are accepted."""
+        """The predictions after the first ``first`` steps, which are accepted."""
         last = first
         for after in range(first + 1, len(self.predictions)):
             if self.gain(last, after).clear:

@@ -560,7 +560,7 @@ class LawSearch:
         return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
 
     def _climbed(self, refit: Refit) -> Refit:
-        """The same, climbed to its end."""
+        """The refit after a complete optimisation."""
         return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
 
     def _shaped(self, known: FitTarget, terms: Sequence[Refit], best: Refit) -> Refit:

@@ -67,7 +67,7 @@ class Found:
     ended: tuple[str, ...] = ()
 
     def after(self, part: str) -> Found:
-        """The same with a part that is done."""
+        """The results with one more finished part."""
         return replace(self, ended=(*self.ended, part))
 
     @property

@@ -4,7 +4,7 @@ Strains are Simo and Reissner's in the frame half-way between both sections, (R_
 the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
 Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent neglects the rotation of the forces. The
 forces of guided cables rotate with the rod's: the sum of both is the stiffness of taut strings between sections, which
-depends on the strains alone (``cables.held``).
+depends on the strains alone (``cables.taut_cables``).
 
 An arc is longer than its chord: the stretch of an element is its chord's plus h^2 / 24 times its squared curvature.
 Without this term an axially compressed element would be too stiff in bending.
@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.cables import Held
+from rfdropo_bayes.fem.cables import TautCables
 from rfdropo_bayes.fem.components import (
     Matrix,
     Quaternion,
@@ -120,24 +120,24 @@ def station_forces(elements: Elements, resultant: Six) -> Six:
     return jnp.concatenate([first, none], axis=1) + jnp.concatenate([none, second], axis=1)
 
 
-def held_resultant(elements: Elements, held: Held, rates: Six) -> Six:
+def taut_resultant(elements: Elements, taut: TautCables, rates: Six) -> Six:
     """Forces and moments of the sections in the elements' frames, of cables that hold them against strain rates."""
     stretching, bending = (elements.length * times(elements.frame, part) for part in (rates[:3], rates[3:]))
-    force = times(held.force, stretching) + times(held.mixed, bending)
-    moment = transposed_times(held.mixed, stretching) + times(held.moment, bending)
+    force = times(taut.force, stretching) + times(taut.mixed, bending)
+    moment = transposed_times(taut.mixed, stretching) + times(taut.moment, bending)
     return jnp.concatenate([transposed_times(elements.frame, force), transposed_times(elements.frame, moment)])
 
 
 def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six, share: Scalar) -> Stiffness:
-    """The stiffness with a share of how the forces of sections and of cables beside them turn with the middles of the
-    elements, in leading order; it is symmetric.
+    """The stiffness with a share of the geometric term: forces of sections and of cables turn with the elements. The
+    term is of leading order and symmetric.
 
     Args:
         elements: shape of all elements.
-        stiffness: their stiffness without it.
+        stiffness: stiffness of the elements without this term.
         resultant: forces and moments of the sections in the elements' frames.
         pull: forces and moments of the cables in space.
-        share: 1 for all of it.
+        share: share of this term, 1 for the whole.
     """
     force = 0.5 * share * (pull[:3] + times(elements.frame, resultant[:3]))
     moment = 0.5 * share * (pull[3:] + times(elements.frame, resultant[3:]))
@@ -148,15 +148,15 @@ def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six,
     return Stiffness(c, a - tilt, b - tilt, aa + swing, bb + swing, ba + swing - roll)
 
 
-def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held: Held | None = None) -> Stiffness:
+def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, taut: TautCables | None = None) -> Stiffness:
     """Stiffness of the elements, from the stiffness of the sections, a diagonal and a diagonal or a matrix, and of the
     cables that hold them."""
     frame, way = elements.frame, elements.way
     c = product(frame * (stretch / elements.length)[None], transposed(frame))
     turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
     bent = product(turned / elements.length, transposed(frame))
-    if held is not None:
-        c, bent = c + held.force, bent + held.moment
+    if taut is not None:
+        c, bent = c + taut.force, bent + taut.moment
     for _ in range(2):  # W from the left, then, as the matrix is symmetric, from the right
         row = transposed_times(bent, elements.bend)
         bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
@@ -167,9 +167,9 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held:
     lever_a, lever_b = turn + fold, turn - fold
     a, b = product(c, lever_a), product(c, lever_b)
     back_a, back_b = transposed(lever_a), transposed(lever_b)
-    if held is None:
+    if taut is None:
         return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)
-    mixed = held.mixed - (elements.share * times(held.mixed, elements.bend))[:, None] * elements.bend[None]
+    mixed = taut.mixed - (elements.share * times(taut.mixed, elements.bend))[:, None] * elements.bend[None]
     more = transposed(mixed)
     turning_a, turning_b = bent - product(more, lever_a), bent + product(more, lever_b)
     a, b = a - mixed, b + mixed

@@ -43,7 +43,7 @@ SMALLEST_SHARE = 0.01  # of the work, from which the remaining time is estimated
 
 
 class Progress:
-    """Reports stages, and rollouts between them. Nothing of it influences a result.
+    """Reports stages, and rollouts between them. Progress does not influence results.
 
     Args:
         title: name of the work.

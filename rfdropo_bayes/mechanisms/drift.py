@@ -1,8 +1,8 @@
 """Sizes that change linearly from the start of a recording: `drift_of` makes the drift of a mechanism, with a rate in
 place of each size.
 
-A size that differs between recordings needs no mechanism of its own: [model.per_recording] and [model.per_group] give
-each recording or group its size.
+A size that differs between recordings needs no separate mechanism: [model.per_recording] and [model.per_group] give
+each recording or group a size.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Drift:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> Any:
-        """With the parameters that the mechanism has for a robot."""
+        """The drift with the parameters of the mechanism for a robot."""
         kind: Any = cls.kind
         return cls(kind.for_robot(robot) if hasattr(kind, "for_robot") else kind())
 

@@ -30,29 +30,17 @@ PLACES = ("base", "middle", "tip")
 
 
 class Port(NamedTuple):
-    """A place at which a signal w(t) may act.
+    """A place at which a signal w(t) may act."""
 
-    Attributes:
-        name: name in files, such as "cable left" or "marker m3 along".
-        stage: "actuation", "body" or "sensing".
-        kind: kind of place.
-        number: index within its kind: a channel, a place or a marker; for "cables" the number of cables.
-        axis: 0 to 2, and 3 along the body; -1 without an axis.
-        unit: unit of the signal.
-        size: size of a typical effect: the scale of priors and of differences.
-        look: check to make at the robot.
-        spoken: its name in sentences, tables and figures, if it differs from the name in files; see `words`.
-    """
-
-    name: str
-    stage: str
-    kind: str
-    number: int
-    axis: int
-    unit: str
-    size: float
-    look: str
-    spoken: str = ""
+    name: str  # name in files, such as "cable left" or "marker m3 along"
+    stage: str  # "actuation", "body" or "sensing"
+    kind: str  # kind of place
+    number: int  # index within its kind: a channel, a place or a marker; for "cables" the number of cables
+    axis: int  # 0 to 2, and 3 along the body; -1 without an axis
+    unit: str  # unit of the signal
+    size: float  # size of a typical effect: the scale of priors and of differences
+    look: str  # check to make at the robot
+    spoken: str = ""  # its name in sentences, tables and figures, if it differs from the name in files; see `words`
 
     @property
     def words(self) -> str:
@@ -61,27 +49,20 @@ class Port(NamedTuple):
 
 
 class PortMap(NamedTuple):
-    """The ports of a robot on an engine, and the composition of signals there.
+    """The ports of a robot on an engine, and the composition of signals there."""
 
-    Attributes:
-        ports: all of them.
-        left_out: ports that the body cannot carry, with the reason.
-        channels: number of commands; places: number of stations for forces, 0 if none.
-        gravity: acceleration [m/s2].
-    """
-
-    ports: tuple[Port, ...]
-    left_out: dict[str, str]
-    channels: int
-    places: int
-    gravity: tuple[float, float, float]
+    ports: tuple[Port, ...]  # all of them
+    left_out: dict[str, str]  # ports that the body cannot carry, with the reason
+    channels: int  # number of commands
+    places: int  # number of stations for forces, 0 if none
+    gravity: tuple[float, float, float]  # acceleration [m/s2]
 
     def named(self, name: str) -> Port | None:
         """A port by its name in files or in sentences; None if there is none."""
         return next((port for port in self.ports if name in (port.name, port.words)), None)
 
     def members(self, port: Port) -> tuple[Port, ...]:
-        """The ports at which a law of this port acts: for "cables" every cable, by its own command."""
+        """The ports at which a law of this port acts: every cable for "cables", each as a function of its command."""
         if port.kind == "cables":
             return tuple(each for each in self.ports if each.kind == "cable")
         return (port,)
@@ -97,7 +78,7 @@ class PortMap(NamedTuple):
         return BodySignals(jnp.zeros((rows, self.places, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
 
     def signals(self, port: Port, w: Float[Array, " row"]) -> PortSignals:
-        """A signal at a port of actuation or of the body, as a rollout takes it; at one with several members none."""
+        """A signal at a port of actuation or of the body, as input of a rollout; None for several members."""
         none = self.silent(len(w))
         if port.kind == "cable":
             return none._replace(command=none.command.at[:, port.number].set(w))

@@ -12,8 +12,6 @@ from rfdropo_bayes.tables import nearest
 
 ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN")
 CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
-ACTOR_CRITIC = ("PPO", "A2C")
-"""Whose actor and critic have their own networks and one observation: the critic may see more."""
 OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
 """Arguments that the training sets itself."""
 OBJECTS = ("action_noise", "replay_buffer_class", "rollout_buffer_class")
@@ -42,27 +40,17 @@ def algorithm_class(name: str, kind: str) -> Any:
     return getattr(stable_baselines3, name)
 
 
-def check_critic(name: str, critic: str) -> None:
-    """Raise an InputError if the critic of an algorithm cannot see parameters."""
-    if critic == "parameters" and name not in ACTOR_CRITIC:
-        raise InputError(
-            f"the critic of {name} cannot see parameters",
-            where='[training] critic = "parameters"',
-            remedy=f'use algorithm = "{ACTOR_CRITIC[0]}" or "{ACTOR_CRITIC[1]}", or leave out critic',
-        )
-
-
 def algorithm_options(
     name: str, kind: str, gamma: float, given: Mapping[str, Any], environments: int = 128
 ) -> dict[str, Any]:
-    """Arguments of an algorithm: the defaults for these tasks, overridden by ``given``.
+    """Arguments of an algorithm: defaults for these tasks, replaced by ``given``.
 
     Args:
         name: name of the algorithm.
         kind: kind of actions.
         gamma: discount factor of one control period, unless ``given`` has another.
         given: options of the algorithm by Stable-Baselines3's own names; ``net_arch``, ``log_std_init`` and
-            ``activation`` (tanh, relu or elu) may stand among them without ``policy_kwargs``.
+        ``activation`` (tanh, relu or elu) need no ``policy_kwargs``.
         environments: number of environments simulated at once; a batch of PPO divides the rows they gather.
 
     Raises:
@@ -78,7 +66,7 @@ def algorithm_options(
             remedy = nearest(option, [*known, *short])
             raise InputError(f"{name} has no option {option!r}", where="[training.options]", remedy=remedy)
     policy: dict[str, Any] = {"net_arch": [128, 128]}
-    if name in ACTOR_CRITIC and kind == "continuous":
+    if name in ("PPO", "A2C") and kind == "continuous":
         policy["log_std_init"] = -1.0
     own = given.get("policy_kwargs", {})
     if not isinstance(own, Mapping):

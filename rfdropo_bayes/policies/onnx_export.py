@@ -95,7 +95,7 @@ def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Pa
     Args:
         model: the trained model.
         normalisation: the ``VecNormalize`` it was trained under, or None.
-        layout: layout of its observation and action.
+        layout: layout of the policy's observation and action.
         path: file to write.
         facts: further metadata: hashes, seed, versions.
 
@@ -143,7 +143,7 @@ class ExportedPolicy:
         path: path of the ONNX file.
 
     Attributes:
-        layout: layout of its observation and action.
+        layout: layout of the policy's observation and action.
         facts: its other metadata.
 
     Raises:

@@ -1,8 +1,8 @@
-"""Exported policies beside the models they are made from: before a training and after it.
+"""Comparison of exported policies with their models, before and after training.
 
-Some options of an algorithm change the network in ways that an export may not follow. A training of hours must not end
-there, so that the untrained policy is exported and compared first: as it is, and with numbers drawn for its weights,
-because an untrained policy's actions are near zero, and hide a missing tanh or limit.
+Some options of an algorithm change the network in ways that an export may not follow. A failure after hours of training
+is avoided: the untrained policy is exported and compared first, as it is and with random weights, because an untrained
+policy's actions are near zero, and hide a missing tanh or limit.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def check_exportable(model: Any, normalisation: Any, act: Act, layout: PolicyLay
         model: model of Stable-Baselines3, trained or untrained.
         normalisation: the ``VecNormalize`` around its environments, or None.
         act: map from the environments' observations to the model's most likely actions.
-        layout: layout of its observation and action.
+        layout: layout of the policy's observation and action.
 
     Raises:
         InputError: a layer that cannot be exported, or another action.

@@ -22,7 +22,7 @@ from pydantic_core import PydanticSerializationError
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import stop_if_asked_twice
-from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options, check_critic
+from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options
 from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, peak_tension, play
 from rfdropo_bayes.policies.parity import check_exportable
 from rfdropo_bayes.policies.training_config import TrainingTable
@@ -91,8 +91,7 @@ def train(
         show: progress on stderr; None draws a bar on a terminal, and prints a line now and then elsewhere.
 
     Raises:
-        InputError: an unknown algorithm or option, a critic that the algorithm cannot have, or a checkpoint of another
-            run.
+        InputError: an unknown algorithm or option, or a checkpoint of another run.
     """
     import torch
 
@@ -101,7 +100,6 @@ def train(
     layout = venv.get_attr("layout")[0]
     options = algorithm_options(table.algorithm, layout.kind, gamma, table.options, table.environments)
     maker = algorithm_class(table.algorithm, layout.kind)
-    check_critic(table.algorithm, table.critic)
     known = {"table": _plain(table), "seed": seed, **(fingerprint or {})}
     folder = Path(out) / CHECKPOINT
     state = _load_state(folder, known) if resume else None
@@ -152,10 +150,8 @@ def _begin(
         variance = LEAST_SPREAD**2  # added to variances
         normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=variance) if table.normalise else None
         ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
-        around = _training_environments(normalisation or venv, table)
-        policy, options = _policy_class(around, table, options)
         try:
-            return maker(policy, around, **ours, **options), normalisation
+            return maker("MlpPolicy", normalisation or venv, **ours, **options), normalisation
         except Exception as error:  # Stable-Baselines3 asserts, and PyTorch and Python raise whatever they raise
             raise InputError(
                 f"{maker.__name__} cannot be made: {error}",
@@ -179,27 +175,7 @@ def _load(
 
     normalisation = VecNormalize.load(str(folder / f"{which}normalisation.pkl"), venv) if table.normalise else None
     path = folder / f"{which}model.zip"
-    around = _training_environments(normalisation or venv, table)
-    return maker.load(path, env=around, device="cpu", tensorboard_log=tensorboard), normalisation
-
-
-def _training_environments(around: Any, table: TrainingTable) -> Any:
-    """Environments for training: the policy's environments, with further observations for the critic."""
-    if table.critic == "observation":
-        return around
-    from rfdropo_bayes.policies.critic import ParametersBeside
-
-    return ParametersBeside(around)
-
-
-def _policy_class(around: Any, table: TrainingTable, options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-    """Policy class for Stable-Baselines3, and the options completed for it."""
-    if table.critic == "observation":
-        return "MlpPolicy", options
-    from rfdropo_bayes.policies.critic import AsymmetricPolicy
-
-    own = {**options["policy_kwargs"], "unseen": len(around.varied.names)}
-    return AsymmetricPolicy, {**options, "policy_kwargs": own}
+    return maker.load(path, env=normalisation or venv, device="cpu", tensorboard_log=tensorboard), normalisation
 
 
 def _best_row(curve: Sequence[Mapping[str, float]]) -> int:
@@ -216,7 +192,9 @@ def _leg(
     seed: int,
     log: Path,
 ) -> dict[str, Any]:
-    """Learn until the next evaluation, and evaluate in the same environments: each leg resets them all."""
+    """Learn until the next evaluation, and evaluate in the same environments. Learning and evaluation each begin with a
+    reset of all environments.
+    """
     began, redrawn = time.monotonic(), venv.get_attr("redrawn")[0]
     leg = int(state["leg"]) + 1
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
@@ -254,8 +232,8 @@ def _leg(
 
 
 def _failures(steps: int) -> Any:
-    """A callback that counts training episodes whose simulation failed, has schedules count the whole run's steps, and
-    stops if Ctrl-C was pressed twice.
+    """A callback that counts failed training episodes, bases schedules on the steps of the whole run, and stops if
+    Ctrl-C was pressed twice.
 
     Stable-Baselines3 imports are heavy, so that the class is made here.
     """
@@ -292,7 +270,9 @@ def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint beside the previous checkpoint, then replace it: a kill leaves one of the two."""
+    """Write a checkpoint beside the previous checkpoint, then replace the previous checkpoint, so that a killed process
+    leaves one of the two.
+    """
     partial = folder.with_name(f"{CHECKPOINT}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

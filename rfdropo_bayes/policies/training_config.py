@@ -49,11 +49,6 @@ class TrainingTable(BaseModel):
         default_factory=dict,
         description="options of the algorithm, under their names in Stable-Baselines3, with net_arch",
     )
-    critic: Literal["observation", "parameters"] = Field(
-        default="observation",
-        description="input of the critic of PPO or A2C in training: the observation, or also the parameters that "
-        "differ between episodes; the policy never sees them",
-    )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(
         default=False,

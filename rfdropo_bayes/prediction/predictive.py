@@ -1,4 +1,4 @@
-"""Predictions under a posterior: of the recordings it was fitted to, and of recordings it has never seen.
+"""Predictions under a posterior: of fitted and of new recordings.
 
 A pushed cube starts at its measured pose in a new recording.
 """
@@ -213,7 +213,7 @@ def with_repeats_marked(
 
     Args:
         predictions: predictions of recordings.
-        trajectories: these recordings, in the same order.
+        trajectories: the same recordings as trajectories, in the same order.
     """
     marked, number = list(predictions), 0
     for split in ("fit", "test"):
@@ -229,7 +229,7 @@ def with_repeats_marked(
 def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key: PRNGKeyArray) -> Batch:
     """Values of the parameters of new recordings, from draws of the fitted parameters.
 
-    One fitted recording is chosen per draw for all parameters of a new recording: its values belong together.
+    For each draw, all parameters of a new recording come from one fitted recording, so that the values are consistent.
     """
     count, extended = len(next(iter(values.values()))), {}
     chosen = {

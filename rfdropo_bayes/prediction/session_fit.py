@@ -1,7 +1,8 @@
 """Parameters of a new session, fitted to one short recording under every draw of the body.
 
-The body keeps its posterior. Under each draw the session's parameters are fitted to perturbed data and perturbed prior
-means (`fit_own`), so that the optimum is a draw from their posterior given that body. Each body is then weighted by its
+The posterior of the body's parameters is unchanged. Under each draw the session's parameters are fitted to perturbed
+data and perturbed prior means (`fit_own`), so that the optimum is a draw from their posterior given that body. Each
+body is then weighted by its
 evidence: the likelihood of the recording with the session's parameters integrated out. The draws are exact for a linear
 model with normal noise.
 """

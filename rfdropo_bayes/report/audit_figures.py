@@ -27,16 +27,14 @@ class Residuals:
 
     main: Float[np.ndarray, " row"]  # the residual's dominant pattern over the channels, a coordinate per row [m]
     share: float  # part of the mean square in this pattern
-    # [s]; command: of every channel at that time, and its rate per second; tension: of every cable [N]
-    time: Float[np.ndarray, " row"]
-    command: Float[np.ndarray, "row channel"]
+    time: Float[np.ndarray, " row"]  # [s]
+    command: Float[np.ndarray, "row channel"]  # of every channel at that time, and its rate per second
     rate: Float[np.ndarray, "row channel"]
-    tension: Float[np.ndarray, "row cable"]
+    tension: Float[np.ndarray, "row cable"]  # of every cable [N]
     position: Float[np.ndarray, " row"]  # simulated coordinate along the same pattern [m]
-    # channels, cables: their names; unit: of the commands
-    channels: tuple[str, ...]
+    channels: tuple[str, ...]  # channels, cables: their names
     cables: tuple[str, ...]
-    unit: str
+    unit: str  # of the commands
 
 
 def _strongest(series: np.ndarray, main: np.ndarray) -> int:
@@ -295,7 +293,7 @@ def class_figure(residuals: Residuals, effect: ClassEffect) -> Figure:
 def binned(
     cause: Float[np.ndarray, " row"], values: Float[np.ndarray, "k row"]
 ) -> tuple[Float[np.ndarray, " bin"], Float[np.ndarray, "k bin"]]:
-    """Means over rows with as much of a cause: over each of its values, or, of more than `BINS`, over quantiles."""
+    """Means over rows with equal values of a cause; over quantiles for more than `BINS` values."""
     known = np.unique(cause)
     if len(known) > BINS:
         edges = np.unique(np.quantile(cause, np.linspace(0.0, 1.0, BINS + 1)))

@@ -75,7 +75,7 @@ class Cable(RobotTable):
 
     @property
     def end_m(self) -> float:
-        """Axial coordinate of its end in the undeformed body."""
+        """Axial coordinate of the cable's end in the undeformed body."""
         return self.guide_z_m[-1]
 
     def turned(self, angle: float) -> Cable:

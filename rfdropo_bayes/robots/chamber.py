@@ -10,7 +10,7 @@ from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 
 class Chamber(RobotTable):
-    """A chamber parallel to the axis: its pressure times its area is a force that follows the body.
+    """A chamber parallel to the axis: pressure times area is a force that follows the body.
 
     Between its ends the sections carry this force at the chamber's distance from the axis: a thrust along the axis and
     a moment.
@@ -54,10 +54,10 @@ class Chamber(RobotTable):
         return self.model_copy(update={"azimuth_deg": self.azimuth_deg + angle})
 
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Place of its middle line across the axis [m]."""
+        """Place of the chamber's middle line across the axis [m]."""
         angle = np.deg2rad(self.azimuth_deg)
         return self.radius_m * np.array([np.cos(angle), np.sin(angle)])
 
     def ends(self) -> Float[np.ndarray, "2 3"]:
-        """Middle of its two ends in the undeformed body [m]."""
+        """Middle of the chamber's two ends in the undeformed body [m]."""
         return np.column_stack([np.tile(self.middle(), (2, 1)), self.z_m])

@@ -78,7 +78,7 @@ class DriveTravel(RobotTable):
         return group in patterns or any(fnmatchcase(whole(recording), pattern) for pattern in patterns)
 
     def columns(self, channels: Sequence[str]) -> list[int]:
-        """Indices of its cables among the command channels.
+        """Indices of the table's cables among the command channels.
 
         Raises:
             InputError: a cable that is no channel.
@@ -146,7 +146,7 @@ def travel_in(
         tables: tables of a robot and its experiment.
         channels: names of the command channels.
         recording: name of the recording.
-        initial: command before its first row [m or rad].
+        initial: command before the first row [m or rad].
         group: group of the recording.
 
     Raises:

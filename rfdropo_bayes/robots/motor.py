@@ -84,8 +84,3 @@ class Motor(RobotTable):
     def per_mille(self, tension: float) -> float:
         """Torque in per mille of the rated one, without sign, that holds a tension [N]."""
         return tension * self.drum_radius_m / (self.gear * self.rated_torque_n_m) * 1e3
-
-    @property
-    def stopping_time_s(self) -> float:
-        """Longest time a stop takes that keeps the limit on acceleration [s]."""
-        return self.rate_limit_m_s / self.acceleration_limit_m_s2

@@ -94,21 +94,19 @@ class LanesBeforeCube:
         self._gaps = jax.jit(jax.vmap(gap))
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`."""
-        found = self._bodies.reset(rows, given)
+        motion = self._bodies.reset(rows, given)
         # all lanes are computed, so that the same program serves any number of rows
-        spread = np.zeros(self._count, int)
-        spread[rows] = np.arange(len(rows))
-        spheres = found.position[:, self._shown :]
-        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (given.cube, spheres))))[rows]
-        return self._markers(found._replace(imbalance=np.where(gap < -TOUCHING, np.inf, found.imbalance)))
+        source = np.zeros(self._count, int)
+        source[rows] = np.arange(len(rows))
+        spheres = motion.position[:, self._shown :]
+        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[source], (given.cube, spheres))))[rows]
+        return self._markers(motion._replace(imbalance=np.where(gap < -TOUCHING, np.inf, motion.imbalance)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """See `BodyLanes`."""
         return self._markers(self._bodies.advance(displacement, loads))
 
-    def _markers(self, found: Motion) -> Motion:
-        return found._replace(position=found.position[:, : self._shown])
+    def _markers(self, motion: Motion) -> Motion:
+        return motion._replace(position=motion.position[:, : self._shown])
 
 
 class CompiledLanes:
@@ -120,13 +118,11 @@ class CompiledLanes:
         self.save, self.restore = self._session.save, self._session.restore
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`."""
         cube = None if given.cube is None else cube_arrays(given.cube)
         begin = {"start" if self._from_equilibrium else "before": given.start}
         return _last(self._session.reset(rows, given.material, **begin, cube=cube, loads=self._acting(given.loads)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """See `BodyLanes`."""
         if self._at_rest:
             displacement, loads = _ends(displacement, loads)
         return _last(self._session.advance(displacement, loads=self._acting(loads)), begun=1)
@@ -139,10 +135,10 @@ def _ends(
     return displacement[:, -1:], jax.tree.map(lambda part: part[:, -1:], loads)
 
 
-def _last(found: Motion, begun: int = 0) -> Motion:
+def _last(motion: Motion, begun: int = 0) -> Motion:
     """The last recorded row, and the largest tensions of rows from ``begun`` on."""
-    pose, peak = None if found.pose is None else found.pose[:, -1], found.tension[:, begun:].max(axis=1)
-    return found._replace(position=found.position[:, -1], tension=found.tension[:, -1], pose=pose, peak=peak)
+    pose, peak = None if motion.pose is None else motion.pose[:, -1], motion.tension[:, begun:].max(axis=1)
+    return motion._replace(position=motion.position[:, -1], tension=motion.tension[:, -1], pose=pose, peak=peak)
 
 
 class _Lane(NamedTuple):
@@ -166,9 +162,9 @@ class ReferenceLanes:
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`. All lanes are computed, so that the same compiled program works for any number of rows."""
-        spread = np.zeros(self._count, int)
-        spread[rows] = np.arange(len(rows))
-        fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[spread], given))
+        source = np.zeros(self._count, int)
+        source[rows] = np.arange(len(rows))
+        fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[source], given))
         if self._lanes is None:
             self._lanes = fresh
         elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):
@@ -177,18 +173,15 @@ class ReferenceLanes:
         return Motion(*(None if part is None else part[rows] for part in self._shown(self._lanes.state.tension)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """See `BodyLanes`."""
         if self._engine.at_rest:
             displacement, loads = _ends(displacement, loads)
         self._lanes, peak = self._moved(self._lanes, jnp.asarray(displacement), loads)
         return self._shown(peak)
 
     def save(self) -> Float[np.ndarray, "lane values"]:
-        """See `BodyLanes`."""
         return flat_lanes(self._lanes, self._count)
 
     def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """See `BodyLanes`."""
         whole = self.save()
         whole[rows] = state
         self._lanes = lanes_like(self._lanes, whole)

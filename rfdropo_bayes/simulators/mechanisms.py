@@ -27,8 +27,7 @@ STAGES = ("actuation", "body", "contact", "sensing")
 BODIES = ("rod", "tetrahedra")
 ENGINES = ("jax", "numba")
 MOTIONS = ("dynamic", "quasi-static")
-BLACK_BOX = "black box"
-"""In the place of body and engine: a program whose inside nobody reaches."""
+BLACK_BOX = "black box"  # in the place of body and engine: a program whose inside nobody reaches
 
 
 class Mechanism(Protocol):
@@ -36,8 +35,8 @@ class Mechanism(Protocol):
 
     Attributes:
         name: registry name.
-        stage: one of `STAGES`, in the order in which they act on a rollout.
-        parameters: its parameters; the nominal value of each is its null value, except for parameters with a ``grid``.
+        stage: one of `STAGES`, which are in the order of their action on a rollout.
+        parameters: parameters of the mechanism; nominal values are null values, except for parameters with a ``grid``.
             A null value that is a bound makes the effect one-sided.
         cause: one line on the physical cause.
         remedy: one line on the remedy in a laboratory.
@@ -96,17 +95,11 @@ class TimedSensingMechanism(Mechanism, Protocol):
 
 
 class Meanwhile(NamedTuple):
-    """Commands at the cables during a rollout.
+    """Commands at the cables during a rollout."""
 
-    Attributes:
-        levels: commands before the first step and at the end of every step [m or rad].
-        commands: commands, with the observed steps.
-        time_step: time step [s].
-    """
-
-    levels: Float[Array, "row channel"]
-    commands: Commands
-    time_step: float
+    levels: Float[Array, "row channel"]  # commands before the first step and at the end of every step [m or rad]
+    commands: Commands  # commands, with the observed steps
+    time_step: float  # time step [s]
 
 
 @runtime_checkable
@@ -127,7 +120,7 @@ class PushingMechanism(Mechanism, Protocol):
 
     @property
     def follows_motion(self) -> bool:
-        """Whether it depends on how the body moves."""
+        """Whether the mechanism depends on the motion of the body."""
 
     def push(
         self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
@@ -186,13 +179,11 @@ class SteppedActuation:
     """Base of mechanisms of actuation that are written as a step; a rollout scans it."""
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Any:
-        """See `SteppedMechanism`."""
         raise NotImplementedError
 
     def advance(
         self, values: Values, memory: Any, given: Float[Array, " channel"], now: float
     ) -> tuple[Any, Float[Array, " channel"]]:
-        """See `SteppedMechanism`."""
         raise NotImplementedError
 
     def actuate(
@@ -211,17 +202,14 @@ class MemorylessActuation:
         raise NotImplementedError
 
     def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
-        """See `ActuationMechanism`."""
         return self.reach(values, constant)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[()]:
-        """See `SteppedMechanism`."""
         return ()
 
     def advance(
         self, values: Values, memory: tuple[()], given: Float[Array, " channel"], now: float
     ) -> tuple[tuple[()], Float[Array, " channel"]]:
-        """See `SteppedMechanism`."""
         return memory, self.reach(values, given)
 
     def actuate(
@@ -290,13 +278,13 @@ def obstacle(
 
 def code_of(mechanisms: Iterable[Mechanism]) -> bytes:
     """Source files of mechanisms: their digests show whether the code of a name has changed."""
-    found: set[bytes] = set()
+    sources: set[bytes] = set()
     for kind in {type(mechanism) for mechanism in mechanisms}:
         try:
-            found.add(Path(inspect.getfile(kind)).read_bytes())
+            sources.add(Path(inspect.getfile(kind)).read_bytes())
         except (OSError, TypeError):  # written in a notebook or at a prompt
-            found.add(f"{kind.__module__}.{kind.__qualname__}".encode())
-    return b"".join(sorted(found))
+            sources.add(f"{kind.__module__}.{kind.__qualname__}".encode())
+    return b"".join(sorted(sources))
 
 
 def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:

@@ -22,17 +22,11 @@ class BodySignals(NamedTuple):
 
 
 class PortSignals(NamedTuple):
-    """Signals at the ports of a simulator; row 0 belongs to the initial state, row k to the end of step k.
+    """Signals at the ports of a simulator; row 0 belongs to the initial state, row k to the end of step k."""
 
-    Attributes:
-        command: added to the commands that reach the cables [m or rad].
-        delay: delay of commands at the cables [s].
-        body: loads on the body; None without loads.
-    """
-
-    command: Float[Array, "*batch row channel"]
-    delay: Float[Array, "*batch row"]
-    body: BodySignals | None = None
+    command: Float[Array, "*batch row channel"]  # added to the commands that reach the cables [m or rad]
+    delay: Float[Array, "*batch row"]  # delay of commands at the cables [s]
+    body: BodySignals | None = None  # loads on the body; None without loads
 
 
 def reached(

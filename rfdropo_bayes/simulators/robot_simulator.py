@@ -43,8 +43,7 @@ PASSES = 2
 """Number of fixed-point iterations for laws that depend on the motion: after two, a pull and a softening are within 5 %
 of their effect after eight.
 """
-DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
-"""Parameters that a body at rest does not have."""
+DAMPING = ("rayleigh_mass", "rayleigh_stiffness")  # parameters that a body at rest does not have
 SOFT = 1e4
 """[m/N] Compliance between a cable and a drive that holds its tension: a length of 1 m changes the tension by 0.1
 mN.
@@ -85,8 +84,8 @@ def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time sec
         axis=-2,
     )
     largest = jnp.argmax(jnp.stack([a - e - i, e - a - i, i - a - e, a + e + i], axis=-1), axis=-1)
-    found = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
-    return found / jnp.linalg.norm(found, axis=-1, keepdims=True)
+    quaternion = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
+    return quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)
 
 
 class RobotSimulator(ExtendedSimulator):
@@ -94,20 +93,13 @@ class RobotSimulator(ExtendedSimulator):
 
     Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
     mechanisms, and cube -> markers -> sensing mechanisms -> observation. A cube starts at rest at its given pose.
-
-    Attributes:
-        robot: simulated robot.
-        engine: engine of the motion of the body, and of a cube if it has a scene.
-        assembly: the discretised robot that the engine was made for.
-        mechanisms: extensions, applied in the given order within each stage.
-        time_step: time step of the simulation [s].
     """
 
-    robot: Robot
-    engine: Engine
-    assembly: Any
-    mechanisms: Sequence[Mechanism]
-    time_step: float
+    robot: Robot  # simulated robot
+    engine: Engine  # engine of the motion of the body, and of a cube if it has a scene
+    assembly: Any  # the discretised robot that the engine was made for
+    mechanisms: Sequence[Mechanism]  # extensions, applied in the given order within each stage
+    time_step: float  # time step of the simulation [s]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
@@ -175,11 +167,11 @@ class RobotSimulator(ExtendedSimulator):
         return self.engine.lanes
 
     def with_backend(self, backend: Backend) -> Self:
-        """The same, computed by another backend."""
+        """The simulator with another backend."""
         return replace(self, engine=replace(self.engine, backend=backend))  # type: ignore[type-var]
 
     def pushing(self) -> Self:
-        """The same with the cube and the plate of its robot before it.
+        """The simulator with the robot's cube and plate.
 
         Raises:
             InputError: a robot without a cube.
@@ -285,7 +277,7 @@ class RobotSimulator(ExtendedSimulator):
             InputError: such mechanisms on another body than a rod without a cube.
         """
         pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
-        found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
+        loads = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
         if pushing:
             if not self.engine.carries_loads:
                 raise InputError(
@@ -295,13 +287,13 @@ class RobotSimulator(ExtendedSimulator):
                 )
             initial, command = self.actuated(values, commands, self.time_step)
             levels = jnp.concatenate([initial[None], command])
-            found += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
-        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
+            loads += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
+        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *loads) if loads else None
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.
 
-        Always in double precision; with another integrator than implicit Euler always by the reference engine, as
+        The computation is in double precision. Integrators other than implicit Euler need the reference engine, since
         states alone do not determine the stages of a step. Mechanisms of sensing have no effect; only `rollout` reports
         divergence.
 
@@ -365,7 +357,7 @@ class RobotSimulator(ExtendedSimulator):
         """Values with the cube at its measured pose, less the offset of the measuring frame, standing on the plate.
 
         Args:
-            values: values of one rollout, or of many (arrays of one shape); missing values are nominal.
+            values: values of one rollout, or of many (arrays of equal shapes); missing values are nominal.
             pose: measured centre [m] and unit quaternion (x, y, z, w).
         """
         known = {spec.name: spec.nominal for spec in self.parameters} | dict(values)
@@ -408,8 +400,9 @@ class RobotSimulator(ExtendedSimulator):
         return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
 
     def exerted(self, values: Values, level: Float[Array, " drive"]) -> Float[Array, " drive"]:
-        """Drives of the engine at levels of the robot's drives [m, N or Pa]: a drive that holds a tension winds a
-        spring that is so soft that the cable's own length does not count."""
+        """Drives of the engine at levels of the robot's drives [m, N or Pa]. A drive that holds a tension winds a very
+        soft spring, so that the cable's length has no effect.
+        """
         if self.robot.held_by_force:
             return level * np.array([SOFT if each.unit == "N" else 1.0 for each in self.robot.actuators])
         return level + self.pretension(values)
@@ -441,12 +434,10 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def integrator(self) -> str | None:
-        """See `ExtendedSimulator.integrator`."""
         return self.engine.integrator
 
     @property
     def command_timing(self) -> tuple[float, float]:
-        """See `ExtendedSimulator.command_timing`."""
         return self.robot.command.ramp_s, self.robot.command.dead_time_s
 
     def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:
@@ -454,7 +445,6 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.travel(recording, command)
 
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
-        """See `ExtendedSimulator.lane_start`."""
         material, cube = self.body_inputs(values)
         return LaneStart(material, self.exerted(values, drives.level), cube)
 
@@ -485,5 +475,4 @@ class RobotSimulator(ExtendedSimulator):
         return self.in_measuring_frame(values, super().measured(values, position, time, meanwhile))
 
     def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """See `ExtendedSimulator.in_measuring_frame`."""
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

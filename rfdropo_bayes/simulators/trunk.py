@@ -65,8 +65,7 @@ def _chambers(robot: Robot, body: Rod) -> np.ndarray | None:
     return chamber_layout(body, middle, ends, [chamber.area_m2 for chamber in robot.chambers])
 
 
-ARM = 0.01
-"""[m] Distance from the axis of the points that give a section's orientation."""
+ARM = 0.01  # [m] Distance from the axis of the points that give a section's orientation
 
 
 def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
@@ -78,16 +77,12 @@ def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
 
 @dataclass(frozen=True)
 class TrunkSimulator(RobotSimulator):
-    """A rod with mechanisms, behind the `Simulator` protocol.
-
-    Attributes:
-        discretisation: resolution of body and time; for the others see `RobotSimulator`.
-    """
+    """A rod with mechanisms, behind the `Simulator` protocol."""
 
     robot: Robot
     engine: Engine
     assembly: Assembly
-    discretisation: Discretisation
+    discretisation: Discretisation  # resolution of body and time; for the others see `RobotSimulator`
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
 
     @property
@@ -97,7 +92,6 @@ class TrunkSimulator(RobotSimulator):
 
     @property
     def discretised(self) -> dict[str, object]:
-        """See `RobotSimulator`."""
         return {"body": "rod", "elements": self.assembly.system.body.elements}
 
     def session(self, lanes: int, period: float) -> Session:
@@ -105,7 +99,6 @@ class TrunkSimulator(RobotSimulator):
         return Session(self, lanes, period)
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Material, Array, Array]:
-        """See `RobotSimulator`."""
         return self.material(values), *self.wound(values, commands, self.time_step)
 
     def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
@@ -120,7 +113,6 @@ class TrunkSimulator(RobotSimulator):
         return stepped_balance(system, prepared, state, displacement, self.time_step, engine.integrator, *around)
 
     def material(self, values: Values) -> Material:
-        """See `RobotSimulator`."""
         body = self.assembly.system.body
         masses = jnp.zeros(len(body.station)).at[self.assembly.station_of].set(self.robot.point_masses(values))
         cuts = np.diff(self.assembly.station_of)

@@ -433,7 +433,7 @@ def _model(
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and the number of its first parameters, those of the base model.
 
-    The noise of its channels is known, so that its parameters are not included.
+    The noise of the channels is known, so noise parameters are not included.
     """
     added = simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
@@ -521,7 +521,7 @@ def extended_tables(
 
 
 def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, Any]]:
-    """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
+    """Priors under which the sizes of a mechanism were fitted, at least as wide as the sizes, see `widened`."""
     coordinates = answer.problem.coordinates
     factor = widening(answer.extended, coordinates)
     priors = {}

@@ -1,4 +1,4 @@
-"""Groups of recordings in an audit: their recordings, and the model's description of their difference."""
+"""Groups of recordings in an audit, and their differences in a model's file."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _groups_of(scope: str, groups: Groups, patterns: Patterns) -> dict[str, tupl
 
 
 def _naming(groups: Mapping[str, Sequence[str]], patterns: Patterns) -> Patterns:
-    """Patterns that name these groups, and by which their recordings belong to them."""
+    """Patterns of groups and of their recordings."""
     for group, recordings in groups.items():
         for recording in recordings:
             if group not in patterns or group_of(recording, patterns) != group:

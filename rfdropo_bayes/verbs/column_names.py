@@ -103,9 +103,8 @@ class Guess(NamedTuple):
     # why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file
     evidence: Mapping[str, str]
     start: Float[np.ndarray, "marker 3"]  # first seen position of each marker, in the file's frame and unit
-    # commands of the first rows; seen: marker positions in the first rows, both in the file's units
-    sent: Float[np.ndarray, "command channel"]
-    seen: Float[np.ndarray, "row marker 3"]
+    sent: Float[np.ndarray, "command channel"]  # commands of the first rows
+    seen: Float[np.ndarray, "row marker 3"]  # marker positions in the first rows, both in the file's units
     counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
     sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
 
@@ -222,8 +221,8 @@ def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers
     None if the number of columns does not match.
 
     Args:
-        rows: the cells of its first rows.
-        commands: their number, if it is known.
+        rows: cells of the table's first rows.
+        commands: number of commands, if known.
         markers: their names.
     """
     width, places = len(rows[0]), [f"{marker}_{axis}" for marker in markers for axis in "xyz"]
@@ -320,7 +319,7 @@ def names_of(positions: list[list[str]]) -> list[str]:
 
 
 def _triples(names: list[str]) -> dict[str, list[str]]:
-    """Columns that differ in one letter, x, y or z: their common name, and the three in this order."""
+    """Columns whose names differ in one letter, x, y or z: the common name, and the three columns in this order."""
     triples: dict[str, dict[str, str]] = {}
     for name in names:
         for match in AXIS.finditer(name):

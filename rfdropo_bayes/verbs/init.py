@@ -96,7 +96,7 @@ def with_counts(guess: Guess, counts: float | None, unit_given: bool) -> Guess:
     """A guess with the counts of one turn; whoever gives them, and no unit (``unit_given``), has commands in counts.
 
     Raises:
-        InputError: counts of one turn that are not positive, or are given for commands in another unit.
+        InputError: counts of one turn are not positive, or commands are in another unit than counts.
     """
     if counts is None:
         return guess
@@ -143,10 +143,11 @@ def write_first_files(
         recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
             third of the rows of a single recording.
         commands: the file of commands of each, if they have any.
-        guess: guess of their columns, see `of_robot`; None without recordings, when random commands are simulated.
+        guess: guess of the recordings' columns, see `of_robot`; None without recordings, if random commands are
+        simulated.
 
     Raises:
-        InputError: files of these names are there already, or the folder cannot be written to.
+        InputError: the files exist already, or the folder cannot be written to.
     """
     folder = output_folder(folder)
     robot, experiment = folder / f"{outline.name}.toml", folder / "experiment.toml"

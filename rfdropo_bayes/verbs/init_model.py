@@ -34,7 +34,7 @@ def write_model_experiment(
         folder: folder to write to; it is created.
         recordings: files to fit; the last of several is for testing.
         commands: the file of commands of each, if they have any.
-        guess: guess of their columns; None without recordings.
+        guess: guess of the recordings' columns; None without recordings.
 
     Returns:
         the file, and its assumptions.

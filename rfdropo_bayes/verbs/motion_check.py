@@ -45,7 +45,7 @@ SOLVED = 0.5  # least share of the rows in which the rod must have an equilibriu
 
 
 class Proposal(NamedTuple):
-    """Another arrangement of the commands: its agreement, the lines for it, and its alternatives in words."""
+    """Another arrangement of the commands: agreement, lines for the experiment file, and alternatives in words."""
 
     agreement: float
     lines: tuple[str, ...]

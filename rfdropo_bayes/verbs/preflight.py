@@ -61,7 +61,7 @@ class Direction:
 
     @property
     def needs_own_measurement(self) -> bool:
-        """Whether it is a single parameter that nothing but a measurement of its own would determine."""
+        """Whether the direction is a single parameter that only a separate measurement would determine."""
         return len(self.together) == 1 and bool(self.ended_by) and all(BY_ITSELF in what for what in self.ended_by)
 
 
@@ -75,11 +75,11 @@ class Preflight:
     parameters: pd.DataFrame
     channels: dict[str, list[str]]  # constant command channels of each recording
     noise: str  # assumed noise of the positions, in words
-    draws: int  # number of prior draws; failed: number of failed rollouts
-    failed: int
+    draws: int  # number of prior draws
+    failed: int  # number of failed rollouts
     rollout_seconds: float  # time to simulate one parameter set, all recordings
-    rollouts: int  # budget of the fit; minutes: its run time
-    minutes: float
+    rollouts: int  # budget of the fit
+    minutes: float  # its run time
     method: str  # method of the fit
     seconds: float  # run time of this analysis
     notes: list[str] = field(default_factory=list)
@@ -373,9 +373,7 @@ def innovations(
     valid: Bool[np.ndarray, "time marker"],
     noise: _Noise,
 ) -> Float[np.ndarray, "time *many marker 3"]:
-    """Series whitened by white plus correlated noise: each row less its prediction from earlier rows (Kalman filter),
-    in linear time; zero for invalid rows.
-    """
+    """Series whitened under white plus correlated noise: innovations of a Kalman filter; zero for invalid rows."""
     whitened = np.zeros_like(series)
     mean, variance = np.zeros(series.shape[1:]), np.full(valid.shape[1], noise.lasting**2)
     for row, seen in enumerate(valid):
@@ -487,7 +485,7 @@ _OWN = f"nothing but the parameter {BY_ITSELF} would end it"
 
 
 def _sentence(parts: Mapping[str, float], smaller: int, logs: bool, kept: float, ended: Mapping[str, float]) -> str:
-    """A direction in words: its largest parts, and the number of smaller parts."""
+    """A direction in words: the largest parts, and the number of smaller parts."""
     names = list(parts)
     if len(names) == 1:
         subject = names[0]

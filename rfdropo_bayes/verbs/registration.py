@@ -54,7 +54,7 @@ class Frame(NamedTuple):
 
 
 class Registration(NamedTuple):
-    """How a recording lies to its robot at rest."""
+    """Frame and arrangement of a recording relative to its robot at rest."""
 
     # frame that brings the robot to the recording; None if the robot explains the motion in no frame
     frame: Frame | None

@@ -72,12 +72,10 @@ class RestFit(NamedTuple):
     fitted: int
     other: int
     tested: bool  # whether these are rows of test recordings
-    # shown rows of all recordings; residual: measured less computed [m]; ways: whether each command was last changed
-    # upwards (1) or downwards (-1); recording: number of each row's recording
-    rows: Rows
-    residual: Float[np.ndarray, "row marker 3"]
-    ways: Float[np.ndarray, "row channel"]
-    recording: np.ndarray
+    rows: Rows  # shown rows of all recordings
+    residual: Float[np.ndarray, "row marker 3"]  # measured less computed [m]
+    ways: Float[np.ndarray, "row channel"]  # whether each command was last changed upwards (1) or downwards (-1)
+    recording: np.ndarray  # number of each row's recording
 
 
 OWN = "own"  # key of the fitted robot among errors

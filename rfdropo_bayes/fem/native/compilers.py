@@ -1,8 +1,8 @@
 """Which compilers the kernels of rods take: ours, or Numba's own if ours do not fit the installed Numba.
 
 Ours (`compilation`) rest on private parts of Numba. They are used without asking with the versions that they are tested
-with. With another version a small program is compiled and run first; if that fails in any way, Numba compiles the
-kernels its own way, which takes longer to compile and gives the same numbers. See CONTRIBUTING.md.
+with. With another version of Numba a small program is compiled and run first. If that fails, Numba's standard compiler
+is used, which is slower and gives the same numbers. See CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TESTED = ((0, 68),)
 
 
 class Compilers(NamedTuple):
-    """Compilers of kernels, and of functions that only kernels call; both take options of `njit`."""
+    """Compilers of kernels (`whole`) and of functions that only kernels call (`part`), with options of `njit`."""
 
     name: str
     part: Callable[..., Any]
@@ -70,14 +70,14 @@ def _ours() -> Compilers:
     return Compilers(OURS, deferred, whole)
 
 
-def _tried(found: Compilers) -> Compilers:
+def _tried(compilers: Compilers) -> Compilers:
     """The same compilers, after they have compiled a function within a function within a kernel, and it ran rightly."""
-    square = found.part(lambda value: value * value, no_cpython_wrapper=True)
-    shifted = found.part(lambda value: square(value) + 1.0, no_cpython_wrapper=True)
-    total = found.whole(lambda value: shifted(value) + square(value))(3.0)
+    square = compilers.part(lambda value: value * value, no_cpython_wrapper=True)
+    shifted = compilers.part(lambda value: square(value) + 1.0, no_cpython_wrapper=True)
+    total = compilers.whole(lambda value: shifted(value) + square(value))(3.0)
     if total != 19.0:
         raise ValueError(f"a trial kernel returned {total} for 19")
-    return found
+    return compilers
 
 
 COMPILERS = chosen_compilers(os.environ.get(VARIABLE), numba.__version__)

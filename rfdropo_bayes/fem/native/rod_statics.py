@@ -125,8 +125,9 @@ def _take_tensions(tables, work, moving, token):
 
 @kernel
 def _found(tables, factors, work, moving, token):
-    """The lanes that move whose matrix had a solution, and those that try again without the forces that turn, which
-    near a loss of stability leave the matrix indefinite."""
+    """Moving lanes whose matrix had a solution, and lanes that try again without the geometric terms, which make the
+    matrix indefinite near a loss of stability.
+    """
     zero, bound = fill(0.0, work.frame, token), fill(UNBOUNDED, work.frame, token)
     total, turning = _product(tables, work.solution, work.solution, token), load(factors.turning, 0, token)
     found = where_greater(bound, total, moving, zero)
@@ -171,7 +172,8 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
 @kernel
 def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
     """Find the equilibrium from the present state in at most ``most`` iterations, to the increment ``bound`` relative
-    to the body's length. A lane that missed an earlier equilibrium is not moved: its rollout counts as failed.
+    to the body's length. A lane without an equilibrium in an earlier row is not moved, and its rollout counts as
+    failed.
     """
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)

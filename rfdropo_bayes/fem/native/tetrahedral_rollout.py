@@ -108,7 +108,8 @@ def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
 def set_targets(cables, commanded, share, work, token):
     """Displacement that a stage imposes on every cable, a share of the way to the commanded one.
 
-    The commanded one may differ from that measured a step before by no more than ``rate``, and never exceeds the limit.
+    The commanded displacement may differ from the displacement measured a step before by at most ``rate``, and never
+    exceeds the limit.
     """
     one = fill(1.0, work.position, token)
     for c in range(len(cables.limit)):

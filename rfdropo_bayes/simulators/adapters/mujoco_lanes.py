@@ -34,23 +34,19 @@ class MuJoCoLanes:
         self._values = np.full((count, len(rollouts.edits)), np.nan)
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`."""
         self._take_values(rows, np.stack([np.asarray(given.material[name], float) for name in self.rollouts.edits], 1))
         first = np.asarray(given.start, float)
-        state, found = self.rollouts.begun([self._models[row] for row in rows], self._ctrl(first[:, None])[:, 0])
-        self._state[rows], self._failed[rows] = state, ~found
+        state, valid = self.rollouts.begun([self._models[row] for row in rows], self._ctrl(first[:, None])[:, 0])
+        self._state[rows], self._failed[rows] = state, ~valid
         return self._moved(rows, np.zeros((len(rows), 0, first.shape[1])), first)
 
     def advance(self, displacement: Float[np.ndarray, "lane step channel"]) -> Motion:
-        """See `BodyLanes`."""
         return self._moved(np.arange(len(self._models)), displacement, displacement[:, -1])
 
     def save(self) -> Float[np.ndarray, "lane values"]:
-        """See `BodyLanes`."""
         return np.concatenate([self._state, self._failed[:, None], self._values], axis=1)
 
     def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """See `BodyLanes`."""
         size = self._state.shape[1]
         self._state[rows], self._failed[rows] = state[:, :size], state[:, size] > 0.0
         self._take_values(rows, state[:, size + 1 :])
@@ -68,11 +64,11 @@ class MuJoCoLanes:
         return ctrl
 
     def _moved(
-        self, rows: np.ndarray, commands: Float[np.ndarray, "row step channel"], held: Float[np.ndarray, "row channel"]
+        self, rows: np.ndarray, commands: Float[np.ndarray, "row step channel"], last: Float[np.ndarray, "row channel"]
     ) -> Motion:
-        """Take a step for each command, and one more under ``held`` that shows the state before it."""
+        """Take a step for each command, and one more under ``last`` that shows the state before it."""
         steps, clock = commands.shape[1], self.rollouts.model.opt.timestep
-        ctrl = self._ctrl(np.concatenate([commands, held[:, None]], axis=1))
+        ctrl = self._ctrl(np.concatenate([commands, last[:, None]], axis=1))
         begun = self._state[rows, 0]
         states, seen = self.rollouts.rolled([self._models[row] for row in rows], self._state[rows], ctrl)
         if steps:
