@@ -161,7 +161,7 @@ def _number(name: str, value: Any, where: str) -> float:
 
 
 def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float], where: str) -> None:
-    """A range must lie inside the hard bounds; a bell must have at least half of its mass there."""
+    """A range must lie inside the hard bounds; a normal distribution must have at least half of its mass inside."""
     bounds = f"the hard bounds of {spec.name} are [{spec.low:g}, {spec.high:g}] {spec.unit}"
     low, high = numbers.get("low", -math.inf), numbers.get("high", math.inf)
     if low >= high:

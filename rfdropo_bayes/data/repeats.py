@@ -15,7 +15,7 @@ def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
     """Indices of recordings with identical commands, group by group, in order of first appearance.
 
     Recordings are not repeats if the robots, the recorded conditions (a payload at the tip) or the speeds of the
-    commands differ. Times are not compared otherwise: repeats are sampled with the jitter of their own clocks.
+    commands differ. Times are not compared further, since the sampling times of repeats jitter.
     """
     groups: dict[tuple[object, ...], list[list[int]]] = {}
     for index, trajectory in enumerate(trajectories):

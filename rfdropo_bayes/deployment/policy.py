@@ -100,10 +100,10 @@ class OnnxPolicy:
         robot: robot to drive.
         goal: position of the goal [m].
         sha256: hash that the file must have; None accepts any.
-        markers: names of the markers that it sees; all of the robot's by default.
+        markers: names of observed markers; all markers of the robot by default.
 
     Attributes:
-        pull: its tensions in the evaluation for which it was selected.
+        pull: tensions of the policy in its best evaluation.
 
     Raises:
         InputError: if the file cannot be read, or its layout, hash or shapes do not fit.

@@ -326,7 +326,7 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
     """RF-DROPO's distribution from a run folder.
 
     Raises:
-        InputError: no summary there, one of a method that has no phi, or a phi that does not fit the simulator.
+        InputError: the folder has no summary, the method has no phi, or phi does not match the simulator.
     """
     path = Path(path)
     file = path / PHI if path.is_dir() else path

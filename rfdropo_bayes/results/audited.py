@@ -42,7 +42,7 @@ class Audit:
         content: content of audit.json.
         tables: experiment file with the adopted extensions, as tables.
         page: the report as HTML.
-        robot: audited robot, if it was made in Python; None if the tables name it.
+        robot: audited robot, if made in Python; None for a robot that the tables name.
         base: folder that paths in the tables are relative to.
         folder: folder with the audit's files, if written.
         shown: data of the figures; None for an audit read from files.

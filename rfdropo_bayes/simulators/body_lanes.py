@@ -74,7 +74,7 @@ class LanesBeforeCube:
     """Bodies that start clear of cube and plate: see `BodyLanes`.
 
     The equilibrium of a body ignores both, and a body that overlaps the cube would throw it away. The unbalanced force
-    of such a start counts as infinite.
+    of a start in penetration counts as infinite.
     """
 
     def __init__(

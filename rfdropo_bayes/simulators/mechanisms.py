@@ -86,7 +86,7 @@ class SensingMechanism(Mechanism, Protocol):
 
 @runtime_checkable
 class TimedSensingMechanism(Mechanism, Protocol):
-    """Acts on measurements, with a memory or a clock of its own."""
+    """Acts on measurements, with a memory or a clock."""
 
     def sense_over_time(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]

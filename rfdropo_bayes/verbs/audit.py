@@ -385,8 +385,9 @@ def _lanes(
     coordinates: Coordinates,
     workshop: Workshop,
 ) -> Lanes:
-    """The simulator with all candidates, which compiled engines only run for rollouts with some of them: there is one
-    without candidates, and another without expensive ones. Lanes in the workshop are reused.
+    """The simulator with all candidates. Compiled engines run this simulator only for rollouts with candidates; other
+    rollouts use a simulator without candidates, or a simulator without expensive ones. Lanes in the workshop are
+    reused.
     """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)

@@ -166,7 +166,7 @@ def _summary(
 ) -> dict[str, Any]:
     return {
         "task": table.task,
-        "algorithm": table.algorithm,
+        "algorithm": "PPO",
         "steps": training.curve[-1]["steps"],
         "seconds": training.seconds,
         "diverged_episodes": training.diverged,

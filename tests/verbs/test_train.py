@@ -188,7 +188,6 @@ def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
         (['training.randomisation="posterior"', 'training.source="nowhere"'], "nowhere"),
         (["training.ranges={}"], "no ranges"),
         (["training.ranges={young_modulus = [1.0, 2.0]}"], "outside its hard bounds"),
-        (['training.algorithm="SACK"'], "did you mean 'SAC'"),
         (["training.options={learning_rat = 1e-3}"], "did you mean 'learning_rate'"),
         (["training.period=0.013"], "not a whole number of time steps"),
     ],

@@ -81,7 +81,7 @@ def build_plant(name: str, robot: Robot, settings: Mapping[str, Any] | None = No
     """The plant of that name: "springs", or MODULE:CALLABLE, called with the robot and the settings.
 
     Raises:
-        InputError: if there is no such plant, or it does not take the settings.
+        InputError: the plant does not exist, or does not take the settings.
     """
     try:
         if name == "springs":
