@@ -33,7 +33,7 @@ def limit_blas_threads() -> None:
 def keep_callback_threads() -> None:
     """Give XLA's pool at least `CALLBACK_THREADS` threads, unless the user chose otherwise.
 
-    A callback waits, in a thread of that pool, for a copy of its arguments by another thread of it. The pool has one
+    A callback occupies one thread of the pool, and waits for another thread to copy its arguments. The pool has one
     thread for each processor: on one processor two callbacks of one program wait forever. The variable is read when
     JAX first makes an array, and engines that use JAX do so when they are imported.
     """

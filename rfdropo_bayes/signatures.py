@@ -1,4 +1,4 @@
-"""Keywords that a function hands on, shown as its own: by help, by tab completion, and by the error on a typo."""
+"""Keywords that a function passes on, shown in its help, tab completion and errors on typos."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def with_keys_of(schema: type[BaseModel], *, without: Container[str] = ()) -> Ca
 
     Args:
         schema: the table that the keywords are handed on to.
-        without: keys that the function does not take, or takes under its own name.
+        without: keys that the function does not take, or has as named arguments.
     """
 
     def decorate(function: Called) -> Called:

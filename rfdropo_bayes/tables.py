@@ -27,7 +27,7 @@ def read_toml(text: str) -> dict[str, Any]:
     """Tables of a TOML text.
 
     Raises:
-        tomllib.TOMLDecodeError: it is not TOML; the message has a remedy for Windows paths.
+        tomllib.TOMLDecodeError: the text is not TOML; the message has a remedy for Windows paths.
     """
     try:
         return tomllib.loads(text)

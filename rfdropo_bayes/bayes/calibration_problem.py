@@ -185,7 +185,7 @@ class CalibrationProblem:
         return self.model.programs.prior_derivatives
 
     def steps_for(self, horizon: int) -> int:
-        """Time steps to simulate so that the first ``horizon`` rows of every recording are there."""
+        """Number of time steps that reach the first ``horizon`` rows of every recording."""
         commands = self.model.recordings.commands
         row = np.minimum(horizon, self.model.recordings.rows) - 1
         index = np.arange(self.n_recordings), row

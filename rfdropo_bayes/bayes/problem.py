@@ -181,7 +181,7 @@ class Hierarchy(Problem, Protocol):
     def typical_scales(self) -> Mapping[str, float]: ...
 
     def holding(self, values: Mapping[str, float]) -> ResidualProblem:
-        """The same problem with some parameters fixed. A parameter whose standard deviation is fixed is its own
+        """The same problem with some parameters fixed. A parameter with a fixed standard deviation equals its
         unconstrained coordinate.
         """
         ...

@@ -160,13 +160,13 @@ class Scopes:
         """The parameters of new recordings.
 
         A parameter that every fitted recording had separately takes, in a new recording, the value of any of them. A
-        parameter of some fitted recordings only, such as a payload, applies to them and their further pieces. A
-        parameter of some groups also applies to their new recordings. Each group, fitted or not, deviates from the
-        shared values.
+        parameter of some fitted recordings only, such as a payload, applies to these recordings and their further
+        pieces. A parameter of some groups also applies to their new recordings. Each group, fitted or not, deviates
+        from the shared values.
 
         Args:
             recordings: names of the new recordings; fitted: names of the fitted recordings.
-            groups: recordings that belong together; by default each is its own group.
+            groups: recordings that belong together; by default each recording is a group.
         """
         known, shared = self.recordings_known(fitted), [p for p in self.parameters if not p.scope.owner]
         like: dict[str, tuple[str, ...]] = {p.name: (p.name,) for p in shared}

@@ -24,11 +24,11 @@ from rfdropo_bayes.errors import InputError
 
 def train(
     experiment: Annotated[
-        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; leave it out with --from")
+        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; not needed with --from")
     ] = None,
     fit: Annotated[
         Path | None,
-        typer.Option("--from", help="folder of a calibration: train on its model, under draws of its posterior"),
+        typer.Option("--from", help="folder of a calibration, whose model and posterior are used for training"),
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="reach or push; by default from the experiment")] = None,
     goal: Annotated[
@@ -42,7 +42,9 @@ def train(
 ) -> None:
     """Train a policy and play it. Writes report.html, policy.onnx, its card and its learning curve."""
     if (experiment is None) == (fit is None):
-        raise InputError("takes an experiment file or --from DIR", where="train", remedy="give one of them")
+        raise InputError(
+            "the command needs an experiment file or --from DIR, not both", where="train", remedy="give one of them"
+        )
     see_calibration(fit, "--from")
     if fit is not None:
         experiment, out = fit / "config.toml", out or fit.with_name(f"{fit.name}_train")

@@ -232,7 +232,7 @@ def _off_path(
 ) -> tuple[np.ndarray, int]:
     """Rows off the longest smooth path of one marker, and the number of breaks in that path.
 
-    A path through rows whose every step is smooth leaves nothing out: it is searched around the other steps only.
+    A path with only smooth steps needs no search; the search covers the other steps only.
     """
     wrong, breaks = np.zeros(len(time), dtype=bool), 0
     if len(time) < 4 * _VELOCITY_ROWS:

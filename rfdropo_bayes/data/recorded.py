@@ -81,7 +81,7 @@ class Measured:
 
 
 class Recorded(NamedTuple):
-    """All of a recording, before it is checked: ``Trajectory.build(*recorded)`` checks it."""
+    """All parts of a recording before the checks of ``Trajectory.build(*recorded)``."""
 
     origin: Origin
     sent: SentCommands

@@ -15,7 +15,7 @@ def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
     """Indices of recordings with identical commands, group by group, in order of first appearance.
 
     Recordings are not repeats if the robots, the recorded conditions (a payload at the tip) or the speeds of the
-    commands differ. Times are not compared otherwise: repeats are sampled with the jitter of their own clocks.
+    commands differ. Times are not compared further, since the sampling times of repeats jitter.
     """
     groups: dict[tuple[object, ...], list[list[int]]] = {}
     for index, trajectory in enumerate(trajectories):
@@ -43,7 +43,7 @@ def _span(trajectory: Trajectory) -> float:
 
 
 def _of_one_rate(one: float, other: float) -> bool:
-    """Whether two times are equal but for the jitter of clocks; a zero time means a single command."""
+    """Whether two times are equal within the jitter of clocks; a zero time means a single command."""
     return one == other or (min(one, other) > 0.0 and max(one, other) < ONE_RATE * min(one, other))
 
 

@@ -320,7 +320,7 @@ class Trajectory:
         and body in the first row began earlier. ``initial_command`` becomes the last command before these.
 
         Raises:
-            InputError: if there are no such rows.
+            InputError: the rows do not exist.
         """
         rows = self.time.size
         if not 0 <= first < last < rows:

@@ -42,7 +42,7 @@ def load_unseen(
         spec: the [data] table of the experiment; its recordings are not read.
         base: folder that paths are relative to.
         commands: the file of commands.
-        start: the file of observations, if it is another file; only one row is used.
+        start: file of observations, if separate; one row is used.
         begun: beginning of the fitted recordings, "zero" or "first" (`common_beginning`), if all begin by the same
             rule; it then applies to these commands unless [data] or the file has another.
         episode: number of the episode, if the file of observations is a LeRobotDataset.

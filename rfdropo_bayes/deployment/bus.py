@@ -25,7 +25,7 @@ class BusTable(BaseModel):
     Attributes:
         interface: "hub", or any interface of python-can ("socketcan" on a robot).
         channel: channel of the interface; HOST:PORT or a path for the hub.
-        bitrate: bit rate [bit/s], if the interface sets it.
+        bitrate: bit rate [bit/s], for interfaces that set a bit rate.
         options: further arguments of the interface.
     """
 

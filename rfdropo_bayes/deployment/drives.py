@@ -227,7 +227,7 @@ class Drive:
         """Least and greatest position of the travel [counts].
 
         Raises:
-            InputError: if the drive's position would wrap in it.
+            InputError: the drive's position would wrap within the travel.
         """
         ends = sorted(self.motor.counts(length, self.offset) for length in self.motor.length_limit_m)
         told = all(self.knows(Object.POSITION_RANGE, subindex) for subindex in (1, 2))
@@ -292,7 +292,9 @@ class Drive:
             if time.monotonic() > end:
                 break
         raise InputError(
-            "stays powered", where=self.name, remedy="switch it off, and find out which other master commands it"
+            "the drive stays powered after a command to switch off",
+            where=self.name,
+            remedy="switch it off, and find out which other master commands it",
         )
 
     def configure(self, period: float, guards: Guards, say: Callable[[str], None]) -> None:

@@ -68,7 +68,7 @@ class SessionLog:
     """Writes a session's folder while it runs.
 
     Args:
-        folder: folder to write to; it must not hold a session yet.
+        folder: folder to write to, without a session.
         robot: robot to drive.
         facts: facts about the session, kept in the recording's settings.
         frames: name of the file of CAN frames; its ending chooses the format.
@@ -238,7 +238,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
 
     Args:
         folder: folder of the session.
-        phases: take only the cycles of these phases, if there are at least two.
+        phases: phases whose cycles are used, if there are at least two cycles.
 
     Raises:
         InputError: the journal has fewer than two cycles.

@@ -97,10 +97,10 @@ class OnnxPolicy:
         robot: robot to drive.
         goal: position of the goal [m].
         sha256: hash that the file must have; None accepts any.
-        markers: names of the markers that it sees; all of the robot's by default.
+        markers: names of observed markers; all markers of the robot by default.
 
     Attributes:
-        pull: its tensions in the evaluation for which it was selected.
+        pull: tensions of the policy in its best evaluation.
 
     Raises:
         InputError: if the file cannot be read, or its layout, hash or shapes do not fit.
@@ -128,7 +128,7 @@ class OnnxPolicy:
         self.pull = Pull.told(self._session.get_modelmeta().custom_metadata_map)
         names = [part.name for part in self.layout.observation]
         if "goal" in names and not np.all(np.isfinite(self._goal)):
-            raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
+            raise InputError("the policy needs a goal", where="[goal]", remedy="give x, y and z in metres")
         self.rate_hz = 1.0 / self.layout.period_s
         self.sees_markers = bool({"markers", "moved"} & set(names))
         self.sees_object = "object" in names

@@ -82,8 +82,8 @@ class PolicyTable(_Table):
 
     Attributes:
         file: the ONNX file.
-        sha256: hash that it must have; summary.json has the hash of the policy that ran.
-        markers: names of the markers that it sees; all of the robot's by default.
+        sha256: required hash of the policy; summary.json has the hash of the policy that ran.
+        markers: names of observed markers; all markers of the robot by default.
     """
 
     file: str

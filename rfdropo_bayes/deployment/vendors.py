@@ -61,7 +61,7 @@ def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, wh
 
     Args:
         stated: unit stated by the owner of the drive.
-        word: content of 0x60A9; 0 if it is empty.
+        word: content of 0x60A9; 0 if empty.
         counts_per_turn: encoder counts per turn of the motor.
         where: location for messages.
 
@@ -87,7 +87,7 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
 
     Args:
         stated: unit stated by the owner of the drive.
-        word: content of 0x60AA; 0 if it is empty.
+        word: content of 0x60AA; 0 if empty.
         counts_per_turn: encoder counts per turn of the motor.
         where: location for messages.
 
@@ -187,7 +187,7 @@ def check_home_offset(offset: int, unguarded: Collection[int], where: str) -> No
         where: location for messages.
 
     Raises:
-        InputError: if there is an offset, which the standard takes off the limits of 0x607D.
+        InputError: the drive has an offset, which the standard subtracts from the limits of 0x607D.
     """
     if offset and Object.POSITION_LIMIT not in unguarded:
         raise InputError(
@@ -203,7 +203,7 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 
     Args:
         ends: least and greatest position.
-        wrap: content of 0x607B; 0, 0 if it is empty.
+        wrap: content of 0x607B; 0, 0 if empty.
         where: location for messages.
 
     Raises:

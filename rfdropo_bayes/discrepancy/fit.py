@@ -161,7 +161,7 @@ class FitTarget:
         """Measured less simulated readings at one point, in the unit of the noise.
 
         Raises:
-            InputError: a rollout there failed.
+            InputError: a rollout at the point failed.
         """
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 

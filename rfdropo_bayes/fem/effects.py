@@ -58,7 +58,7 @@ class BodyEffects(NamedTuple):
 
     @property
     def rubs(self) -> bool:
-        """Whether cables rub in their guides: it adds rows to the problem of every step, also at size zero."""
+        """Whether cables have friction in guides, which adds rows to the problem of every step, also at size zero."""
         return self.coulomb_friction is not None or self.capstan_friction is not None
 
 

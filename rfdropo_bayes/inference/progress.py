@@ -201,7 +201,7 @@ def run_digest(problem: Problem, method: str, config: Any, key: PRNGKeyArray) ->
 
 
 class Checkpoint:
-    """One file that is replaced whole after every stage: arrays, and everything else as JSON beside them.
+    """One file, replaced after every stage, with arrays and a JSON text.
 
     Args:
         path: the file; ``None`` keeps nothing.

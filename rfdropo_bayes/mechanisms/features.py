@@ -106,6 +106,11 @@ class Feature(NamedTuple):
         known = GAUGES if self.of_motion else names
         return [OWN_NAME if k == OWN else known[k] for k in self.channels]
 
+    @property
+    def in_time(self) -> bool:
+        """Whether it depends on seconds, and not on the order of commands alone."""
+        return bool(KINDS[self.kind].unit[1]) or self.kind in ("low_pass", "lag")
+
     def begin(self, first: Float[Array, " channel"]) -> Any:
         """Memory before the first step, given the command that was held before it."""
         own = [first[k] for k in self.channels]

@@ -1,4 +1,4 @@
-"""Ports by name: the places at which an effect may enter a simulated robot, and the action of a signal there.
+"""Ports by name: places at which a signal may act on a simulated robot, and its action.
 
 A port of actuation or of the body acts on a rollout (`simulators.ports`); one of sensing is a map of the markers.
 """
@@ -49,7 +49,7 @@ class Port(NamedTuple):
 
 
 class PortMap(NamedTuple):
-    """The ports of a robot on an engine, and the composition of signals there."""
+    """The ports of a robot on an engine, and the sum of signals at ports."""
 
     ports: tuple[Port, ...]  # all of them
     left_out: dict[str, str]  # ports that the body cannot carry, with the reason

@@ -17,15 +17,25 @@ from types import ModuleType
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms import actuation, body_mechanisms, drift, sensing
-from rfdropo_bayes.mechanisms.drift import Drift
+from rfdropo_bayes.mechanisms import actuation, body_mechanisms, sensing
+from rfdropo_bayes.mechanisms.drift import Drift, DriveZero, drift_of
 from rfdropo_bayes.mechanisms.sizes import scales_of, sized
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 
-MODULES = (actuation, drift, body_mechanisms, sensing)
+MODULES = (actuation, body_mechanisms, sensing)
+DRIFTING = (
+    DriveZero,
+    actuation.CommandGain,
+    actuation.CableGain,
+    actuation.CableSlack,
+    sensing.CameraOffset,
+    sensing.CameraRotation,
+    sensing.CameraScale,
+)
+"""Mechanisms whose sizes may drift, see `drift_of`."""
 
 
 def defined_in(module: ModuleType) -> list[Any]:
@@ -34,7 +44,8 @@ def defined_in(module: ModuleType) -> list[Any]:
     return [kind for kind in own if hasattr(kind, "cause")]
 
 
-REGISTRY: dict[str, type] = {kind.name: kind for module in MODULES for kind in defined_in(module)}
+KINDS = (*(kind for module in MODULES for kind in defined_in(module)), *map(drift_of, DRIFTING))
+REGISTRY: dict[str, type] = {kind.name: kind for kind in KINDS}
 
 
 ACTS = {"actuation": ("actuate",), "body": ("embody",), "contact": ("embody",), "sensing": ("sense", "sense_over_time")}

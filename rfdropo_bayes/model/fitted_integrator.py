@@ -1,4 +1,4 @@
-"""Check that a calibration is used with its own integrator: fitted values depend on the time step."""
+"""Check that a calibration is used with the integrator of its fit, since fitted values depend on the time step."""
 
 from __future__ import annotations
 

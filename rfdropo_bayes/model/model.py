@@ -56,7 +56,7 @@ class Model:
             `BlackBox`.
         priors: inferred parameters: {parameter: prior}. A prior is a numpyro distribution, a table such as
             ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default. For
-            a black box, all its parameters with their own priors by default, less its `families`.
+            a black box, by default all parameters except `families`, with their priors.
         mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or your own
             mechanisms, as classes or objects.
         noise: noise of the positions, by name as in an experiment file; or, if it is known, ``{"standard_deviation":
@@ -223,7 +223,7 @@ class Model:
 
         Args:
             meant: keys that describe the run in a file; a model read from a file has them already.
-            given: keys that a call overrides; None if it does not.
+            given: keys and values that replace the file's; None keeps the file's.
         """
         stated = {name: value for name, value in given.items() if value is not None}
         return {**self.tables(), **(meant if self.file is None else {}), **stated}

@@ -285,7 +285,7 @@ def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]
 
 
 def _without_folders(entry: Any) -> Any:
-    """A recording's entry with the names of its files alone."""
+    """A recording's entry with file names without folders."""
     if isinstance(entry, dict):
         return {key: _without_folders(value) if key in FILE_KEYS else value for key, value in entry.items()}
     return Path(str(entry)).name

@@ -87,7 +87,7 @@ def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Pa
 
     Args:
         model: the trained model.
-        normalisation: the ``VecNormalize`` it was trained under.
+        normalisation: ``VecNormalize`` of the policy's training.
         layout: layout of the policy's observation and action.
         path: file to write.
         facts: further metadata: hashes, seed, versions.

@@ -29,17 +29,17 @@ class TrainingTable(BaseModel):
     step: float | None = Field(
         default=None,
         gt=0.0,
-        description="largest change of a command by an action, in its unit; 5 mm of cable by default, or a twentieth "
-        "of the range of other commands",
+        description="largest change of a command by an action, in the command's unit; 5 mm of cable by default, or a "
+        "twentieth of the range of other commands",
     )
     noise: float = Field(default=0.0, ge=0.0, description="white noise on the observed markers [m]")
     tension_limit: float | None = Field(
         default=None,
         gt=0.0,
-        description="an episode fails and ends once any cable pulls more [N], as drives then stop; none by default",
+        description="tension [N] beyond which an episode fails and ends, as drives would stop; none by default",
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options of PPO under their names in Stable-Baselines3, with net_arch"
+        default_factory=dict, description="options of PPO by their names in Stable-Baselines3; also net_arch"
     )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(
@@ -59,9 +59,7 @@ class TrainingTable(BaseModel):
         default=1.0,
         gt=0.0,
         le=10.0,
-        description=(
-            "factor by which draws of the posterior or of phi are spread about their middle, up to hard bounds"
-        ),
+        description=("factor on the distances of posterior or phi draws from their middle, up to hard bounds"),
     )
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="lowest and highest value of each parameter, for uniform randomisation"

@@ -51,7 +51,7 @@ class ParameterInfo:
         return cls(**{**given, "scope": Scope(**given["scope"])})
 
     def as_dict(self) -> dict[str, Any]:
-        """The facts in JSON's types."""
+        """The facts as JSON types."""
         return {**asdict(self), "low": float(self.low), "high": float(self.high), "prior": dict(self.prior)}
 
     @property

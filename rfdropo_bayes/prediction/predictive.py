@@ -145,7 +145,7 @@ def predict_new(
     (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
     (`resampled_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
-    A parameter that only some fitted recordings had free, such as a payload, applies to them alone. A parameter that
+    A parameter of some fitted recordings only, such as a payload, applies only to these recordings. A parameter that
     only some groups have also applies to their new recordings; an unseen group lacks it. A cube starts at its measured
     pose in the first row.
 
@@ -153,7 +153,7 @@ def predict_new(
         fitted: names of the fitted recordings.
         model_error: residuals of the model on the fitted recordings, its error in new recordings if its noise is white;
             without it, all markers have equal weight in a first row.
-        groups: recordings that belong together, by name or wildcard; by default each is its own group.
+        groups: recordings that belong together, by name or wildcard; by default each recording is a group.
         slow: error of the session of each unseen recording, by name.
     """
     names = [t.name for t in trajectories]

@@ -105,7 +105,7 @@ def physical_of_normal(
 
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
-    """Log evidence of the unperturbed data for every body, from the linearisation at its own optimum."""
+    """Log evidence of the unperturbed data for every draw of the body, from the linearisation at its optimum."""
     evidence = -_least_cost(fit, noise) - 0.5 * np.linalg.slogdet(_curvature(fit))[1]
     return np.where(np.isfinite(evidence), evidence, -np.inf)
 

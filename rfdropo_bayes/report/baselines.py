@@ -164,7 +164,7 @@ def baseline_errors(
 
 
 def _with_markers(recording: Trajectory, markers: Sequence[str]) -> Trajectory:
-    """A recording with these of its markers, in this order."""
+    """A recording restricted to the given markers, in the given order."""
     if recording.marker_names == tuple(markers):
         return recording
     return Trajectory(recording.dataset.sel(marker=list(markers)))

@@ -61,7 +61,7 @@ class Calibration:
         """The posterior in a folder with the model that was fitted, and no further content.
 
         Raises:
-            InputError: no posterior there, or a damaged one.
+            InputError: the folder has no posterior, or a damaged posterior.
         """
         return cls(PosteriorRecord.load(folder / POSTERIOR), {"title": model.title}, "", model, folder)
 

@@ -23,12 +23,12 @@ def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:
 class PointMass(RobotTable):
     """A rigid part fixed to the body at a station; the parameter of the same name is its mass [kg]."""
 
-    parameter: Name = Field(description="parameter that holds its mass [kg]")
-    z_m: float = Field(description="station at which it sits")
+    parameter: Name = Field(description="parameter for the mass [kg] of the part")
+    z_m: float = Field(description="station of the part")
 
 
 class Body(RobotTable):
-    """A body of layers along z, from the clamp (first station) to the tip; each is one element of a rod or several.
+    """A body of layers along z, from the clamp (first station) to the tip; a layer is one or several elements of a rod.
 
     A layer's section is effective: the profile makes the layer's ends move like the real body's under unit moments,
     force and torque, for any true shape in between. Poisson's ratio acts on shear and torsion alone, unless

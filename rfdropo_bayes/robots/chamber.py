@@ -18,8 +18,8 @@ class Chamber(RobotTable):
 
     name: Name = Field(description="unique among the robot's cables and chambers")
     azimuth_deg: float = Field(description="azimuth of the chamber, from +x towards +y")
-    radius_m: float = Field(ge=0.0, description="distance of its middle line from the axis")
-    z_m: Pair = Field(description="axial coordinates of its two ends in the undeformed body")
+    radius_m: float = Field(ge=0.0, description="distance of the chamber's middle line from the axis")
+    z_m: Pair = Field(description="axial coordinates of the chamber's two ends in the undeformed body")
     area_m2: Positive = Field(description="area across the axis on which the pressure acts")
     pressure_limit_pa: Pair = Field(
         description="least and greatest pressure above the surroundings; commands beyond are held at the limit"

@@ -49,15 +49,15 @@ class CommandTiming(RobotTable):
 
     unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = Field(
         description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, "Pa" of '
-        'pressure, or "-" of drives that are sent volts or a share of their supply; channels.gain has the newtons of '
-        "torques, and the newtons or pascals of such drives"
+        'pressure, or "-" for drives with commands in volts or shares of their supply; channels.gain converts '
+        'torques to newtons, and commands of "-" to newtons or pascals'
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
     usual: Positive | None = Field(
         default=None,
-        description="size of usual commands, in their unit: mechanisms have priors in this size; by default "
-        f"{USUAL_SHARE} of the largest command",
+        description="size of usual commands, in the unit of commands, which scales the priors of mechanisms; by "
+        f"default {USUAL_SHARE} of the largest command",
     )
 
 
@@ -83,7 +83,7 @@ class PushScene(RobotTable):
     """A cube on a plate across gravity, for pushing."""
 
     plate_height_m: float = Field(description="coordinate of the plate's top against gravity")
-    contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
+    contact_distance_m: float = Field(ge=0.0, description="smallest distance between surfaces")
     parameters: dict[Name, Parameter] = Field(
         description="the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
         "turn about the vertical [rad], zero if the edges are parallel to the axes"

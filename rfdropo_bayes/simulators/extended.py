@@ -75,7 +75,7 @@ class ExtendedSimulator:
 
     @property
     def integrator(self) -> str | None:
-        """Integrator of time steps; None if the simulator has its own."""
+        """Integrator of time steps; None for a simulator without a choice of integrators."""
         return None
 
     @property

@@ -7,6 +7,7 @@ simulator exactly. The library of mechanisms lives one room above.
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -85,7 +86,7 @@ class SensingMechanism(Mechanism, Protocol):
 
 @runtime_checkable
 class TimedSensingMechanism(Mechanism, Protocol):
-    """Acts on measurements, with a memory or a clock of its own."""
+    """Acts on measurements, with a memory or a clock."""
 
     def sense_over_time(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
@@ -249,8 +250,17 @@ def needs_cables(mechanism: Mechanism | type) -> bool:
     return bool(getattr(mechanism, "needs_cables", False))
 
 
-def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0], cables: bool = True) -> str | None:
-    """Why a mechanism does not run on a body with or without cables, on an engine or in a motion; None if it runs."""
+def needs_times(mechanism: Mechanism) -> bool:
+    """Whether a parameter of a mechanism is a time or a rate."""
+    return any("s" in re.findall(r"[A-Za-z]+", spec.unit) for spec in mechanism.parameters)
+
+
+def obstacle(
+    mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0], *, cables: bool = True, timed: bool = True
+) -> str | None:
+    """Why a mechanism does not run on a body with or without cables, on an engine or in a motion, or on rows with or
+    without times; None if it runs.
+    """
     if body == BLACK_BOX:
         return None if mechanism.stage in ("actuation", "sensing") else f"it acts on the {mechanism.stage}, inside"
     if body not in bodies_of(mechanism):
@@ -259,6 +269,8 @@ def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS
         return "it acts on cables, and the robot has none"
     if engine not in engines_of(mechanism):
         return f"it runs on the engine {' or '.join(engines_of(mechanism))} only"
+    if not timed and needs_times(mechanism):
+        return "it acts in time, and the rows have no times"
     if motion not in motions_of(mechanism):
         return f"it acts on a body in motion, and motion is {motion}"
     return None

@@ -47,7 +47,9 @@ class TetrahedraTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     mesh: str = Field(description="mesh file (VTK, Gmsh), in the folders of recordings")
-    unit: Literal["m", "cm", "mm"] = Field(description="unit of its coordinates, in the frame of the robot's base")
+    unit: Literal["m", "cm", "mm"] = Field(
+        description="unit of the mesh's coordinates, in the frame of the robot's base"
+    )
     clamp_height: float = Field(description="height [m] at or below which nodes are fixed")
     frames: Literal["polar", "edges"] = Field(
         default="polar",
@@ -71,8 +73,8 @@ class TetrahedraTable(BaseModel):
     )
     marker_cables: tuple[str, ...] = Field(
         default=(),
-        description="cables at whose guides markers lie: such a marker is the mean of the guides at its height; if "
-        "empty, every marker is a point of the body",
+        description="cables at whose guides markers lie: a marker is then the mean of the guides at its height; if "
+        "empty, markers are points of the body",
     )
 
 
@@ -129,7 +131,7 @@ def _check_cables(robot: Robot, table: TetrahedraTable) -> None:
         if name not in robot.cable_names:
             raise InputError(f"the robot has no cable {name!r}", where=where, remedy=f"its cables: {known}")
     if table.drive_rate is not None and table.drives != "sofa":
-        raise InputError("drive_rate has no effect", where=where, remedy='it belongs to drives = "sofa"')
+        raise InputError('drive_rate has no effect without drives = "sofa"', where=where, remedy="leave it out")
 
 
 def _markers(

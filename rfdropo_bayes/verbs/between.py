@@ -80,7 +80,7 @@ def groups_at_hand(patterns: Patterns, fitted: Sequence[Trajectory], tested: Seq
 
 
 def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Recordings of groups that the experiment names; a recording that it puts into none is a group of its own."""
+    """Recordings of the groups in the experiment; a recording in no group forms a group."""
     groups = gather_groups(names, patterns)
     for group in between:
         if group not in groups and group not in patterns:

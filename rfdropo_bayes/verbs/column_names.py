@@ -121,7 +121,7 @@ def guess_columns(
 
     Args:
         path: a CSV, an export of Motive's, a bag, a LeRobotDataset, or a file of arrays.
-        sent: a CSV with the commands, if they have a separate file.
+        sent: a CSV with the commands, if separate.
         names: column names of a CSV without names; command_names: the same for the commands' file.
 
     Raises:

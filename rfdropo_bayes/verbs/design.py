@@ -191,7 +191,7 @@ def _alternatives(
         return []
     simulator: Any = problem.lanes.simulator
     names, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    options = (problem.ports, names, unit, problem.seed, problem.rules.family, report)
+    options = (problem.ports, names, unit, problem.seed, problem.rules.family, report, None, problem.timed)
     alternatives: list[Refit] = []
     with clock.part(LAWS_BY, "laws at ports"):
         search = replace(law_search(target, *options), most=1)

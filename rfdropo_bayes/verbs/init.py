@@ -138,11 +138,11 @@ def write_first_files(
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
 
     Args:
-        folder: folder to write to; it is made.
+        folder: folder to create and write to.
         outline: the robot.
         recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
             third of the rows of a single recording.
-        commands: the file of commands of each, if they have any.
+        commands: files of commands, one for each recording, if separate.
         guess: guess of the recordings' columns, see `of_robot`; None without recordings, if random commands are
         simulated.
 
@@ -401,7 +401,7 @@ def _clock(guess: Guess) -> list[str]:
 
 
 def _command_clock(guess: Guess) -> list[str]:
-    """The times of commands in a file of their own."""
+    """The times of commands in a separate file."""
     if guess.command_time is None:
         return []
     return [

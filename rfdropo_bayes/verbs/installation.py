@@ -62,7 +62,7 @@ def installed_priors(
         robot: robot whose lengths set the sizes of the priors.
         recording: recording whose commands set the sizes of the cables' zeros.
         frame: frame in which a rod at rest explains that recording; priors are centred there.
-        assumed: answers of the robot's outline that were not given, which have wide priors.
+        assumed: unknown sizes of the robot, which get wide priors.
     """
     lines = []
 

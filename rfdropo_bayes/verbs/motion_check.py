@@ -122,7 +122,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
     Args:
         spec: model of a robot; values are nominal or fixed.
         recordings: recordings in the base's frame; the first `MOST` are used.
-        columns: table used to read them.
+        columns: table that maps the recordings' columns.
 
     Raises:
         InputError: no common marker of robot and recordings.

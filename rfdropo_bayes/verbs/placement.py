@@ -85,7 +85,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     Args:
         robot: robot with the undeformed markers.
         trajectory: the recording, transformed by ``axes`` and ``origin``.
-        columns: table used to read it. A hint has the corrected line.
+        columns: table that maps the recording's columns. A hint has the corrected line.
     """
     start = start_of(robot, trajectory)
     length = robot.length

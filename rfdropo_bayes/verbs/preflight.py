@@ -1,10 +1,10 @@
 """Before a fit: parameter combinations that recordings cannot determine, measurements that would, and the cost of the
 fit.
 
-The derivatives of the measurements, at draws of the prior, give the Fisher information there. In coordinates in which
+The derivatives of the measurements at prior draws give the Fisher information at these draws. In coordinates in which
 the prior is a standard normal distribution (logarithms of scale parameters), with information :math:`F_d` at draw
 :math:`d`, a direction :math:`v` keeps the share :math:`\\sqrt{\\overline{v^T (1 + F_d)^{-1} v}}` of its prior standard
-deviation. Directions that keep most of it are undetermined. Further measurements add their own information. Posterior
+deviation. Directions that keep most of it are undetermined. Further measurements add information. Posterior
 variances are averaged, not informations: a draw with a snap-through may have more information than all others together.
 """
 
@@ -99,7 +99,7 @@ class Preflight:
         return rows
 
     def _undetermined(self) -> list[str]:
-        """Sentences; parameters that nothing but a measurement of their own would determine share one."""
+        """Sentences; parameters that only separate measurements would determine share one sentence."""
         lonely = [each for each in self.directions if each.needs_own_measurement]
         if len(lonely) < 2:
             return [direction.sentence for direction in self.directions]
@@ -172,7 +172,7 @@ def preflight(
         runs: recordings to fit.
         method: and ``rollouts``: its budget; by default from the model's experiment.
         seed: seed of the prior draws.
-        share: rows of ``runs`` over those of the fit, if they are some of its rows only.
+        share: number of rows in ``runs`` divided by the number in the fit.
 
     Raises:
         InputError: no parameter to infer, or no prior draw whose rollouts succeed.

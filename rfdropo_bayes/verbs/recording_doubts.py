@@ -35,7 +35,7 @@ def recording_cautions(
     Args:
         robot: recorded robot.
         recordings: recordings as read.
-        columns: table used to read them; None for formats that have none.
+        columns: table that maps the recordings' columns; None for formats without this table.
     """
     cautions = [
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")

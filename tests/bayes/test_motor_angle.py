@@ -241,8 +241,8 @@ def test_a_mechanism_of_a_user_is_inside_the_drive_unless_it_says_otherwise():
     assert inside_drive(Own())
     Own.inside_drive = False
     assert not inside_drive(Own())
-    transmission = {"backlash", "cable_gain", "cable_slack", "spool_growth", "drive_creep", "drive_drift"}
-    transmission |= {"cable_gain_drift", "gain_drift", "guide_azimuth"}
+    transmission = {"backlash", "cable_gain", "cable_slack", "spool_growth", "drive_creep", "drive_zero_drift"}
+    transmission |= {"cable_gain_drift", "command_gain_drift", "cable_slack_drift", "guide_azimuth"}
     drive = {"command_delay", "actuator_lag", "command_gain", "end_stop", "travel_stop", "rate_limit"}
     assert {name for name in transmission | drive if inside_drive(REGISTRY[name]())} == drive
 

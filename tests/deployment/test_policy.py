@@ -94,7 +94,7 @@ def test_outputs_that_cannot_be_meant_end_the_session(robot: Robot, tmp_path: Pa
         ({"observation": (ObservationPart("commands", 16, "m"),)}, "needs 16 numbers of 'commands'"),
         ({"observation": (ObservationPart("markers", 16, "m"),)}, "needs 16 numbers of 'markers'; there are 12"),
         ({"observation": (ObservationPart("wind", 16, "m"),)}, "needs 'wind', which no sensor measures"),
-        ({"observation": (ObservationPart("goal", 3, "m"),)}, "wants a goal"),
+        ({"observation": (ObservationPart("goal", 3, "m"),)}, "needs a goal"),
         ({"observation": (ObservationPart("commands", 4, "m"),)}, "takes .* of width 16, its layout 4"),
     ],
 )

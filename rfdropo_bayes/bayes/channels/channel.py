@@ -1,4 +1,4 @@
-"""Interface of every channel of measurements: parameters, residuals, density, and a draw of its noise."""
+"""Interface of every channel of measurements: parameters, residuals, density, and draws of the noise."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Series(Channel):
 
     @abstractmethod
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """Its noise as a known one, at values of its parameters, in rows that are ``step`` seconds apart."""
+        """The channel's noise at given values of its parameters, in rows that are ``step`` seconds apart."""
 
     def log_size(
         self, about: Float[Any, "recording time *reading"], measured: Float[Any, "recording time *reading"]
@@ -210,10 +210,10 @@ def padded_readings(
         length: rows.
         needed: number of recordings, from the first, that must have readings; all by default.
         read: readings of one recording and their mask; None without readings.
-        key: key of [model] that makes them data; words: their name.
+        key: key of [model] that uses the readings as data; words: name of the readings.
 
     Raises:
-        InputError: a recording without readings that needs them.
+        InputError: a recording lacks the readings.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     for index, trajectory in enumerate(trajectories):

@@ -51,7 +51,7 @@ class Markers(Series):
         """The positions of other recordings, under the same noise.
 
         Raises:
-            InputError: known noise, and a marker of which it is not known.
+            InputError: the noise is known, but not for all markers.
         """
         known = self.known
         if known is not None:

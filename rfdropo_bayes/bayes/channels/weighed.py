@@ -1,4 +1,4 @@
-"""Parts that were weighed, and other sums of parameters known from a measurement of their own.
+"""Weighed parts, and other sums of parameters known from separate measurements.
 
 With cables that impose a displacement, all stiffnesses and masses times one factor give the same motion. A mass from a
 balance fixes the factor, as a tension reading does.
@@ -23,7 +23,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Weighed(NamedTuple):
-    """A parameter, or the sum of several, known from a measurement of its own."""
+    """A parameter, or a sum of parameters, known from a separate measurement."""
 
     parameters: tuple[str, ...]  # names; their sum was measured
     value: float  # measured value in their unit

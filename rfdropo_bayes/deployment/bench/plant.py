@@ -81,7 +81,7 @@ def build_plant(name: str, robot: Robot, settings: Mapping[str, Any] | None = No
     """The plant of that name: "springs", or MODULE:CALLABLE, called with the robot and the settings.
 
     Raises:
-        InputError: if there is no such plant, or it does not take the settings.
+        InputError: the plant does not exist, or does not take the settings.
     """
     try:
         if name == "springs":
@@ -170,7 +170,7 @@ class PlantProcess:
             answer = self._pipe.recv()
         except (EOFError, ConnectionError):
             raise InputError(
-                "its process has died", where="plant", remedy="run it in this process to see why"
+                "the process of the plant has died", where="plant", remedy="run it in this process to see why"
             ) from None
         if isinstance(answer, str):
             raise InputError(answer, where="plant")

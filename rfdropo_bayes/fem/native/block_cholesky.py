@@ -202,7 +202,7 @@ def factor(pattern, pivot, lower, token):
 
 @mesh_kernel
 def forward_substitute(pattern, pivot, lower, token):
-    """Turn border row 0, written anew after `factor`, into (L^-1 b)'."""
+    """Replace border row 0, a new row b' after `factor`, by (L^-1 b)'."""
     for column in range(len(pattern.first) - 1):
         block = pattern.first[column + 1] - pattern.border
         t, j = 9 * block, 6 * column

@@ -45,7 +45,7 @@ def chosen_compilers(wanted: str | None, version: str) -> Compilers:
         version: version of Numba.
 
     Raises:
-        InputError: another word, or "ours" if they do not fit.
+        InputError: an unknown word, or "ours" with a version of Numba that the compilers do not support.
     """
     if wanted not in (None, "", OURS, NUMBA):
         raise InputError(f"{wanted!r} is not a compiler", where=VARIABLE, remedy=f"use {OURS} or {NUMBA}, or unset it")

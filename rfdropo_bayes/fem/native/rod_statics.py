@@ -1,7 +1,7 @@
 """Static equilibrium of a rod in SIMD lanes: where a rollout starts, and every row of a quasi-static motion.
 
-Newton's method, with all that turns with the sections in leading order. A lane that has come to rest is not moved
-again: how long others take changes nothing of it.
+Newton's method, with all that turns with the sections in leading order. A lane at rest is not moved again, so its
+result does not depend on other lanes.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def _mesh_entry(scene, offset, way, centre, k, r):
 
 @kernel
 def _rod_entry(scene, touch, offset, way, entry, k, r, token):
-    """Entry of a section: of its translation as it is, else of its spin."""
+    """Entry of a section: unchanged for its translation, with a lever for its spin."""
     if scene.place[k] % SIZE == 0:
         return entry
     lever = load3(touch.lever, 3 * (k - 1), token)

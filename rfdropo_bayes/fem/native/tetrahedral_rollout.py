@@ -1,7 +1,8 @@
 """Rollouts of a tetrahedral body in SIMD lanes: cables, the stages of a step, and one lane block through all steps.
 
-In single precision the elimination loses digits that the motion of a long soft body needs: there the stage is refined
-once. Its residual costs one pass over the elements, without tangents, and the factor is used again.
+In single precision the elimination loses digits that the motion of a long soft body needs. In single precision each
+stage is therefore refined once. Its residual costs one pass over the elements, without tangents, and the factor is used
+again.
 """
 
 from __future__ import annotations

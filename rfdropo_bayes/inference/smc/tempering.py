@@ -270,8 +270,7 @@ def next_step(
         longest: length of the step to the end of the path.
         target: effective sample size to keep, as a share of the particles that have weight at the end of the path.
 
-    Returns:
-        the length, and whether it reaches the end of the path with the target kept.
+    Returns: the length, and whether the end of the path is reached at the target effective size.
     """
     end = log_weights_at(longest)
     alive = np.isfinite(end)

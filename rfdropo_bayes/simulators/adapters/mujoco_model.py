@@ -459,7 +459,7 @@ class MuJoCoRollouts:
 
 @contextmanager
 def _unheard() -> Iterator[None]:
-    """Warnings of unstable rollouts go nowhere: a rollout that diverged has a status of its own."""
+    """Warnings of unstable rollouts are dropped, since a status marks diverged rollouts."""
     import mujoco
 
     kept = mujoco.get_mju_user_warning()
