@@ -97,7 +97,7 @@ def in_words(scores: Prequential, markers: tuple[str, ...], level: float, timed:
     first, worst = failing[0], int(np.argmax(scores.surprise))
     at = int(np.argmax(scores.misfit.reshape(-1, 3).sum(axis=1)))
     share = "in every block" if len(failing) == len(scores.p) else f"in {len(failing)} of {len(scores.p)} blocks"
-    early, late = (span_in_words(*scores.edges[k : k + 2], timed) for k in (first, worst))
+    early, late = (span_in_words(scores.edges[k], scores.edges[k + 1], timed) for k in (first, worst))
     return f"The model fails {share} of rows, first {early}, most {late}, and most at marker {markers[at]}." + (
         f" {BEGINNING}" if begins_wrong(scores, level) else ""
     )
