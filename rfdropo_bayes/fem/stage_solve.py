@@ -56,7 +56,7 @@ from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
 class Turning(NamedTuple):
     """Forces that turn with the sections in the matrix of an equilibrium."""
 
-    resultant: Six  # forces and moments of the sections in the elements' frames
+    resultant: Six  # forces and moments between the stations in the elements' frames
     share: Scalar  # 0 without them, 1 with them
 
 
@@ -147,7 +147,7 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
     frame = rotation(body.orientation)
     course = courses(way.layout, thread, body.position, frame)
     between = held(way.layout, course, tension, len(body.length))
-    elements = rod_elements.shape(body.length, body.position, body.orientation)
+    elements = rod_elements.shape(body.length, body.position, body.orientation, body.section.inner)
     slope = slopes(body.section, elements.strain)
     rates = rod_elements.strain_rates(elements, body.twist)
     resultant = answer(body.section, elements.strain) + body.behind * linear(slope, rates)
@@ -155,6 +155,7 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
         resultant = resultant + body.gain * linear(body.section, elements.strain - body.branch)
     if body.blown is not None:
         resultant = resultant - body.blown
+    resultant = rod_elements.leant(elements, resultant)
     if not way.predicted:
         resultant = resultant + body.span * rod_elements.held_resultant(elements, between, rates)
     momentum = inertia_times(body, frame, body.twist)
@@ -169,16 +170,16 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
 
 def stresses(body: StageBody, change: Six) -> Six:
     """Forces and moments of the sections after a change of all stations, linear in it."""
-    elements = rod_elements.shape(body.length, body.position, body.orientation)
+    elements = rod_elements.shape(body.length, body.position, body.orientation, body.section.inner)
     rates = rod_elements.strain_rates(elements, change)
     found = answer(body.section, elements.strain) + linear(slopes(body.section, elements.strain), rates)
-    return found if body.blown is None else found - body.blown
+    return rod_elements.leant(elements, found if body.blown is None else found - body.blown)
 
 
 def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
     """A times a field."""
     rates = rod_elements.strain_rates(line.elements, change)
-    strained = body.lookahead * linear(line.slope, rates)
+    strained = rod_elements.leant(line.elements, body.lookahead * linear(line.slope, rates))
     strained = strained + body.span * rod_elements.held_resultant(line.elements, line.held, rates)
     stiff = -body.span * rod_elements.station_forces(line.elements, strained)
     result = stiff + (1.0 + body.span * body.loss) * inertia_times(body, line.frame, change)
@@ -192,12 +193,14 @@ def matrix(body: StageBody, line: Linearised) -> Chain:
     """A."""
     scale = body.span * body.lookahead
     taut = Held(*(body.span**2 * part for part in line.held))
-    bending = scale * line.slope.bending
+    stretch, bending = scale * line.slope.stretch, scale * line.slope.bending
     if body.turning is not None:
-        bow = body.turning.share * body.turning.resultant[2] * body.length**2 / 12.0
-        bow = jnp.stack([bow, bow, jnp.zeros_like(bow)])
+        axial = body.turning.share * body.turning.resultant[2]
+        bow, none = axial * body.length**2 / 12.0, jnp.zeros_like(axial)
+        bow = jnp.stack([bow, bow, none])
+        stretch = stretch + jnp.stack([*(2.0 * axial * body.section.inner.shear), none])
         bending = bending + (bow if bending.ndim == bow.ndim else diagonal(bow))
-    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, bending, taut)
+    element = rod_elements.tangent(line.elements, stretch, bending, taut)
     if body.turning is not None and line.pull is not None:
         element = rod_elements.turning(line.elements, element, body.turning.resultant, line.pull, body.turning.share)
     grown = 1.0 + body.span * body.loss

@@ -116,7 +116,7 @@ def _follow_stress(tables, samples, factors, work, share, token):
     """
     zero = fill(0.0, work.stress, token)
     for element in range(tables.stations - 1):
-        measure_element(tables, element, work, token)
+        measure_element(tables, samples, element, work, token)
         place_stress(tables, samples, factors, element, work, token)
         for i in range(SIZE):
             row, there = SIZE * element + i, load(work.element, STRESS + i, token)
@@ -258,7 +258,7 @@ def measure_imbalance(tables, samples, factors, work, token):
         for station in range(tables.stations):
             add_surroundings(tables, samples, factors, station, False, work, token)
     for element in range(tables.stations - 1):
-        measure_element(tables, element, work, token)
+        measure_element(tables, samples, element, work, token)
         place_stress(tables, samples, factors, element, work, token)
         add_forces(element, work.element, work.field, token)
     _add_cable_forces(tables, work, token)
