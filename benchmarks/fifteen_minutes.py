@@ -87,13 +87,7 @@ def type_all(folder: Path) -> list[Step]:
 
 def write_recordings(folder: Path) -> None:
     """Three recordings of 6 s at 60 Hz, simulated, as CSV files."""
-    arm = rb.Robot.outline(
-        name="invented",
-        length=0.25,
-        radius=0.012,
-        markers={"mid": 0.125, "tip": 0.25},
-        mass=0.09,
-    )
+    arm = rb.Robot.outline(name="invented", length=0.25, radius=0.012, markers={"mid": 0.125, "tip": 0.25}, mass=0.09)
     model = rb.Model(arm, priors={"young_modulus": {}}, mechanisms=["command_delay"])
     walk = {"duration": 6.0, "interval": 0.3, "step": 0.004, "low": 0.0, "high": 0.014, "sample_time": 1.0 / 60.0}
     truth = {"young_modulus": MODULUS, "command_delay": DELAY}

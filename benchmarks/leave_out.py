@@ -5,7 +5,8 @@
 
 The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
 seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
-fits some rows of them; after an adaptation the first one as far as it was not shown. Climbs start from the prior, or
+fits some rows of them; after an adaptation the first one as far as it was not shown. Optimisations start from the
+prior, or
 where a study has `start`, the folder of a calibration, from its optimum: a day that is left out has chosen the basin
 then, and nothing else. `set` changes entries of the experiment, as ``--set`` does.
 
@@ -41,15 +42,15 @@ from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import load_data
 from rfdropo_bayes.posteriors import RecordingPrediction, by_owner
-from rfdropo_bayes.prediction.day_error import DAY_ERROR, left_out_sentence
 from rfdropo_bayes.prediction.predictive import predict_fitted, thin
+from rfdropo_bayes.prediction.session_error import SESSION_ERROR, left_out_sentence
 from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import write_summary
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.adapt import model_error_of
 from rfdropo_bayes.verbs.calibrate import calibrate, inference_options
-from rfdropo_bayes.verbs.left_out_days import DRAWS, Days, error_of_unseen_days
+from rfdropo_bayes.verbs.left_out_sessions import DRAWS, Sessions, error_of_unseen_sessions
 from rfdropo_bayes.verbs.predict import model_of
 
 SETTINGS = Path(__file__).with_suffix(".toml")
@@ -108,16 +109,16 @@ def store(folder: Path) -> str:
         raise InputError(f"was not fitted to {unknown[0]} as it is now", where=str(folder), remedy="calibrate again")
     key = jax.random.key(model.settings.seed)
     draws = {info.name: record.posterior[info.name] for info in record.free}
-    problem = model.problem(runs).holding({info.name: value for info, value in record.held})
+    problem = model.problem(runs).holding({info.name: value for info, value in record.fixed})
     predictions = predict_fitted(problem, thin(draws, DRAWS), key)
     optimum = fit.content["optimum"]
     start = by_owner(record.free, {name: np.full(2, optimum[name]) for name in draws})
-    error = error_of_unseen_days(Days(model, runs, start, predictions, model_error_of(record)), key)
+    error = error_of_unseen_sessions(Sessions(model, runs, start, predictions, model_error_of(record)), key)
     if error is None:
         raise InputError("nothing of the model differs between days", where=str(folder), remedy="name [model.groups]")
     sentence = left_out_sentence(error)
-    replace(record, attrs={**record.attrs, DAY_ERROR: error.as_dict()}).save(folder / POSTERIOR)
-    write_summary({**fit.content, "unseen_days": {**error.as_dict(), "sentence": sentence}}, folder / SUMMARY)
+    replace(record, attrs={**record.attrs, SESSION_ERROR: error.as_dict()}).save(folder / POSTERIOR)
+    write_summary({**fit.content, "unseen_sessions": {**error.as_dict(), "sentence": sentence}}, folder / SUMMARY)
     return sentence
 
 

@@ -102,8 +102,7 @@ EFFECTS = {
     "moved_marker": Effect(_moved, mechanisms=("marker_offset", "site_pos")),
     "late_camera": Effect(late=0.02, mechanisms=LATE),
     "late_commands": Effect(
-        torques=lambda torques: np.concatenate([np.repeat(torques[:1], 4, axis=0), torques[:-4]]),
-        mechanisms=LATE,
+        torques=lambda torques: np.concatenate([np.repeat(torques[:1], 4, axis=0), torques[:-4]]), mechanisms=LATE
     ),
     "tiring_motor": Effect(torques=_tiring, ports=("cable m1",)),
     "coupled_motors": Effect(torques=_coupled, ports=("cable m2",)),

@@ -38,10 +38,7 @@ class Rod(NamedTuple):
     length: float  # [m]
 
 
-RODS = {
-    "SpringSteelRod": Rod(0.8e-3, 200e9, 0.33, 7870.0, 0.6),
-    "TPURod": Rod(5e-3, 70e6, 0.4, 1200.0, 0.4),
-}
+RODS = {"SpringSteelRod": Rod(0.8e-3, 200e9, 0.33, 7870.0, 0.6), "TPURod": Rod(5e-3, 70e6, 0.4, 1200.0, 0.4)}
 
 
 class Shapes(NamedTuple):
@@ -96,11 +93,7 @@ def settle(rod: Rod, gravity: jax.Array, wrench: jax.Array) -> tuple[jax.Array, 
     whole = system(rod)
     chosen = np.array([ELEMENTS // 2, ELEMENTS])
     material = fem.material(
-        whole,
-        young_modulus=rod.young_modulus,
-        poisson_ratio=rod.poisson_ratio,
-        density=rod.density,
-        gravity=gravity,
+        whole, young_modulus=rod.young_modulus, poisson_ratio=rod.poisson_ratio, density=rod.density, gravity=gravity
     )
     load = jnp.zeros((ELEMENTS + 1, 6)).at[chosen].set(wrench)
     state, info = fem.static_equilibrium(whole, fem.prepare(whole, material), jnp.zeros(0), load, 300)

@@ -124,13 +124,7 @@ def millimetres(distance: np.ndarray) -> list[float]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Shares of episodes within each distance with 95 % intervals, by setting."""
-    heads = [
-        "setting",
-        *(f"{mm:g} mm" for mm in WITHIN),
-        "15.25 mm by training",
-        "median [mm]",
-        "medians at home [mm]",
-    ]
+    heads = ["setting", *(f"{mm:g} mm" for mm in WITHIN), "15.25 mm by training", "median [mm]", "medians at home [mm]"]
     lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
     for variant in VARIANTS:
         own = [row for row in rows if row["variant"] == variant]

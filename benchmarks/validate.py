@@ -22,13 +22,7 @@ from references import Reference
 
 from rfdropo_bayes import __version__
 
-GROUPS = (
-    references.large_deflections,
-    references.bar,
-    references.modes,
-    references.sliding,
-    references.recordings,
-)
+GROUPS = (references.large_deflections, references.bar, references.modes, references.sliding, references.recordings)
 
 
 def gather() -> list[Reference]:

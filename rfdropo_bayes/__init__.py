@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.nested import NestedConfig as Nested
     from rfdropo_bayes.inference.nuts import NutsConfig as NUTS
     from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RFDROPO
-    from rfdropo_bayes.inference.smc.bridge import BridgeConfig as Bridge
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SMC
     from rfdropo_bayes.model.model import Model as Model
     from rfdropo_bayes.policies.training_config import TrainingOptions as TrainingOptions
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.verbs.calibrate import calibrate as calibrate
     from rfdropo_bayes.verbs.check import check as check
     from rfdropo_bayes.verbs.design import design as design
-    from rfdropo_bayes.verbs.design_day import design_day as design_day
     from rfdropo_bayes.verbs.evaluate import evaluate as evaluate
     from rfdropo_bayes.verbs.make_vec import make_vec as make_vec
     from rfdropo_bayes.verbs.predict import predict as predict
@@ -70,7 +68,6 @@ _HOMES = {
     "Audit": "results.audited",
     "AuditOptions": "verbs.audit",
     "BlackBox": "simulators.black_box",
-    "Bridge": "inference.smc.bridge:BridgeConfig",
     "Calibration": "results.calibrated",
     "Caution": "cautions",
     "Code": "cautions",
@@ -98,7 +95,6 @@ _HOMES = {
     "check": "verbs.check",
     "deploy": "deployment.session",
     "design": "verbs.design",
-    "design_day": "verbs.design_day",
     "evaluate": "verbs.evaluate",
     "load": "results.load",
     "load_deployment": "deployment.settings",
@@ -122,7 +118,6 @@ __all__ = [
     "Audit",
     "AuditOptions",
     "BlackBox",
-    "Bridge",
     "Calibration",
     "Caution",
     "Code",
@@ -149,7 +144,6 @@ __all__ = [
     "check",
     "deploy",
     "design",
-    "design_day",
     "evaluate",
     "load",
     "load_deployment",

@@ -29,7 +29,7 @@ class Code(StrEnum):
     """A single replicate or optimisation cannot show that a mode of the posterior was lost."""
     ROLLOUTS_EXCLUDED = "rollouts_excluded"
     """Many rollouts got no weight."""
-    CLIMB_UNFINISHED = "climb_unfinished"
+    OPTIMISATION_UNFINISHED = "optimisation_unfinished"
     """The best optimisation stopped before its optimum."""
     SEVERAL_OPTIMA = "several_optima"
     """One normal distribution does not describe the posterior."""
@@ -49,7 +49,7 @@ class Code(StrEnum):
     """A first row is farther from the simulated one than the model was wrong in the fitted recordings."""
     FIRST_ROW_UNMATCHED = "first_row_unmatched"
     """Draws of a new group's parameters did not converge in matching a first row."""
-    DAY_UNMATCHED = "day_unmatched"
+    SESSION_UNMATCHED = "session_unmatched"
     """A session is fitted worse than the fitted sessions, few of the body's draws explain it, or fits did not
     converge.
     """

@@ -213,10 +213,7 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     content, answer = found.content, found.answer
     assert answer is not None
     prior = answer.problem.coordinates.prior_deviations
-    judged = {
-        **judge(content, names, hidden, prior),
-        "error_over_oracle": error_over_oracle(answer, names, hidden),
-    }
+    judged = {**judge(content, names, hidden, prior), "error_over_oracle": error_over_oracle(answer, names, hidden)}
     if condition.removed:
         # What the base model does is the same in both.
         shutil.copytree(place / "audit" / JOURNAL, place / "removed" / JOURNAL, dirs_exist_ok=True)

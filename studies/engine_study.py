@@ -65,12 +65,7 @@ class Truth(NamedTuple):
 
 
 TRUTHS = {
-    "mujoco": Truth(
-        MuJoCoArm,
-        ENGINE_EFFECTS,
-        {**CENTRE, "rayleigh_stiffness": 0.05},
-        Setting(audited=AUDITED),
-    ),
+    "mujoco": Truth(MuJoCoArm, ENGINE_EFFECTS, {**CENTRE, "rayleigh_stiffness": 0.05}, Setting(audited=AUDITED)),
     "pyelastica": Truth(
         ElasticaArm,
         ELASTICA_EFFECTS,

@@ -324,12 +324,7 @@ def noisy(
 
 
 def _write(
-    setting: Setting,
-    experiment: Experiment,
-    blank: Sequence[Trajectory],
-    made: Observation,
-    seed: int,
-    out: Path,
+    setting: Setting, experiment: Experiment, blank: Sequence[Trajectory], made: Observation, seed: int, out: Path
 ) -> None:
     for index, (recording, position) in enumerate(zip(blank, np.asarray(made.position), strict=True)):
         key = jax.random.fold_in(jax.random.key(seed), index)

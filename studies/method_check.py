@@ -24,12 +24,7 @@ MOST_FAILURES = 100
 
 
 def run_check(
-    model: Model,
-    out: Path,
-    *,
-    datasets: int = 200,
-    resume: bool = False,
-    overwrite: bool = False,
+    model: Model, out: Path, *, datasets: int = 200, resume: bool = False, overwrite: bool = False
 ) -> dict[str, Any]:
     """Check the experiment's method on data simulated from its own prior at its own commands and times.
 

@@ -204,10 +204,7 @@ def observed_features(problem: RolloutProblem) -> Float[np.ndarray, "1 time f"]:
 
 
 def run_bayessim(
-    problem: Problem,
-    config: BayesSimConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
+    problem: Problem, config: BayesSimConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
 ) -> InferenceResult:
     """BayesSim. It has one stage, so there is nothing to resume from.
 
@@ -222,12 +219,7 @@ def run_bayessim(
     return _run(simulated, "bayessim", config, key, summarise, rounds=1, logbook=logbook)
 
 
-def run_npdr(
-    problem: Problem,
-    config: NpdrConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run_npdr(problem: Problem, config: NpdrConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """NPDR. Rounds build on trained networks, which are not kept: an interrupted run starts again.
 
     Raises:
@@ -284,10 +276,7 @@ def _run(
         draws=draws,
         trace=trace,
         **ledger.record(),
-        cautions=[
-            *prior_cautions(problem, draws),
-            *exclusion_cautions(ledger.excluded, ledger.evaluations),
-        ],
+        cautions=[*prior_cautions(problem, draws), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=time.monotonic() - began,
         details={"simulations": int(share * rounds), "rounds": rounds},
     )
@@ -314,12 +303,7 @@ def _estimator(sbi: Any, config: Any, d: int) -> Any:
     )
 
 
-def run_udr(
-    problem: Problem,
-    config: UdrConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run_udr(problem: Problem, config: UdrConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Random sub-ranges of the prior's central 99 %, as the paper's baseline of uniform randomisation has them."""
     began = time.monotonic()
     prior_key, range_key = jax.random.split(key)

@@ -13,6 +13,7 @@ import inspect
 import json
 import sys
 import typing
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import NoneType
@@ -47,6 +48,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
 NOTE = "<!-- Written by tools/reference.py from the code: change the code, then run it. -->"
 NO_HELP = "--help"
+SEVERAL = 2  # an option of more commands, with the same meaning, is described once
 
 
 def pages() -> dict[str, str]:
@@ -69,10 +71,7 @@ def index_page() -> str:
     rows = [
         ("[experiment.md](experiment.md)", "every key of the experiment file, priors, parameters of measurements"),
         ("[robot.md](robot.md)", "every key of a robot file, and the robots that come with the package"),
-        (
-            "[deployment.md](deployment.md)",
-            "every key of a deployment file, for sessions on motors",
-        ),
+        ("[deployment.md](deployment.md)", "every key of a deployment file, for sessions on motors"),
         ("[mechanisms.md](mechanisms.md)", "every mechanism: cause, remedy, parameters, default priors, where it runs"),
         ("[methods.md](methods.md)", "every method of inference and its options"),
         ("[commands.md](commands.md)", "every command of `rfdropo` and its options"),
@@ -86,7 +85,7 @@ def experiment_page() -> str:
     """Keys of the experiment file."""
     parts = [
         "An experiment is one TOML file. Lengths are in metres and times in seconds, unless a key says otherwise.",
-        *(text for title, schema in tables_of(Experiment, "") for text in key_table(title, schema)),
+        *key_tables(Experiment),
         "## Priors",
         "`[model.priors]` has `parameter = { distribution = NAME, ... }`; every prior is confined to the parameter's "
         "hard bounds. `sigma` of a LogNormal is the standard deviation of the logarithm.",
@@ -111,7 +110,7 @@ def robot_page() -> str:
     parts = [
         "A robot is one TOML file, in SI units, in the frame of its base: z runs along the undeformed body, away from "
         'the clamp. `base = "NAME"` makes it a variant of another robot, whose tables of the same name it replaces.',
-        *(text for title, schema in tables_of(Robot, "") for text in key_table(title, schema)),
+        *key_tables(Robot),
         "## [body] from shapes",
         "In the place of a section profile, `[body]` may list shapes, from the clamp to the tip.",
         keys(SectionedBody),
@@ -127,7 +126,7 @@ def deployment_page() -> str:
     parts = [
         "A deployment is one TOML file, in SI units unless a key says otherwise. Paths are relative to it. "
         "[docs/deployment.md](../deployment.md) shows their use.",
-        *(text for title, schema in tables_of(Deployment, "") for text in key_table(title, schema)),
+        *key_tables(Deployment),
         "## Guards",
         "`[drives] unguarded` may list these objects, if something else does the work of the missing guard.",
         table(("Object", "Without it"), [(code(f"0x{index:04X}"), words) for index, words in sorted(WITHOUT.items())]),
@@ -189,12 +188,22 @@ def methods_page() -> str:
 def commands_page() -> str:
     """Every command with its options."""
     root: Any = typer.main.get_command(app)
-    parts = ["Bad input ends with status 2 and one line with a remedy; an interrupted run ends with status 3."]
+    heads, rows = ("Argument or option", "Default", "Meaning"), {}
     for name, command in walk(root, "rfdropo"):
         shown = [p for p in command.params if NO_HELP not in p.opts]
-        rows = [(code(written(p)), default_of(p), p.help or "") for p in shown]
+        rows[name] = [(code(written(p)), default_of(p), p.help or "") for p in shown]
+    often = Counter(row for own in rows.values() for row in own)
+    shared = [row for row in often if often[row] > SEVERAL]
+    parts = [
+        "Bad input ends with status 2 and one line with a remedy; an interrupted run ends with status 3.",
+        "## Of several commands",
+        table(heads, shared),
+    ]
+    for name, command in walk(root, "rfdropo"):
+        own = [row for row in rows[name] if row not in shared]
+        also = ", ".join(row[0] for row in rows[name] if row in shared)
         parts += [f"## {name}", first_paragraph(command.help)]
-        parts += [table(("Argument or option", "Default", "Meaning"), rows)] if rows else []
+        parts += ([table(heads, own)] if own else []) + ([f"Also {also}."] if also else [])
     return page("Commands", parts)
 
 
@@ -279,6 +288,14 @@ def inner_tables(annotation: Any) -> list[tuple[type[BaseModel], str]]:
     if origin in (list, tuple):
         return [(inner, "[[{}]]") for inner, _ in found]
     return found
+
+
+def key_tables(root: type[BaseModel]) -> list[str]:
+    """Headings, meanings and keys of all tables of a file; tables of one kind together."""
+    titles: dict[type[BaseModel], list[str]] = {}
+    for title, schema in tables_of(root, ""):
+        titles.setdefault(schema, []).append(title)
+    return [text for schema, own in titles.items() for text in key_table(", ".join(own), schema)]
 
 
 def key_table(title: str, schema: type[BaseModel]) -> list[str]:

@@ -55,9 +55,9 @@ def fitted(name: str, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
     began, model = time.process_time(), rb.Model.read(EXPERIMENT, overrides)
     runs = [each for each in model.recordings("fit") if group_of(each.name, model.spec.groups) in days]
     earlier = {key: np.full(2, value) for key, value in known[start]["optimum"].items()} if start else None
-    method = rb.Laplace(starts=1, screen=8 if start else 24, blocks=1, max_steps=40, draws=50)
+    method = rb.Laplace(starts=1, prior_draws=8 if start else 24, blocks=1, max_steps=40, draws=50)
     result = run(model.problem(runs, earlier), "laplace", method, jax.random.key(0))
-    optimum = {**result.held, **(result.optimum or {})}
+    optimum = {**result.fixed, **(result.optimum or {})}
     values = {key: np.full(1, value) for key, value in optimum.items()}
     off = {split: {k: float(v[0]) for k, v in errors(model, days, split, values).items()} for split in ("fit", "test")}
     said = [caution.sentence for caution in result.cautions]

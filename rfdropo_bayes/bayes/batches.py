@@ -48,11 +48,11 @@ def in_chunks(
     count, parts = len(jax.tree.leaves(given)[0]), []
     for start in range(0, count, sizes[-1]):
         before()
-        left = min(count - start, sizes[-1])
-        index = np.minimum(np.arange(start, start + next(size for size in sizes if size >= left)), count - 1)
+        remaining = min(count - start, sizes[-1])
+        index = np.minimum(np.arange(start, start + next(size for size in sizes if size >= remaining)), count - 1)
         chunk = jax.tree.map(lambda array, index=index: np.asarray(array)[index], given)
         parts.append(jax.device_get(function(chunk)))
-        after(left)
+        after(remaining)
     return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
 
 

@@ -30,25 +30,19 @@ class CalibrationProblem:
     into chunks of at most ``chunk`` parameter sets, and the last chunk is padded to one of `chunk_sizes`: a few
     compilations suffice for every batch size. The number of simulated steps is a run-time argument, so that they
     suffice for every horizon. Problems of one model share its compiled programs.
-
-    Attributes:
-        model: priors, simulator and data.
-        chunk: most parameter sets in one compiled call.
-        earlier: draws of the posterior of another model of the same robot, from which optimisations may start; missing
-            parameters start from their priors.
-        other: measured data in place of the model's data; None for the model's.
-        counted: factors of the log likelihood of some channels; the other factors are 1.
-        jacobian: method of Jacobians, see `ResidualProblem`.
-        told: called with the number of rollouts, in full-length equivalents, after each chunk.
     """
 
-    model: TrajectoryModel
-    chunk: int = 32
+    model: TrajectoryModel  # priors, simulator and data
+    chunk: int = 32  # most parameter sets in one compiled call
+    # draws of the posterior of another model of the same robot, from which optimisations may start; missing parameters
+    # start from their priors
     earlier: DrawsByOwner = field(default_factory=dict)
-    other: Measured | None = None
+    other: Measured | None = None  # measured data in place of the model's data; None for the model's
+    # factors of the log likelihood of some channels; the other factors are 1
     counted: Mapping[str, float] = field(default_factory=dict)
-    jacobian: str = "auto"
-    told: Callable[[float], None] = lambda rollouts: None
+    jacobian: str = "auto"  # method of Jacobians, see `ResidualProblem`
+    # called with the number of rollouts, in full-length equivalents, after each chunk
+    count_rollouts: Callable[[float], None] = lambda rollouts: None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,7 +139,7 @@ class CalibrationProblem:
 
     def telling(self, spent: Callable[[float], None]) -> CalibrationProblem:
         """The same problem, which reports rollouts in full-length equivalents to ``spent``."""
-        return replace(self, told=spent)
+        return replace(self, count_rollouts=spent)
 
     def with_measured(self, measured: Measured) -> CalibrationProblem:
         """The same problem with other data.
@@ -310,12 +304,12 @@ class CalibrationProblem:
         names = self.model.channel_names
         ends = np.cumsum([shapes[name].size for name in names])
         parts = dict(zip(names, np.split(residuals, ends[:-1], axis=-1), strict=True))
-        found = {}
+        series = {}
         for channel in self.model.channels:
             if isinstance(channel, Series) and channel.independent:
                 part = parts[channel.name].reshape(*residuals.shape[:-1], *shapes[channel.name].shape)
-                found[channel.name] = part[..., : channel.valid.shape[-1]], channel.valid
-        return found
+                series[channel.name] = part[..., : channel.valid.shape[-1]], channel.valid
+        return series
 
     def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
         """Simulated marker positions [m] of every recording, without observation noise."""
@@ -332,8 +326,8 @@ class CalibrationProblem:
         """Simulated observations of every recording, without observation noise: fields (n, recording, time, ...),
         status (n,).
         """
-        found = self._chunked(values, self.n_rows, lambda observation, _: observation)
-        return found._replace(status=found.status.max(axis=1))
+        simulated = self._chunked(values, self.n_rows, lambda observation, _: observation)
+        return simulated._replace(status=simulated.status.max(axis=1))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
@@ -360,13 +354,13 @@ class CalibrationProblem:
         def seen(own: Batch) -> Any:
             theta = np.asarray(self.model.programs.theta(own))
             flat, commands = theta.reshape(-1, theta.shape[-1]), recordings.commands.of(np.tile(every, len(theta)))
-            found, status = lanes.roll(flat, None, commands, steps=steps, width=len(flat))
-            parts = {**dict.fromkeys(Observation._fields), **found, "status": status}
+            fields, status = lanes.roll(flat, None, commands, steps=steps, width=len(flat))
+            parts = {**dict.fromkeys(Observation._fields), **fields, "status": status}
             shaped = jax.tree.map(lambda part: part.reshape(*theta.shape[:2], *part.shape[1:]), parts)
             return evaluate(Observation(**shaped), own)
 
         def after(count: int) -> None:
-            self.told(count * horizon / self.n_rows)
+            self.count_rollouts(count * horizon / self.n_rows)
 
         return in_chunks(seen, columns, chunk_sizes(self.chunk), after=after)
 

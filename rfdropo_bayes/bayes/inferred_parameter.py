@@ -26,22 +26,15 @@ INTERIOR = 15.0  # in unconstrained space: within 3e-7 of the width of a bound
 
 @dataclass(frozen=True)
 class InferredParameter:
-    """One inferred parameter.
+    """One inferred parameter."""
 
-    Attributes:
-        spec: name, unit, hard bounds and meaning of the parameter, in any scope.
-        prior: numpyro distribution, in the parameter's unit, within its hard bounds.
-        table: the prior as written, for the record.
-        scope: its owner. The unconstrained coordinate of a scaled parameter is its ratio to the scale (a non-centred
-            parametrisation).
-        members: recordings for which it holds, if it has an owner.
-    """
-
-    spec: ParameterSpec
-    prior: dist.Distribution
-    table: Mapping[str, Any]
+    spec: ParameterSpec  # name, unit, hard bounds and meaning of the parameter, in any scope
+    prior: dist.Distribution  # numpyro distribution, in the parameter's unit, within its hard bounds
+    table: Mapping[str, Any]  # the prior as written, for the record
+    # its owner. The unconstrained coordinate of a scaled parameter is its ratio to the scale (a non-centred
+    # parametrisation).
     scope: Scope = SHARED
-    members: tuple[str, ...] = ()
+    members: tuple[str, ...] = ()  # recordings for which it holds, if it has an owner
 
     @classmethod
     def of(
@@ -113,17 +106,13 @@ class InferredParameter:
 
 @dataclass(frozen=True)
 class Pooled:
-    """Pooling of one parameter.
+    """Pooling of one parameter."""
 
-    Attributes:
-        spread: standard deviation between groups, in the parameter's unit: the scale of its half-normal prior, or its
-            value if known.
-        groups: recordings of each group, by the group's name.
-        family: parameters with the same family have one spread, ``<family>_spread``; empty if the spread is known.
-    """
-
+    # standard deviation between groups, in the parameter's unit: the scale of its half-normal prior, or its value if
+    # known
     spread: float
-    groups: Mapping[str, tuple[str, ...]]
+    groups: Mapping[str, tuple[str, ...]]  # recordings of each group, by the group's name
+    # parameters with the same family have one spread, ``<family>_spread``; empty if the spread is known
     family: str = ""
 
 

@@ -81,16 +81,16 @@ class Lanes:
             assert isinstance(self.simulator, Placing)
             values = self.simulator.with_object_at(values, start)
         observation = self.simulator.rollout(values, commands, steps)
-        found = observation._replace(position=observation.position[:, self.marker_index])._asdict()
-        lacking = [name for name in self.fields if found[name] is None]
+        parts = observation._replace(position=observation.position[:, self.marker_index])._asdict()
+        lacking = [name for name in self.fields if parts[name] is None]
         if lacking:
             raise InputError(
                 f"the simulator does not tell its {lacking[0].replace('_', ' ')}",
                 where=f"[model] {lacking[0]}",
                 remedy="leave it out, or let its rollout return it",
             )
-        status = found.pop("status")
-        return {name: part for name, part in found.items() if part is not None}, status
+        status = parts.pop("status")
+        return {name: part for name, part in parts.items() if part is not None}, status
 
     @property
     def slope_rollouts(self) -> int:
@@ -118,8 +118,8 @@ class Lanes:
     def _derived(self) -> Any:
         def one(theta: jax.Array, tangent: jax.Array, start: jax.Array, commands: Commands) -> dict[str, jax.Array]:
             def data(theta: jax.Array) -> dict[str, jax.Array]:
-                found, _ = self._observe(theta, start, commands, jnp.asarray(commands.step.shape[0]))
-                return {name: found[name] for name in self.fields}
+                parts, _ = self._observe(theta, start, commands, jnp.asarray(commands.step.shape[0]))
+                return {name: parts[name] for name in self.fields}
 
             return jax.jvp(data, (theta,), (tangent,))[1]
 
@@ -141,8 +141,8 @@ class Lanes:
         """
         limit, rows = jnp.asarray(commands.step.shape[1] if steps is None else steps), commands.sample_step.shape[1]
         lanes = (theta, start, self._as_long(commands))
-        found, status = in_chunks(lambda own: self._rolled(*own, limit), lanes, (width or self.width,), before=check)
-        return {name: part[:, :rows] for name, part in found.items()}, status
+        parts, status = in_chunks(lambda own: self._rolled(*own, limit), lanes, (width or self.width,), before=check)
+        return {name: part[:, :rows] for name, part in parts.items()}, status
 
     def _as_long(self, commands: Commands) -> Commands:
         """Commands with steps and rows that are not computed, as many as in the first call: of shorter recordings, the
@@ -225,10 +225,10 @@ class RoutedLanes(Lanes):
         """See `Lanes.roll`."""
         slow = self._needs_slow(theta)
         routes: list[tuple[np.ndarray, Lanes, Any]] = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
-        order, found = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []
+        order, results = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []
         for mask, lanes, kept in routes:
             if mask.any():
                 chosen = np.flatnonzero(mask)
                 own = None if start is None else start[chosen]
-                found.append(lanes.roll(theta[chosen][:, kept], own, commands.of(chosen), check, steps, width))
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *found)
+                results.append(lanes.roll(theta[chosen][:, kept], own, commands.of(chosen), check, steps, width))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *results)

@@ -146,8 +146,8 @@ def log_density(spec: ParameterSpec, table: Mapping[str, Any], values: np.ndarra
         middle, at = math.log(table["median"]), np.log(values)
         low, high = (math.log(bound) if bound > 0.0 else -math.inf for bound in (low, high))
     inside = stats.norm.cdf((high - middle) / scale) - stats.norm.cdf((low - middle) / scale)
-    found = -0.5 * ((at - middle) / scale) ** 2 - math.log(scale * math.sqrt(2.0 * math.pi) * inside)
-    return found - at if family == "LogNormal" else found
+    density = -0.5 * ((at - middle) / scale) ** 2 - math.log(scale * math.sqrt(2.0 * math.pi) * inside)
+    return density - at if family == "LogNormal" else density
 
 
 def _number(name: str, value: Any, where: str) -> float:
@@ -221,10 +221,10 @@ def _table(prior: dist.Distribution, where: str) -> dict[str, Any] | None:
         return {**base, "distribution": "TruncatedNormal", **ends}
     if type(prior) not in TRANSFORMED:
         return None
-    found = _table(prior.base_dist, where)
+    table = _table(prior.base_dist, where)
     for transform in prior.transforms:
-        found = None if found is None else _through(found, transform, where)
-    return found
+        table = None if table is None else _through(table, transform, where)
+    return table
 
 
 def _through(table: dict[str, Any], transform: transforms.Transform, where: str) -> dict[str, Any] | None:

@@ -19,26 +19,16 @@ from rfdropo_bayes.simulators.protocol import Simulator
 
 @dataclass(frozen=True)
 class RecordingSet:
-    """Recordings as the arrays a likelihood needs, padded to a common length (padding is not valid).
+    """Recordings as the arrays a likelihood needs, padded to a common length (padding is not valid)."""
 
-    Attributes:
-        names: one per recording.
-        markers: the markers that all recordings have.
-        marker_index: indices of these markers in the simulator.
-        time: observation times, from zero [s].
-        rows: number of rows of each recording.
-        position: measured marker positions [m]; zero if masked.
-        commands: commands on the simulator's clock.
-    """
-
-    names: tuple[str, ...]
-    markers: tuple[str, ...]
-    marker_index: Int[np.ndarray, " marker"]
-    time: Float[np.ndarray, "recording time"]
-    rows: Int[np.ndarray, " recording"]
-    position: Float[np.ndarray, "recording time marker 3"]
+    names: tuple[str, ...]  # one per recording
+    markers: tuple[str, ...]  # the markers that all recordings have
+    marker_index: Int[np.ndarray, " marker"]  # indices of these markers in the simulator
+    time: Float[np.ndarray, "recording time"]  # observation times, from zero [s]
+    rows: Int[np.ndarray, " recording"]  # number of rows of each recording
+    position: Float[np.ndarray, "recording time marker 3"]  # measured marker positions [m]; zero if masked
     line: Timeline
-    commands: Commands
+    commands: Commands  # commands on the simulator's clock
 
     @property
     def steps(self) -> Float[np.ndarray, " recording"]:

@@ -22,16 +22,15 @@ SURE = 1e-4  # p-value under the noise within recordings, below which shifts are
 LEAST = 0.5  # of the noise's standard deviation: smaller differences change no conclusion
 ROWS = 10  # fewer rows do not distinguish a constant from slow noise
 
-Groups = tuple[tuple[int, ...], ...]
-"""Indices of the recordings in each group of repeats."""
+Groups = tuple[tuple[int, ...], ...]  # indices of the recordings in each group of repeats
 
 
 def group_recordings(recordings: RecordingSet, trajectories: Sequence[Trajectory]) -> Groups:
     """Recordings with the same commands, rows and clock."""
     groups: list[tuple[int, ...]] = []
-    for found in group_repeats(trajectories):
+    for repeats in group_repeats(trajectories):
         kept: list[list[int]] = []
-        for index in found:
+        for index in repeats:
             for group in kept:
                 first = group[0]
                 step = trajectories[first].dataset.attrs["sample_time"]
@@ -48,7 +47,7 @@ def group_recordings(recordings: RecordingSet, trajectories: Sequence[Trajectory
 def repeats_apart(recordings: RecordingSet, trajectories: Sequence[Trajectory], groups: Groups) -> tuple[str, ...]:
     """Recordings that repeat commands of another recording but are not grouped with it, as rows or clocks differ."""
     firsts = {group[0] for group in groups}
-    repeats = [index for found in group_repeats(trajectories) for index in found[1:]]
+    repeats = [index for repeated_by in group_repeats(trajectories) for index in repeated_by[1:]]
     return tuple(recordings.names[index] for index in repeats if index in firsts)
 
 
@@ -58,8 +57,8 @@ def mean_of(channel: Series, groups: Groups) -> Float[np.ndarray, "group time *r
     return np.stack([channel.mean(readings[list(group)], channel.valid[list(group)]) for group in groups])
 
 
-def spread(channel: Series, groups: Groups) -> Float[np.ndarray, "recording time column"]:
-    """Every recording less the mean of its group, in the unit of the noise; zero if not valid."""
+def departures_from_mean(channel: Series, groups: Groups) -> Float[np.ndarray, "recording time column"]:
+    """Each recording minus the mean of its group, in the unit of the noise; zero if not valid."""
     readings = np.asarray(channel.measured)
     about = np.empty_like(readings)
     for group, mean in zip(groups, mean_of(channel, groups), strict=True):
@@ -82,9 +81,7 @@ def mean_error(
 
 
 def deviations(
-    errors: Float[np.ndarray, "recording time column"],
-    valid: Bool[np.ndarray, "recording time column"],
-    groups: Groups,
+    errors: Float[np.ndarray, "recording time column"], valid: Bool[np.ndarray, "recording time column"], groups: Groups
 ) -> tuple[Float[np.ndarray, "repeat time column"], Bool[np.ndarray, "repeat time column"], float]:
     """Errors of repeats about their means, which of them count, and their degrees of freedom per value."""
     parts, counted, freedom, values = [], [], 0.0, 0
@@ -125,8 +122,8 @@ def noise_of_repeats(channel: Series, groups: Groups, steps: Float[np.ndarray, "
             where='[model] noise = "repeats"',
             remedy="repeat one, or let the noise be inferred",
         )
-    found = deviations(spread(channel, groups), channel.valid, groups)
-    return estimate_noise(*found, source=REPEATS, steps=steps[repeated(groups)], shared=None)
+    departures = deviations(departures_from_mean(channel, groups), channel.valid, groups)
+    return estimate_noise(*departures, source=REPEATS, steps=steps[repeated(groups)], shared=None)
 
 
 def repeat_shift(

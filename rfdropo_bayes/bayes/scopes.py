@@ -25,18 +25,13 @@ class Scopes:
     """The parameters of a model, and the value of each in each recording.
 
     Values and draws are mappings from labels, see `InferredParameter.name`.
-
-    Attributes:
-        parameters: inferred parameters in sampling order; a spread precedes its parameters.
-        specs: every parameter that a recording may have, by name.
-        fixed: fixed values, by label.
-        known: formerly inferred parameters whose values are now in ``fixed``.
     """
 
-    parameters: tuple[InferredParameter, ...]
+    parameters: tuple[InferredParameter, ...]  # inferred parameters in sampling order; a spread precedes its parameters
+    # every parameter that a recording may have, by name
     specs: Mapping[str, ParameterSpec] = field(default_factory=dict)
-    fixed: Mapping[str, float] = field(default_factory=dict)
-    known: tuple[InferredParameter, ...] = ()
+    fixed: Mapping[str, float] = field(default_factory=dict)  # fixed values, by label
+    known: tuple[InferredParameter, ...] = ()  # formerly inferred parameters whose values are now in ``fixed``
 
     @classmethod
     def read(
@@ -44,7 +39,7 @@ class Scopes:
         infos: Iterable[ParameterInfo],
         specs: Sequence[ParameterSpec],
         fixed: Mapping[str, float],
-        held: Sequence[tuple[ParameterInfo, float]] = (),
+        fixed_parameters: Sequence[tuple[ParameterInfo, float]] = (),
     ) -> Scopes:
         """The parameters of a posterior; `extended` has the recordings of each group.
 
@@ -52,7 +47,7 @@ class Scopes:
             infos: facts about the inferred parameters.
             specs: every parameter of the model.
             fixed: values known to the model.
-            held: parameters whose values the fit took for known.
+            fixed_parameters: parameters that the fit fixed, with their values.
 
         Raises:
             InputError: a parameter that the model lacks.
@@ -73,8 +68,10 @@ class Scopes:
             members = () if scope.group or not scope.owner else (scope.owner,)
             return InferredParameter.of(own, info.prior, scope, members, where="posterior")
 
-        known = {info.name: value for info, value in held}
-        return cls(tuple(map(read, infos)), by_name, {**fixed, **known}, tuple(read(info) for info, _ in held))
+        known = {info.name: value for info, value in fixed_parameters}
+        return cls(
+            tuple(map(read, infos)), by_name, {**fixed, **known}, tuple(read(info) for info, _ in fixed_parameters)
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -95,19 +92,19 @@ class Scopes:
         Parameters of other recordings are nominal. The sum of a shared value and a group's deviation is clipped to the
         parameter's hard bounds.
         """
-        found = {name: self.specs[name].nominal for name in self._partly if name in self.specs}
+        values_here = {name: self.specs[name].nominal for name in self._partly if name in self.specs}
         labels = {p.name for p in self.known}
-        found |= {name: value for name, value in self.fixed.items() if name not in labels}
+        values_here |= {name: value for name, value in self.fixed.items() if name not in labels}
         given = {**self.fixed, **values}
         every = [p for p in (*self.known, *self.parameters) if p.holds_for(recording)]
         own = [p for p in every if not p.scope.added_to]
-        found |= {p.spec.name: given[p.name] for p in own if not p.scope.owner}
-        found |= {p.spec.name: given[p.name] for p in own if p.scope.owner}
+        values_here |= {p.spec.name: given[p.name] for p in own if not p.scope.owner}
+        values_here |= {p.spec.name: given[p.name] for p in own if p.scope.owner}
         for p in every:
             if p.scope.added_to:
-                found[p.scope.added_to] = found[p.scope.added_to] + given[p.name]
+                values_here[p.scope.added_to] = values_here[p.scope.added_to] + given[p.name]
         ends = {name: self.specs[name] for name in self._summed if name in self.specs}
-        return found | {name: jnp.clip(found[name], spec.low, spec.high) for name, spec in ends.items()}
+        return values_here | {name: jnp.clip(values_here[name], spec.low, spec.high) for name, spec in ends.items()}
 
     @cached_property
     def _summed(self) -> frozenset[str]:
@@ -122,8 +119,8 @@ class Scopes:
     @cached_property
     def scales(self) -> dict[str, tuple[str, ...]]:
         """Labels of the parameters that are standard deviations of others, with the labels of these others."""
-        found = dict.fromkeys(p.scope.scaled_by for p in self.parameters if p.scope.scaled_by)
-        return {name: tuple(p.name for p in self.parameters if p.scope.scaled_by == name) for name in found}
+        scales = dict.fromkeys(p.scope.scaled_by for p in self.parameters if p.scope.scaled_by)
+        return {name: tuple(p.name for p in self.parameters if p.scope.scaled_by == name) for name in scales}
 
     @property
     def typical_scales(self) -> dict[str, float]:
@@ -133,11 +130,11 @@ class Scopes:
     @cached_property
     def groups_alone(self) -> dict[str, list[str]]:
         """Parameters that some groups have and others do not, with these groups."""
-        found: dict[str, list[str]] = {}
+        owners: dict[str, list[str]] = {}
         for p in self.parameters:
             if p.scope.group and not p.scope.added_to:
-                found.setdefault(p.spec.name, []).append(p.scope.owner)
-        return found
+                owners.setdefault(p.spec.name, []).append(p.scope.owner)
+        return owners
 
     @property
     def deviating(self) -> tuple[InferredParameter, ...]:
@@ -173,12 +170,12 @@ class Scopes:
         """
         known, shared = self.recordings_known(fitted), [p for p in self.parameters if not p.scope.owner]
         like: dict[str, tuple[str, ...]] = {p.name: (p.name,) for p in shared}
-        found = list(shared)
+        parameters = list(shared)
 
         def add(parameter: InferredParameter, owner: str, members: tuple[str, ...], sources: Iterable[str]) -> None:
             own = replace(parameter, scope=replace(parameter.scope, owner=owner), members=members)
             like[own.name] = tuple(sources)
-            found.append(own)
+            parameters.append(own)
 
         families: dict[str, list[InferredParameter]] = {}
         for p in self.parameters:
@@ -201,15 +198,16 @@ class Scopes:
             for name, p in kinds.items():
                 known_of = [q.name for q in self.deviating if (q.spec.name, q.scope.owner) == (name, group)]
                 add(p, group, members, known_of)
-        return Extension(replace(self, parameters=tuple(found)), like)
+        return Extension(replace(self, parameters=tuple(parameters)), like)
 
-    def of_day(
-        self, day: str, recordings: Sequence[str], fitted: Sequence[str], pooled: Mapping[str, Pooled]
+    def of_session(
+        self, session: str, recordings: Sequence[str], fitted: Sequence[str], pooled: Mapping[str, Pooled]
     ) -> Scopes:
         """The shared parameters, and the parameters of a session and its recordings.
 
         Args:
-            day: name of the session; recordings: its recordings.
+            session: name of the session.
+            recordings: its recordings.
             fitted: names of the fitted recordings.
             pooled: parameters that vary between sessions, also if they were shared in the fit.
 
@@ -222,7 +220,7 @@ class Scopes:
             return replace(p, scope=replace(p.scope, owner=owner), members=members)
 
         shared = [p for p in self.parameters if not p.scope.owner]
-        added = [own(p, day) for p in {p.spec.name: p for p in self.deviating}.values()]
+        added = [own(p, session) for p in {p.spec.name: p for p in self.deviating}.values()]
         spreads: list[InferredParameter] = []
         for name, each in pooled.items():
             if any(p.scope.added_to == name for p in added):
@@ -236,9 +234,11 @@ class Scopes:
                 )
             known = [p.name for p in [*shared, *spreads]]
             spreads += [p for p in spread_of(spec, each) if p.name not in known]
-            added += deviations(spec, replace(each, groups={day: members}))
+            added += deviations(spec, replace(each, groups={session: members}))
         added += [
-            own(p, day) for p in self.parameters if p.scope.group and not p.scope.added_to and p.scope.owner == day
+            own(p, session)
+            for p in self.parameters
+            if p.scope.group and not p.scope.added_to and p.scope.owner == session
         ]
         families: dict[str, list[InferredParameter]] = {}
         for p in self.parameters:
@@ -301,14 +301,10 @@ class Scopes:
 
 
 class Extension(NamedTuple):
-    """The parameters of new recordings.
+    """The parameters of new recordings."""
 
-    Attributes:
-        scopes: scopes with them instead of the fitted recordings' parameters.
-        like: labels of fitted parameters from which each takes its values; none for the deviation of a new group.
-    """
-
-    scopes: Scopes
+    scopes: Scopes  # scopes with them instead of the fitted recordings' parameters
+    # labels of fitted parameters from which each takes its values; none for the deviation of a new group
     like: Mapping[str, tuple[str, ...]]
 
 

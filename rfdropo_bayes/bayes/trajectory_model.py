@@ -32,19 +32,12 @@ Measured = Mapping[str, Float[Any, "..."]]
 
 @dataclass(frozen=True)
 class TrajectoryModel:
-    """The probabilistic program: priors, rollouts of the simulator, channels of measurements.
+    """The probabilistic program: priors, rollouts of the simulator, channels of measurements."""
 
-    Attributes:
-        simulator: anything that satisfies `Simulator`, mechanisms included.
-        scopes: inferred and fixed parameters, including the channels'.
-        recordings: commands and times of observation.
-        channels: measurement channels, `Markers` first.
-    """
-
-    simulator: Simulator
-    scopes: Scopes
-    recordings: RecordingSet
-    channels: tuple[Channel, ...]
+    simulator: Simulator  # anything that satisfies `Simulator`, mechanisms included
+    scopes: Scopes  # inferred and fixed parameters, including the channels'
+    recordings: RecordingSet  # commands and times of observation
+    channels: tuple[Channel, ...]  # measurement channels, `Markers` first
 
     @classmethod
     def of_positions(
@@ -223,8 +216,8 @@ class Programs:
             return jnp.stack([jnp.stack([jnp.asarray(row[name], float) for name in physical]) for row in rows])
 
         def features(seen: Seen) -> tuple[Array, Array]:
-            found = [c.features(c.expected(seen)) for c in model.compared]
-            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
+            columns = [c.features(c.expected(seen)) for c in model.compared]
+            return jnp.concatenate(columns, axis=-1), jnp.max(seen.observation.status)
 
         def of_seen(function: Callable, *axes: None) -> Callable:
             """A function of what is seen, compiled for batches of observations and of the values behind them."""
@@ -246,7 +239,7 @@ class Programs:
             # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
             steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
             above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
-            found = (above - below) / (2.0 * np.diag(steps)[:, None])
-            return 0.5 * (found + found.T)
+            matrix = (above - below) / (2.0 * np.diag(steps)[:, None])
+            return 0.5 * (matrix + matrix.T)
 
         self.prior_derivatives = (lambda u: gradient(u[None])[0]), hessian

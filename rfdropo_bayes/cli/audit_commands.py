@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -19,7 +19,7 @@ from rfdropo_bayes.cli.options import (
     see_calibration,
 )
 from rfdropo_bayes.cli.terminal_summary import say, show_audit
-from rfdropo_bayes.errors import InputError, Interrupted
+from rfdropo_bayes.errors import Interrupted
 
 Fit = Annotated[
     Path | None, typer.Option("--from", help="folder of an earlier calibration, to start the base model from")
@@ -67,38 +67,18 @@ def design(
     experiment: ExperimentFile,
     out: OutFolder = None,
     fit: Fit = None,
-    adapt: Annotated[
-        bool, typer.Option("--adapt", help="propose the shortest recording of a new session that rfdropo adapt needs")
-    ] = False,
-    seconds: Annotated[float, typer.Option(help="with --adapt: longest proposal, in seconds")] = 10.0,
-    group: Annotated[
-        str | None,
-        typer.Option(
-            "--group",
-            help="with --adapt: group whose limits of the drives hold in the new session; by default the last group",
-        ),
-    ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Propose commands that distinguish causes. Writes next_commands.csv and design.json."""
     see_calibration(fit, "--from")
-    if adapt and fit is None:
-        raise InputError("--adapt needs a calibration", where="--adapt", remedy="name its folder with --from")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
-    from rfdropo_bayes.results.calibrated import Calibration
     from rfdropo_bayes.results.designed import COMMANDS
     from rfdropo_bayes.verbs.design import design as propose
-    from rfdropo_bayes.verbs.design_day import design_day
 
-    model = Model.read(experiment, overrides)
-    options: dict[str, Any] = {"out": folder, "overwrite": overwrite, "show": True}
-    if adapt and fit is not None:
-        result = design_day(Calibration.of_posterior(fit, model), seconds=seconds, group=group, **options)
-    else:
-        result = propose(model, fit=fit, **options)
+    result = propose(Model.read(experiment, overrides), fit=fit, out=folder, overwrite=overwrite, show=True)
     commands = folder / COMMANDS
     content = {**result.content, "commands": str(commands)}
     say(content, result.sentence, f"commands: {commands}", as_json=as_json)

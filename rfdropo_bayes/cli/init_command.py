@@ -21,12 +21,10 @@ FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", *ANGLES, *PASCALS, *FORCES)
 FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
 """Lines of an experiment file whose values `init` may find from a recording."""
-MODELS = (".xml", ".urdf")
-"""Suffixes of models of other simulators, see `simulators.adapters`."""
+MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
 LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "disk_thickness", "cable_radius", "spool_radius")
-FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6}
-"""From the units of options to SI."""
+FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6}  # from the units of options to SI
 
 
 class Questions:

@@ -51,14 +51,14 @@ def train(
     folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.make_vec import with_training
-    from rfdropo_bayes.verbs.train import PAGE, POLICY, learnt
+    from rfdropo_bayes.verbs.train import PAGE, POLICY, training_sentence
     from rfdropo_bayes.verbs.train import train as learn
 
     model = Model.read(experiment, overrides)
     if fit is not None:
         model = with_training(model, {"randomisation": "posterior"})
     summary = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
-    done = f"after {summary['steps']} steps in {summary['seconds']:.0f} s: {learnt(summary)}"
+    done = f"after {summary['steps']} steps in {summary['seconds']:.0f} s: {training_sentence(summary)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
     lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
     say(summary, *lines, as_json=as_json)

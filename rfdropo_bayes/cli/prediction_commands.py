@@ -27,8 +27,7 @@ Episode = Annotated[int | None, typer.Option("--episode", help="number of the ep
 
 def predict(
     experiment: Annotated[
-        Path,
-        typer.Argument(metavar="EXPERIMENT.toml|DIR", help="the calibrated experiment, or a run's folder"),
+        Path, typer.Argument(metavar="EXPERIMENT.toml|DIR", help="the calibrated experiment, or a run's folder")
     ],
     commands: Annotated[str, typer.Option("--commands", help="file of commands, in the format of the experiment")],
     out: Annotated[Path, typer.Option("--out", help="folder to write to")],

@@ -16,9 +16,7 @@ JOURNAL, POSTERIOR = "cycles.bin", "posterior.nc"
 TO_VIEW = {"predict": "prediction.nc"}
 
 
-def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder that a run has written")],
-) -> None:
+def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder that a run has written")]) -> None:
     """Draw the page of a calibration or a motor session again. Lists the results of other runs."""
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder), remedy="name the folder that --out gave a run")

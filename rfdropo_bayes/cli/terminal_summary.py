@@ -134,8 +134,8 @@ def show_prediction(facts: Mapping[str, Any], *, as_json: bool) -> None:
     if facts["group_fitted"] is not None:
         values = "fitted" if facts["group_fitted"] else "not fitted: its values are drawn from the spread of groups"
         lines.append(f"group {facts['group']}, {values}")
-    if facts.get("unseen_day"):
-        lines.append(facts["unseen_day"])
+    if facts.get("unseen_session"):
+        lines.append(facts["unseen_session"])
     lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
     lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
     say(facts, *lines, as_json=as_json)

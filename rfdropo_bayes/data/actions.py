@@ -28,32 +28,6 @@ def cumulative_displacement(actions: Int[np.ndarray, " n"]) -> Float[np.ndarray,
     return change.cumsum(axis=0)
 
 
-def actions_of(command: Float[np.ndarray, "n 8"], initial: Float[np.ndarray, " 8"]) -> Int[np.ndarray, " n"]:
-    """Actions after which the commanded displacements [m] are these; the inverse of `cumulative_displacement`."""
-    change = np.diff(command, axis=0, prepend=initial[None])
-    cable = np.argmax(np.abs(change), axis=1)
-    return cable + np.where(change[np.arange(len(cable)), cable] < 0.0, CABLES, 0)
-
-
-def actions_towards(target: Float[np.ndarray, "n 8"], initial: Float[np.ndarray, " 8"]) -> Int[np.ndarray, " m"]:
-    """At most one action per row, each of which brings the cable that is farthest from its target [m] nearer.
-
-    No cable passes its target. Once all cables are within an action of their targets, the next targets apply; the
-    actions end after the last targets.
-    """
-    level, row, actions = np.array(initial, dtype=float), 0, list[int]()
-    while row < len(target) and len(actions) < len(target):
-        off = target[row] - level
-        cable = int(np.argmax(np.abs(off)))
-        if abs(off[cable]) < DISPLACEMENT * (1.0 - 1e-6):
-            row += 1
-            continue
-        actions.append(cable if off[cable] > 0.0 else cable + CABLES)
-        level[cable] += np.copysign(DISPLACEMENT, off[cable])
-        row = max(row, len(actions))
-    return np.array(actions, dtype=int)
-
-
 def read_actions(column: Float[np.ndarray, " rows"], where: str) -> Int[np.ndarray, " n"]:
     """Actions of an episode whose first row is the initial state; more such rows may follow before the first action.
 

@@ -22,8 +22,7 @@ DIMS: dict[str, tuple[str, ...]] = {
     "object_pose": ("time", "pose"),
     "orientation": ("time", "section", "quaternion"),
 }
-GAPPED = frozenset({"object_pose", "orientation"})
-"""Quantities that may be missing in a row."""
+GAPPED = frozenset({"object_pose", "orientation"})  # quantities that may be missing in a row
 MASKS = frozenset({"position_mask", "tension_mask", "motor_angle_mask"})
 _LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres taken for metres always do
 _SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are

@@ -7,16 +7,11 @@ from jaxtyping import Float
 
 REGULAR, NEAR = 0.7, 0.25
 """Commands come regularly if this share of their intervals is as near to the median, as a share of it."""
-FEWEST = 10
-"""Least number of intervals that give a rate."""
-HOLE = 4.0
-"""Multiple of the usual interval above which an interval is noted."""
-LOST = 0.04
-"""Share of commands that are lost one by one, at or above which they are noted."""
-ALTERNATING = 8
-"""Commands in a row that go to and fro between two others, at or above which two programs are suspected."""
-SAME = 0.2
-"""Share of a change of command within which the command after the next one counts as equal."""
+FEWEST = 10  # least number of intervals that give a rate
+HOLE = 4.0  # multiple of the usual interval above which an interval is noted
+LOST = 0.04  # share of commands that are lost one by one, at or above which they are noted
+ALTERNATING = 8  # commands in a row that go to and fro between two others, at or above which two programs are suspected
+SAME = 0.2  # share of a change of command within which the command after the next one counts as equal
 
 
 def command_notes(time: Float[np.ndarray, " command"], command: Float[np.ndarray, "command channel"]) -> list[str]:

@@ -15,46 +15,30 @@ from jaxtyping import Float
 
 SHORT, LONG = 0.35, 0.6
 """Steps of a counter that wraps are shorter or longer than these shares of a turn, and none lies between."""
-FEWEST = 5
-"""Short steps that are needed to distinguish a turn from a command that jumps."""
-SEVERAL = 2
-"""Jumps that it takes to believe in a turn of no known counter."""
-EXCEPTIONAL = 3.0
-"""Multiple of the 95 % quantile of step sizes above which a step may be a restart."""
+FEWEST = 5  # short steps that are needed to distinguish a turn from a command that jumps
+SEVERAL = 2  # jumps that it takes to believe in a turn of no known counter
+EXCEPTIONAL = 3.0  # multiple of the 95 % quantile of step sizes above which a step may be a restart
 BETTER, MUCH_BETTER = 0.9, 0.5
 """Ratio of the errors without and with the jumps of a turn, and of a restart, below which markers did not follow."""
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.4)  # [s] of the markers after the commands
 ROWS = 4000  # that a regression looks at, at most
-POWERS = tuple(2.0**k for k in range(8, 33))
-"""Turns of counters in whole numbers."""
+POWERS = tuple(2.0**k for k in range(8, 33))  # turns of counters in whole numbers
 
 
 class Wraps(NamedTuple):
-    """Jumps of one column.
+    """Jumps of one column."""
 
-    Attributes:
-        rows: after the jumps.
-        turn: turn of the counter, in the unit of the column.
-        known: whether this is the turn of a known counter; else it is estimated from the jumps.
-    """
-
-    rows: tuple[int, ...]
-    turn: float
-    known: bool
+    rows: tuple[int, ...]  # after the jumps
+    turn: float  # turn of the counter, in the unit of the column
+    known: bool  # whether this is the turn of a known counter; else it is estimated from the jumps
 
 
 class Column(NamedTuple):
-    """One column of a file.
+    """One column of a file."""
 
-    Attributes:
-        name: name in the file.
-        values: one value per row; NaN if missing.
-        turns: possible turns of counters in this unit.
-    """
-
-    name: str
-    values: Float[np.ndarray, " rows"]
-    turns: Sequence[float]
+    name: str  # name in the file
+    values: Float[np.ndarray, " rows"]  # one value per row; NaN if missing
+    turns: Sequence[float]  # possible turns of counters in this unit
 
 
 class Motion(NamedTuple):
@@ -169,8 +153,7 @@ def find_restart(columns: Sequence[Column], motion: Motion) -> Restart | None:
         return None
     names = [column.name for column in columns]
     return Restart(
-        row + 1,
-        {names[k]: (float(values[row, k]), float(values[row + 1, k])) for k in np.flatnonzero(moved)},
+        row + 1, {names[k]: (float(values[row, k]), float(values[row + 1, k])) for k in np.flatnonzero(moved)}
     )
 
 

@@ -12,10 +12,8 @@ from rfdropo_bayes.errors import InputError
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 """In the order in which they are preferred; a space stands for any number of spaces and tabs."""
-SAMPLED = 40
-"""Rows that are tried with each separator."""
-MOST_SHOWN = 120
-"""Letters of a row that an error shows."""
+SAMPLED = 40  # rows that are tried with each separator
+MOST_SHOWN = 120  # letters of a row that an error shows
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)|na|null|none", re.IGNORECASE)
 _COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _DATE = re.compile(r"\d{4}-\d\d-\d\d([T ].*)?|\d+:\d\d(:\d\d)?([.,]\d+)?")

@@ -19,10 +19,8 @@ from rfdropo_bayes.data.csv_layout import SAMPLED, cells_of, dialect_of, header_
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
-HEAD = 100_000
-"""Letters of a file that hold its first rows."""
-MOTIVE = "Format Version"
-"""How the first line of an export of Motive's begins."""
+HEAD = 100_000  # letters of a file that hold its first rows
+MOTIVE = "Format Version"  # how the first line of an export of Motive's begins
 
 
 def closest(name: str, known: Sequence[str]) -> str:

@@ -179,8 +179,7 @@ def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
     }
 
 
-_UNITS = {"position": "m", "command": "m", "time": "s"}
-"""Units of a data set's variables if they state none."""
+_UNITS = {"position": "m", "command": "m", "time": "s"}  # units of a data set's variables if they state none
 
 
 def _further_units(stated: Mapping[str, str], where: str) -> dict[str, tuple[str, dict[str, float]]]:

@@ -26,8 +26,7 @@ TIME = "timestamp"
 INDICES = ("episode_index", "frame_index")
 NUMBERS = ("float", "int", "uint", "bool")
 VERSIONS = ("v2.", "v3.")
-ROUNDING = 1e-6
-"""Relative error of times in single precision."""
+ROUNDING = 1e-6  # relative error of times in single precision
 
 
 class _Episode(NamedTuple):

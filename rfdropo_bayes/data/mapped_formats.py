@@ -18,8 +18,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import changed
 
 MAPPED = (named_columns.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT, *named_arrays.FORMATS)
-FOLDERS = (rosbag.FORMAT, lerobot.FORMAT)
-"""Formats in which a recording, or several, may be a folder."""
+FOLDERS = (rosbag.FORMAT, lerobot.FORMAT)  # formats in which a recording, or several, may be a folder
 _MAGIC = {b"#ROSBAG": rosbag.FORMAT, b"\x89MCAP0": rosbag.FORMAT, b"SQLite format 3\x00": rosbag.FORMAT}
 
 

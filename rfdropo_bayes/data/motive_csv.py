@@ -28,15 +28,10 @@ PASSED_OVER = "passed over"
 
 
 class MotiveFile(NamedTuple):
-    """A take.
+    """A take."""
 
-    Attributes:
-        table: times [s], positions in the file's unit, and rotations.
-        length_unit: "m", "cm" or "mm"; None if the header does not state it.
-    """
-
-    table: CsvTable
-    length_unit: str | None
+    table: CsvTable  # times [s], positions in the file's unit, and rotations
+    length_unit: str | None  # "m", "cm" or "mm"; None if the header does not state it
 
 
 def read_motive(path: Path) -> MotiveFile:

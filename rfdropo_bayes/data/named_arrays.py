@@ -22,8 +22,7 @@ from rfdropo_bayes.errors import InputError
 MAT, NPZ = "mat", "npz"
 FORMATS = (MAT, NPZ)
 MATLAB, ZIP, HDF5 = b"MATLAB", b"PK\x03\x04", b"\x89HDF\r\n\x1a\n"
-NUMBERS = "biufMm"
-"""Kinds of arrays that are read: numbers, dates and durations."""
+NUMBERS = "biufMm"  # kinds of arrays that are read: numbers, dates and durations
 
 
 def array_format(path: Path, first: bytes) -> str | None:

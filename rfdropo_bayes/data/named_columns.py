@@ -39,17 +39,14 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     **{name: ("Pa", factor) for name, factor in PASCALS.items()},
     **dict.fromkeys(("-", "V", "A", "%"), ("-", 1.0)),
 }
-COUNTS = "counts"
-"""Encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known."""
+COUNTS = "counts"  # encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known
 CommandUnit = Literal[
     "m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "MPa", "mbar", "bar", "psi", "V", "A", "%", "-"
 ]
 
 
-ROWS = "rows"
-"""Stands for a column of times if rows have no times: the row number counts."""
-ROW_SECONDS = 1.0
-"""Nominal time from row to row [s] of rows without times."""
+ROWS = "rows"  # stands for a column of times if rows have no times: the row number counts
+ROW_SECONDS = 1.0  # nominal time from row to row [s] of rows without times
 UNTIMED = "rows have no times: one a second is assumed, which means nothing but for poses at rest"
 
 
@@ -88,13 +85,10 @@ class CsvColumns(BaseModel):
         '"rosbag": "header", stamps if messages have them, or "log", the recorder\'s times',
     )
     time_unit: TimeUnit = Field(
-        default="s",
-        description='unit of the times; dates, durations, "rosbag" and "motive-csv" need no unit',
+        default="s", description='unit of the times; dates, durations, "rosbag" and "motive-csv" need no unit'
     )
     sample_time: float | None = Field(
-        default=None,
-        gt=0,
-        description="time between rows [s], if no column has times, or only times of arrival",
+        default=None, gt=0, description="time between rows [s], if no column has times, or only times of arrival"
     )
     commands: list[str] = Field(
         min_length=1,

@@ -26,47 +26,29 @@ MISSING = "missing_readings"  # among the settings: how many tensions, motor ang
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a recording.
+    """Origin of a recording."""
 
-    Attributes:
-        name: name of the recording in reports.
-        robot: name of the robot description; empty if the file does not state it.
-        format: format of the file, as in an experiment's [data].
-        synthetic: whether a simulator made it.
-        provenance: file or creation of the recording, in words.
-        frame: frame of the positions, in words.
-        settings: facts about the recording that a model may need (JSON); with a ``motor_angle_hold`` [s], only new
-            motor angles are used (`held_readings`).
-    """
-
-    name: str
-    robot: str
-    format: str
-    synthetic: bool = False
-    provenance: str = ""
-    frame: str = "robot base: x, y across, z along the axis away from the base"
+    name: str  # name of the recording in reports
+    robot: str  # name of the robot description; empty if the file does not state it
+    format: str  # format of the file, as in an experiment's [data]
+    synthetic: bool = False  # whether a simulator made it
+    provenance: str = ""  # file or creation of the recording, in words
+    frame: str = "robot base: x, y across, z along the axis away from the base"  # frame of the positions, in words
+    # facts about the recording that a model may need (JSON); with a ``motor_angle_hold`` [s], only new motor angles are
+    # used (`held_readings`)
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class SentCommands:
-    """Commands as they were sent, cumulative, pull > 0, each in force until the next.
+    """Commands as they were sent, cumulative, pull > 0, each in force until the next."""
 
-    Attributes:
-        command_time: start time of each command [s], on the clock of the observations.
-        command: values, unclipped.
-        command_unit: "m" of cable or "rad" of a motor.
-        cable_names: names of the channels.
-        initial_command: command before the first; zero by default.
-        largest: largest plausible command, in their unit; None for the default limits.
-    """
-
-    command_time: Float[np.ndarray, " command_time"]
-    command: Float[np.ndarray, "command_time cable"]
-    command_unit: str
-    cable_names: Sequence[str]
-    initial_command: Float[np.ndarray, " cable"] | None = None
-    largest: float | None = None
+    command_time: Float[np.ndarray, " command_time"]  # start time of each command [s], on the clock of the observations
+    command: Float[np.ndarray, "command_time cable"]  # values, unclipped
+    command_unit: str  # "m" of cable or "rad" of a motor
+    cable_names: Sequence[str]  # names of the channels
+    initial_command: Float[np.ndarray, " cable"] | None = None  # command before the first; zero by default
+    largest: float | None = None  # largest plausible command, in their unit; None for the default limits
 
     def of_poses(self) -> SentCommands:
         """The same of rows whose poses belong to their own commands: a command acts from half-way between its row and
@@ -84,29 +66,18 @@ class SentCommands:
 
 @dataclass(frozen=True)
 class Measured:
-    """Observations; NaN marks missing tensions, motor angles and poses.
+    """Observations; NaN marks missing tensions, motor angles and poses."""
 
-    Attributes:
-        time: times of the observations [s]; the first becomes 0.
-        position: positions of the markers in the robot's base frame [m].
-        marker_names: base to tip.
-        position_mask: False for a recording fault; all True by default.
-        tension: cable tensions [N].
-        motor_angle: motor angles [rad].
-        object_pose: centre [m] and unit quaternion x, y, z, w of a pushed body.
-        orientation: orientations of sections, unit quaternions x, y, z, w from the base's axes to the section's.
-        section_names: names of these sections.
-    """
-
-    time: Float[np.ndarray, " time"]
-    position: Float[np.ndarray, "time marker 3"]
-    marker_names: Sequence[str]
-    position_mask: Bool[np.ndarray, "time marker"] | None = None
-    tension: Float[np.ndarray, "time cable"] | None = None
-    motor_angle: Float[np.ndarray, "time cable"] | None = None
-    object_pose: Float[np.ndarray, "time 7"] | None = None
+    time: Float[np.ndarray, " time"]  # times of the observations [s]; the first becomes 0
+    position: Float[np.ndarray, "time marker 3"]  # positions of the markers in the robot's base frame [m]
+    marker_names: Sequence[str]  # base to tip
+    position_mask: Bool[np.ndarray, "time marker"] | None = None  # False for a recording fault; all True by default
+    tension: Float[np.ndarray, "time cable"] | None = None  # cable tensions [N]
+    motor_angle: Float[np.ndarray, "time cable"] | None = None  # motor angles [rad]
+    object_pose: Float[np.ndarray, "time 7"] | None = None  # centre [m] and unit quaternion x, y, z, w of a pushed body
+    # orientations of sections, unit quaternions x, y, z, w from the base's axes to the section's
     orientation: Float[np.ndarray, "time section 4"] | None = None
-    section_names: Sequence[str] = ()
+    section_names: Sequence[str] = ()  # names of these sections
 
 
 class Recorded(NamedTuple):

@@ -40,8 +40,7 @@ ELEMENT_NAMES = ("child_frame_id", "rigid_body_name", "marker_name", "name", "ma
 LISTS_OF_NAMES = ("name", "names", "joint_names", "interface_names")
 """Fields that name the elements of the message's other lists, e.g. of JointState and DynamicJointState."""
 PASSED_OVER = ("header", "layout")
-LARGEST_LIST = 256
-"""Longer lists are pictures, scans and clouds of points."""
+LARGEST_LIST = 256  # longer lists are pictures, scans and clouds of points
 
 
 class _Reading(NamedTuple):

@@ -28,8 +28,7 @@ ONE_RATE = 1.1  # times between rows that differ by less are of the same rate: c
 GRAIN = 0.02  # of the usual interval: coarser stamps of single precision are reported
 ON_GRID = 0.2  # of the grain: largest distance of rounded stamps from single precision
 SLOWEST, FASTEST = 1.0, 2e-4  # [s] between rows: range of recordings of a moving robot
-ANEW = 10.0
-"""Gaps by which a clock that is set back has begun anew; by less, rows changed places."""
+ANEW = 10.0  # gaps by which a clock that is set back has begun anew; by less, rows changed places
 SET_BACK = 0.01  # largest share of rows out of order after a clock that was set back; else rows are not sorted
 
 

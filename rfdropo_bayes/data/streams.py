@@ -22,24 +22,16 @@ from rfdropo_bayes.data.csv_table import closest
 from rfdropo_bayes.data.recorded import continuous_quaternions
 from rfdropo_bayes.errors import InputError
 
-ADJACENT = 1.5
-"""Largest gap between neighbouring readings, in rows; a gap of two rows means a lost reading."""
+ADJACENT = 1.5  # largest gap between neighbouring readings, in rows; a gap of two rows means a lost reading
 
 
 class Stream(NamedTuple):
-    """Readings that share their times.
+    """Readings that share their times."""
 
-    Attributes:
-        name: name of the topic, and of the element if elements have their own times.
-        time: increasing times [s].
-        values: a column for each quantity, by its full name; NaN if a message has none.
-        frames: coordinate frames that the messages name.
-    """
-
-    name: str
-    time: Float[np.ndarray, " reading"]
-    values: pd.DataFrame
-    frames: frozenset[str] = frozenset()
+    name: str  # name of the topic, and of the element if elements have their own times
+    time: Float[np.ndarray, " reading"]  # increasing times [s]
+    values: pd.DataFrame  # a column for each quantity, by its full name; NaN if a message has none
+    frames: frozenset[str] = frozenset()  # coordinate frames that the messages name
 
 
 def in_order(name: str, time: Float[np.ndarray, " reading"], values: pd.DataFrame, frames: frozenset[str]) -> Stream:

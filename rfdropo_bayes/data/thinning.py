@@ -7,18 +7,14 @@ import numpy as np
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
 
-MANY = 20_000
-"""Number of rows at or above which a thinned copy is examined in place of a recording."""
-LOOKED_AT = 50_000
-"""Rows that show which rate a motion needs."""
+MANY = 20_000  # number of rows at or above which a thinned copy is examined in place of a recording
+LOOKED_AT = 50_000  # rows that show which rate a motion needs
 LIKE_NOISE, CLOSE = 1.6, 5e-3
 """Limits of the interpolation error between rows: a multiple of the error between every second row, and a share of the
 spread of the markers.
 """
-UNRESOLVED = 0.2
-"""Share of the spread by which every second row is missed in a motion that needs every row."""
-SLOWEST = 0.1
-"""Longest time between rows [s] that is offered."""
+UNRESOLVED = 0.2  # share of the spread by which every second row is missed in a motion that needs every row
+SLOWEST = 0.1  # longest time between rows [s] that is offered
 FACTORS = tuple(digit * 10**power for power in range(4) for digit in (1, 2, 5))
 
 

@@ -110,12 +110,7 @@ class Trajectory:
 
     @classmethod
     def from_pandas(
-        cls,
-        frame: Any,
-        columns: CsvColumns | Mapping[str, Any],
-        name: str = "recording",
-        *,
-        mask_missing: bool = True,
+        cls, frame: Any, columns: CsvColumns | Mapping[str, Any], name: str = "recording", *, mask_missing: bool = True
     ) -> Trajectory:
         """A recording from a table.
 

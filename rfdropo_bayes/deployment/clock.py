@@ -114,17 +114,11 @@ def steady_interpreter() -> Iterator[None]:
 
 
 class Jitter(NamedTuple):
-    """Lateness of the cycles of an idle loop.
+    """Lateness of the cycles of an idle loop."""
 
-    Attributes:
-        fifo: whether the system permitted real-time scheduling.
-        lateness: lateness of each cycle [s].
-        missed: skipped cycles.
-    """
-
-    fifo: bool
-    lateness: Float[np.ndarray, " cycles"]
-    missed: int
+    fifo: bool  # whether the system permitted real-time scheduling
+    lateness: Float[np.ndarray, " cycles"]  # lateness of each cycle [s]
+    missed: int  # skipped cycles
 
 
 def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:

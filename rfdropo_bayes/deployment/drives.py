@@ -451,19 +451,12 @@ def drives_of(
 
 
 class Guards(NamedTuple):
-    """Guards between master and drives.
+    """Guards between master and drives."""
 
-    Attributes:
-        master_node: node number under which the master sends heartbeats.
-        master_timeout_s: drives quick-stop if no heartbeat came for this long.
-        drive_heartbeat_s: time between heartbeats of a drive.
-        following_error_m, following_time_s: a drive faults if it lags behind its set-point by this length for this
-            time.
-    """
-
-    master_node: int = 127
-    master_timeout_s: float = 0.06
-    drive_heartbeat_s: float = 0.015
+    master_node: int = 127  # node number under which the master sends heartbeats
+    master_timeout_s: float = 0.06  # drives quick-stop if no heartbeat came for this long
+    drive_heartbeat_s: float = 0.015  # time between heartbeats of a drive
+    # following_error_m, following_time_s: a drive faults if it lags behind its set-point by this length for this time
     following_error_m: float = 0.005
     following_time_s: float = 0.05
 

@@ -25,8 +25,7 @@ SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 POLL = 0.005  # [s]
 STOP_KEYS = b" \x1bqQ\n\r"
 
-Hook = Callable[[], bool | str]
-"""Returns True, or a word for the log, while a button is pressed."""
+Hook = Callable[[], bool | str]  # returns True, or a word for the log, while a button is pressed
 
 
 def file_hook(path: Path, pressed: str) -> Hook:

@@ -115,10 +115,7 @@ class Node:
             received, sent: numbers of the RPDOs and TPDOs that stay.
             name: name for messages.
         """
-        for index, maps, used in (
-            (Object.RPDO, self.remote.rpdo, received),
-            (Object.TPDO, self.remote.tpdo, sent),
-        ):
+        for index, maps, used in ((Object.RPDO, self.remote.rpdo, received), (Object.TPDO, self.remote.tpdo, sent)):
             for number in set(maps) - used:
                 cob = self.read(index + number - 1, 1, name)
                 if not cob & objects.PDO_INVALID:

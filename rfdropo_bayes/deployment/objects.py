@@ -80,12 +80,10 @@ def first_axis(index: int) -> tuple[int, int]:
 PDO_INVALID = 1 << 31
 CSP_BIT = 1 << 7  # of 0x6502
 
-SETPOINT_MAP = ((Object.CONTROLWORD, 0, 16), (Object.TARGET_POSITION, 0, 32))
-"""First RPDO: applied on SYNC."""
+SETPOINT_MAP = ((Object.CONTROLWORD, 0, 16), (Object.TARGET_POSITION, 0, 32))  # first RPDO: applied on SYNC
 COMMAND_MAP = ((Object.CONTROLWORD, 0, 16),)
 """Second RPDO: the controlword alone, applied at once, so that a stop needs no SYNC."""
-STATUS_MAP = ((Object.STATUSWORD, 0, 16), (Object.POSITION, 0, 32), (Object.TORQUE, 0, 16))
-"""First TPDO: sent on SYNC."""
+STATUS_MAP = ((Object.STATUSWORD, 0, 16), (Object.POSITION, 0, 32), (Object.TORQUE, 0, 16))  # first TPDO: sent on SYNC
 
 SETPOINT, COMMAND, STATUS = struct.Struct("<Hi"), struct.Struct("<H"), struct.Struct("<Hih")
 EMERGENCY = struct.Struct("<HB5s")
@@ -94,7 +92,7 @@ NMT, SYNC = 0x000, 0x080
 EMCY, TPDO1, RPDO1, RPDO2, HEARTBEAT = 0x080, 0x180, 0x200, 0x300, 0x700
 """Identifiers of the predefined connection set, to which the node is added."""
 _PREDEFINED = ((RPDO1, RPDO2, TPDO1), (0x400, 0x500, 0x280))  # of the first axis, and of the second
-_FREE = range(0x680, 0x6E0)  # CiA 301 gives them to nobody
+_FREE = range(0x680, 0x6E0)  # ciA 301 gives them to nobody
 
 
 class Identifiers(NamedTuple):

@@ -31,44 +31,27 @@ from rfdropo_bayes.robots.policy_layout import (
     PolicyLayout,
 )
 
-METADATA = "rfdropo_layout"
-"""Key of the layout in the metadata of the ONNX file."""
+METADATA = "rfdropo_layout"  # key of the layout in the metadata of the ONNX file
 
 
 class PolicyScene(NamedTuple):
-    """Inputs that a policy may see.
+    """Inputs that a policy may see."""
 
-    Attributes:
-        position: newest known position of each marker [m].
-        moved: displacement of each marker since the last act [m].
-        command: present command [command unit].
-        length: measured cable length on each drum [m].
-        tension: tension of each cable [N].
-        object_pose: newest known centre [m] and unit quaternion x, y, z, w of the pushed object.
-    """
-
-    position: Float[np.ndarray, "marker 3"]
-    moved: Float[np.ndarray, "marker 3"]
-    command: Float[np.ndarray, " channel"]
-    length: Float[np.ndarray, " channel"]
-    tension: Float[np.ndarray, " channel"]
-    object_pose: Float[np.ndarray, "7"]
+    position: Float[np.ndarray, "marker 3"]  # newest known position of each marker [m]
+    moved: Float[np.ndarray, "marker 3"]  # displacement of each marker since the last act [m]
+    command: Float[np.ndarray, " channel"]  # present command [command unit]
+    length: Float[np.ndarray, " channel"]  # measured cable length on each drum [m]
+    tension: Float[np.ndarray, " channel"]  # tension of each cable [N]
+    object_pose: Float[np.ndarray, "7"]  # newest known centre [m] and unit quaternion x, y, z, w of the pushed object
 
 
 class Pull(NamedTuple):
-    """Tensions in the evaluation for which a policy was selected.
+    """Tensions in the evaluation for which a policy was selected."""
 
-    Attributes:
-        peak: largest tension of a cable, including the overshoot over the limit [N]; NaN if not recorded.
-        limit: tension at which an episode is stopped [N]; infinite without a limit.
-        stopped: number of stopped episodes.
-        episodes: number of episodes.
-    """
-
-    peak: float
-    limit: float
-    stopped: int
-    episodes: int
+    peak: float  # largest tension of a cable, including the overshoot over the limit [N]; NaN if not recorded
+    limit: float  # tension at which an episode is stopped [N]; infinite without a limit
+    stopped: int  # number of stopped episodes
+    episodes: int  # number of episodes
 
     @classmethod
     def told(cls, facts: Mapping[str, str]) -> Pull:

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import DATAGRAM, MAGIC
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
@@ -21,20 +20,13 @@ POSE = 7  # numbers: centre, and quaternion x, y, z, w
 
 
 class Sighting(NamedTuple):
-    """The newest frame of markers.
+    """The newest frame of markers."""
 
-    Attributes:
-        number: rises with every frame; 0 before the first.
-        time: time of arrival [s, monotonic].
-        position: positions of the markers in the robot's base frame [m].
-        seen: False for a lost marker, whose position is then invalid.
-        object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen.
-    """
-
-    number: int
-    time: float
-    position: Float[np.ndarray, "marker 3"]
-    seen: Bool[np.ndarray, " marker"]
+    number: int  # rises with every frame; 0 before the first
+    time: float  # time of arrival [s, monotonic]
+    position: Float[np.ndarray, "marker 3"]  # positions of the markers in the robot's base frame [m]
+    seen: Bool[np.ndarray, " marker"]  # False for a lost marker, whose position is then invalid
+    # centre [m] and unit quaternion x, y, z, w of the pushed object; None if it was not seen
     object_pose: Float[np.ndarray, "7"] | None = None
 
 
@@ -153,35 +145,6 @@ class SimulatedMarkers:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-class RecordedMarkers:
-    """The markers of a recording at the pace at which they were seen; time starts with the first call.
-
-    Read recordings with the importers of `data` ("csv", "optitrack-csv", ...).
-    """
-
-    def __init__(self, recording: Trajectory, robot: Robot) -> None:
-        if recording.marker_names != robot.marker_names:
-            raise InputError(
-                f"has markers {', '.join(recording.marker_names)}; the robot has {', '.join(robot.marker_names)}",
-                where=recording.name,
-                remedy="play a recording of this robot",
-            )
-        self._recording = recording
-        self._start: float | None = None
-
-    def latest(self) -> Sighting:
-        """The row that is due; the last row is repeated."""
-        now = time.monotonic()
-        self._start = now if self._start is None else self._start
-        row = int(np.searchsorted(self._recording.time, now - self._start, side="right")) - 1
-        at, poses = self._start + float(self._recording.time[row]), self._recording.object_pose
-        pose = None if poses is None or not np.all(np.isfinite(poses[row])) else poses[row]
-        return Sighting(row + 1, at, self._recording.position[row], self._recording.position_mask[row], pose)
-
-    def close(self) -> None:
-        """Nothing to let go of."""
 
 
 class NatNetMarkers:

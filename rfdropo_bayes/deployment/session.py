@@ -31,13 +31,7 @@ from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals,
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
 from rfdropo_bayes.deployment.loop import ControlLoop, Phase, Snapshot
-from rfdropo_bayes.deployment.policy import (
-    CommandSource,
-    OnnxPolicy,
-    RecordedCommands,
-    pulls_too_hard,
-    replay_rate,
-)
+from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands, pulls_too_hard, replay_rate
 from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
@@ -62,22 +56,15 @@ class Mode(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """End of a session.
+    """End of a session."""
 
-    Attributes:
-        cause, detail: reason of the end, and one line about it.
-        folder: folder with the session's files.
-        figures: lateness, misses, the policy's time, the time to a stop; as in summary.json.
-        drives: identity of each drive as read at the check.
-        without: objects that each drive lacks, with the consequence of each.
-    """
-
+    # cause, detail: reason of the end, and one line about it
     cause: Cause
     detail: str
-    folder: Path
-    figures: dict[str, Any]
-    drives: dict[str, dict[str, int]]
-    without: dict[str, list[str]]
+    folder: Path  # folder with the session's files
+    figures: dict[str, Any]  # lateness, misses, the policy's time, the time to a stop; as in summary.json
+    drives: dict[str, dict[str, int]]  # identity of each drive as read at the check
+    without: dict[str, list[str]]  # objects that each drive lacks, with the consequence of each
 
     @property
     def finished(self) -> bool:
@@ -141,13 +128,7 @@ class _Session:
     """State of one `deploy` call; the stack closes everything that was opened."""
 
     def __init__(
-        self,
-        settings: Deployment,
-        mode: Mode,
-        robot: Robot,
-        out: Path,
-        simulated: bool,
-        stack: contextlib.ExitStack,
+        self, settings: Deployment, mode: Mode, robot: Robot, out: Path, simulated: bool, stack: contextlib.ExitStack
     ) -> None:
         self.settings, self.mode, self.robot, self.out = settings, mode, robot, out
         self.simulated, self._stack = simulated, stack
@@ -208,13 +189,7 @@ class _Session:
         motors = self._motors()
         guards = settings.safety.guards([motor.node for motor in motors])
         drives = drives_of(
-            self.network,
-            motors,
-            self.offsets,
-            identity.eds,
-            identity.answer_s,
-            identity.units,
-            identity.unguarded,
+            self.network, motors, self.offsets, identity.eds, identity.answer_s, identity.units, identity.unguarded
         )
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:

@@ -19,16 +19,11 @@ _COUNTS = ("counts/s", "counts/s2")
 
 
 class Units(NamedTuple):
-    """Units of a drive's objects, as its owner states them; None leaves them to the drive, then to the standard.
+    """Units of a drive's objects, as its owner states them; None leaves them to the drive, then to the standard."""
 
-    Attributes:
-        torque: unit of 0x6076, the rated torque.
-        speed: unit of 0x6080, the greatest speed; rpm by the standard.
-        acceleration: unit of 0x6085, the deceleration of a quick stop; from 0x60AA by default, else counts/s2.
-    """
-
-    torque: TorqueUnit = "mN m"
-    speed: SpeedUnit | None = None
+    torque: TorqueUnit = "mN m"  # unit of 0x6076, the rated torque
+    speed: SpeedUnit | None = None  # unit of 0x6080, the greatest speed; rpm by the standard
+    # unit of 0x6085, the deceleration of a quick stop; from 0x60AA by default, else counts/s2
     acceleration: AccelerationUnit | None = None
 
 
@@ -160,10 +155,8 @@ def _agree(value: float, expected: float) -> bool:
     return abs(value - expected) <= 0.02 * expected + 1.0  # drives round to whole units
 
 
-POSITION_REVERSED = 1 << 7
-"""Bit of object 0x607E."""
-COUNTER = -(2**31), 2**31 - 1
-"""Least and greatest position of 32 bits."""
+POSITION_REVERSED = 1 << 7  # bit of object 0x607E
+COUNTER = -(2**31), 2**31 - 1  # least and greatest position of 32 bits
 
 
 def check_polarity(word: int, where: str) -> None:

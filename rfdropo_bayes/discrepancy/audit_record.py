@@ -33,12 +33,7 @@ SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation h
 
 
 def record(
-    answer: Answer,
-    *,
-    versions: dict[str, str],
-    data_sha256: str,
-    next_experiment: Any,
-    doubts: Sequence[Caution] = (),
+    answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any, doubts: Sequence[Caution] = ()
 ) -> dict[str, Any]:
     """Results of an audit with the keys of /audit.json/; lengths in mm if a key ends in mm.
 

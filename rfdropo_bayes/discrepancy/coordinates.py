@@ -33,23 +33,17 @@ Moved = Callable[[Float[Any, "n moved"]], tuple[Float[Any, "n moved"], Float[Any
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Parameters as one vector x.
+    """Parameters as one vector x."""
 
-    Attributes:
-        space: every parameter, base first; each with its prior.
-        base: number of base parameters.
-        physical: names of the simulator's parameters, in the order of rollouts; a sum of a shared value and a group's
-            deviation is clipped to their hard bounds.
-        widening: factor by which prior and unit of each coordinate are wider than its parameter's prior; empty for
-            none.
-        draws: draws of each parameter's prior, and ``moved``, values and derivatives of the parameters that move in
-            unconstrained coordinates, compiled. Copies share both: computing them takes as long as a refit's rollouts.
-    """
-
-    space: Scopes
-    base: int
+    space: Scopes  # every parameter, base first; each with its prior
+    base: int  # number of base parameters
+    # names of the simulator's parameters, in the order of rollouts; a sum of a shared value and a group's deviation is
+    # clipped to their hard bounds
     physical: tuple[str, ...]
+    # factor by which prior and unit of each coordinate are wider than its parameter's prior; empty for none
     widening: tuple[float, ...] = ()
+    # draws of each parameter's prior, and ``moved``, values and derivatives of the parameters that move in
+    # unconstrained coordinates, compiled. Copies share both: computing them takes as long as a refit's rollouts.
     draws: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
     moved: Moved | None = field(default=None, repr=False, compare=False)
 
@@ -241,10 +235,7 @@ class Coordinates:
         return np.clip(found, *np.transpose([(spec.low, spec.high) for spec in specs]))
 
     def physical_tangents(
-        self,
-        x: Float[np.ndarray, "n d"],
-        directions: Float[np.ndarray, "n d"],
-        slots: Int[np.ndarray, "recording d"],
+        self, x: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"], slots: Int[np.ndarray, "recording d"]
     ) -> Float[np.ndarray, "n recording physical"]:
         """Derivatives of `physical_values` along directions."""
         zero = np.zeros((len(x), len(slots), len(self.physical)))

@@ -103,10 +103,7 @@ def outlooks(
 
 
 def _misfit(
-    fit: Fit,
-    old: Float[np.ndarray, " n"],
-    new: Float[np.ndarray, " m"],
-    jacobian: Float[np.ndarray, "m free"],
+    fit: Fit, old: Float[np.ndarray, " n"], new: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m free"]
 ) -> float:
     """Squared distance that a hypothesis keeps from data that differ from its predictions by ``old`` and ``new``."""
     distance = np.concatenate([old, new])

@@ -30,7 +30,7 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
+from rfdropo_bayes.inference import LaplaceConfig, find_modes, maximise, normal_at, optimisation_cost
 from rfdropo_bayes.inference import Target as Climbed
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.finite_differences import usable_difference
@@ -51,26 +51,17 @@ FAILED = 1e6  # whitened residual of a rollout that failed: no step is ever take
 
 @dataclass(frozen=True)
 class Fit:
-    """A mode and the normal approximation around it.
+    """A mode and the normal approximation around it."""
 
-    Attributes:
-        x: coordinates of all parameters.
-        free: indices of fitted coordinates.
-        residual: whitened residuals of all channels.
-        jacobian: derivative of the whitened prediction with respect to the free coordinates.
-        covariance: covariance of the free coordinates, prior included.
-        log_evidence: Laplace's, up to the noise's normaliser, which all models under the same noise share; the prior
-            counts with its density and its curvature.
-        promise: predicted gain of a further Gauss-Newton step [nat]; see `converged`.
-    """
-
-    x: Float[np.ndarray, " d"]
-    free: Int[np.ndarray, " free"]
-    residual: Float[np.ndarray, " n"]
-    jacobian: Float[np.ndarray, "n free"]
-    covariance: Float[np.ndarray, "free free"]
+    x: Float[np.ndarray, " d"]  # coordinates of all parameters
+    free: Int[np.ndarray, " free"]  # indices of fitted coordinates
+    residual: Float[np.ndarray, " n"]  # whitened residuals of all channels
+    jacobian: Float[np.ndarray, "n free"]  # derivative of the whitened prediction with respect to the free coordinates
+    covariance: Float[np.ndarray, "free free"]  # covariance of the free coordinates, prior included
+    # Laplace's, up to the noise's normaliser, which all models under the same noise share; the prior counts with its
+    # density and its curvature
     log_evidence: float
-    promise: float
+    promise: float  # predicted gain of a further Gauss-Newton step [nat]; see `converged`
 
     @property
     def converged(self) -> bool:
@@ -260,16 +251,11 @@ class Posterior(ProblemDefaults):
     """The posterior over some coordinates, with the others fixed, as a problem of `bayes.problem`.
 
     A row is one row of every group of repeats, whitened given the earlier rows. The noise is known.
-
-    Attributes:
-        target: target of the fit.
-        start: all coordinates.
-        free: indices of free coordinates.
     """
 
-    target: FitTarget
-    start: Float[np.ndarray, " d"]
-    free: Int[np.ndarray, " free"]
+    target: FitTarget  # target of the fit
+    start: Float[np.ndarray, " d"]  # all coordinates
+    free: Int[np.ndarray, " free"]  # indices of free coordinates
     jacobian: str = "central"
 
     @property
@@ -444,7 +430,7 @@ def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
 
 def climb_rollouts(target: FitTarget, parameters: int) -> int:
     """Expected rollouts of an optimisation of ``parameters`` parameters."""
-    forward, (_, values) = target.forward, climb_cost(0, 0)
+    forward, (_, values) = target.forward, optimisation_cost(0, 0)
     return forward.count * USUAL * (int(values) + forward.lanes.slope_rollouts * parameters)
 
 
@@ -528,9 +514,9 @@ def optimum_rollouts(target: FitTarget) -> int:
     better half continues.
     """
     config, own = _searching(target), target.forward.coordinates
-    beginning, step = climb_cost(own.base, 0)
+    beginning, step = optimisation_cost(own.base, 0)
     climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
-    return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))
+    return target.forward.count * int(config.blocks * config.prior_draws + climbs * (beginning + SEARCHED * step))
 
 
 def poll_rollouts(target: FitTarget) -> int:

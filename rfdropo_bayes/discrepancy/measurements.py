@@ -16,6 +16,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.repeat_noise import (
     Groups,
+    departures_from_mean,
     deviations,
     group_recordings,
     mean_error,
@@ -23,36 +24,24 @@ from rfdropo_bayes.bayes.repeat_noise import (
     repeat_shift,
     repeated,
     repeats_apart,
-    spread,
 )
 from rfdropo_bayes.data import Trajectory
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Recordings as groups of repeats; columns are of all channels side by side, the markers' first.
+    """Recordings as groups of repeats; columns are of all channels side by side, the markers' first."""
 
-    Attributes:
-        names: name of the first recording of each group.
-        members: indices of the recordings in each group.
-        time: time of each row [s].
-        channels: channels with means over the repeats.
-        single: channels with every recording separate.
-        weighed: weighed parts; None without.
-        count: number of valid repeats of each value.
-        spread: every recording less the mean of its group, in the unit of the noise.
-        apart: recordings that repeat commands of another recording but are not joined with it, as their rows or clocks
-            differ.
-    """
-
-    names: tuple[str, ...]
-    members: Groups
-    time: Float[np.ndarray, "group time"]
-    channels: tuple[Series, ...]
-    single: tuple[Series, ...]
-    weighed: WeighedParts | None
-    count: Float[np.ndarray, "group time column"]
+    names: tuple[str, ...]  # name of the first recording of each group
+    members: Groups  # indices of the recordings in each group
+    time: Float[np.ndarray, "group time"]  # time of each row [s]
+    channels: tuple[Series, ...]  # channels with means over the repeats
+    single: tuple[Series, ...]  # channels with every recording separate
+    weighed: WeighedParts | None  # weighed parts; None without
+    count: Float[np.ndarray, "group time column"]  # number of valid repeats of each value
+    # every recording less the mean of its group, in the unit of the noise
     spread: Float[np.ndarray, "recording time column"]
+    # recordings that repeat commands of another recording but are not joined with it, as their rows or clocks differ
     apart: tuple[str, ...] = ()
 
     @property
@@ -199,7 +188,7 @@ def gather_measurements(
         single,
         next((channel for channel in channels if isinstance(channel, WeighedParts)), None),
         np.concatenate(count, axis=-1),
-        np.concatenate([spread(channel, groups) for channel in single], axis=-1),
+        np.concatenate([departures_from_mean(channel, groups) for channel in single], axis=-1),
         apart,
     )
 

@@ -112,10 +112,7 @@ class FeatureTable:
         return jax.jit(jax.vmap(one))
 
     def shaped(
-        self,
-        levels: Float[np.ndarray, "lane row channel"],
-        feature: Feature,
-        shape: Float[np.ndarray, " lane"],
+        self, levels: Float[np.ndarray, "lane row channel"], feature: Feature, shape: Float[np.ndarray, " lane"]
     ) -> Float[np.ndarray, "lane row"]:
         """One feature, with a shape of its own in every lane."""
         once, again = distinct([levels, shape])

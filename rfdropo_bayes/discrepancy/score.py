@@ -19,15 +19,10 @@ VISIBLE = 1.0  # least norm of the change of the whitened data by a candidate of
 
 @dataclass(frozen=True)
 class Signature:
-    """Effect of a candidate on the whitened data, orthogonal to the base parameters' effects.
+    """Effect of a candidate on the whitened data, orthogonal to the base parameters' effects."""
 
-    Attributes:
-        basis: orthonormal columns of S; empty if no effect is visible.
-        sign: +1 if only the positive side of its single direction has a meaning; else 0.
-    """
-
-    basis: Float[np.ndarray, "n rank"]
-    sign: int
+    basis: Float[np.ndarray, "n rank"]  # orthonormal columns of S; empty if no effect is visible
+    sign: int  # +1 if only the positive side of its single direction has a meaning; else 0
 
     @property
     def rank(self) -> int:

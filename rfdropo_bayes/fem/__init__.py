@@ -24,16 +24,8 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
 )
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
-from rfdropo_bayes.fem.points import point_positions, spread_forces  # noqa: E402
-from rfdropo_bayes.fem.rod import (  # noqa: E402
-    PointMap,
-    Rod,
-    attach,
-    profile_rod,
-    refined,
-    solid_torsion_constant,
-    uniform_rod,
-)
+from rfdropo_bayes.fem.points import distribute_forces, point_positions  # noqa: E402
+from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
 
 __all__ = [
@@ -51,6 +43,7 @@ __all__ = [
     "attach",
     "cable_layout",
     "chamber_layout",
+    "distribute_forces",
     "energies",
     "material",
     "point_positions",
@@ -59,7 +52,6 @@ __all__ = [
     "refined",
     "simulate",
     "solid_torsion_constant",
-    "spread_forces",
     "state_at_rest",
     "static_equilibrium",
     "step",

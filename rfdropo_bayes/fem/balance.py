@@ -1,6 +1,6 @@
 """Forces and energies of a rollout: the force of the clamp, contact forces, energies, work and losses.
 
-The equation of motion of a step, with contacts, holds exactly on the free part; its residual on the held part is the
+The equation of motion of a step, with contacts, holds exactly on the free part; its residual on the clamped part is the
 clamp's force. For a mesh all forces follow from the states of a rollout, without a new solve; a rod is simulated again
 (``stage_balance``).
 """
@@ -101,7 +101,7 @@ def check_effects(effects: BodyEffects) -> None:
 
 
 def _gathered(
-    held: Bool[Array, " nodes"],
+    clamped: Bool[Array, " nodes"],
     position: Float[Array, "rows nodes 3"],
     velocity: Float[Array, "rows nodes 3"],
     steps: _Step,
@@ -111,7 +111,7 @@ def _gathered(
     """Sums over the nodes and over time; row k of ``steps`` leads to state k, its forces act at the start of the
     step.
     """
-    clamp = jnp.where(held[:, None], steps.residual, 0.0)
+    clamp = jnp.where(clamped[:, None], steps.residual, 0.0)
     touch = (steps.residual - clamp).at[0].set(0.0)  # no step leads to the initial state: it may be about to fall
     start = jnp.concatenate([position[:1], position[:-1]])
 

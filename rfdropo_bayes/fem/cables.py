@@ -204,9 +204,11 @@ def courses(layout: CableLayout, thread: Threads, position: Vector, frame: Matri
 
 def _entries(station: Int[np.ndarray, " bound"], used: Bool[np.ndarray, " bound"], stations: int) -> np.ndarray:
     """For every station the places in a list of guides' sides that are there, in rows; one past the last for none."""
-    found = [np.flatnonzero(used & (station == number)) for number in range(stations)]
-    most = max((len(places) for places in found), default=0) or 1
-    return np.stack([np.pad(places, (0, most - len(places)), constant_values=len(station)) for places in found], axis=1)
+    places_by_station = [np.flatnonzero(used & (station == number)) for number in range(stations)]
+    most = max((len(places) for places in places_by_station), default=0) or 1
+    return np.stack(
+        [np.pad(places, (0, most - len(places)), constant_values=len(station)) for places in places_by_station], axis=1
+    )
 
 
 def station_rows(
@@ -247,7 +249,7 @@ def _at_stations(
     return sum((_gathered(flat, places) for places in index[1:]), _gathered(flat, index[0]))
 
 
-class Held(NamedTuple):
+class TautCables(NamedTuple):
     """Stiffness of taut cables at the ends of elements: forces and moments per strain times length, in space."""
 
     force: Matrix  # by stretch and shear [N/m]
@@ -259,7 +261,7 @@ def _outer(a: Vector, b: Vector) -> Matrix:
     return a[:, None] * b[None]
 
 
-def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ..."], elements: int) -> Held:
+def taut_cables(layout: CableLayout, course: Courses, tension: Float[Array, "cables ..."], elements: int) -> TautCables:
     """Stiffness of the cables at a tension [N]: P times the change of every segment, with P the second derivative of
     its length.
 
@@ -277,7 +279,7 @@ def held(layout: CableLayout, course: Courses, tension: Float[Array, "cables ...
         mixed = _outer(way, b * turn) - skew(a * arm)
         moment = one * (a * dot(arm, arm)) - _outer(arm, a * arm) - _outer(turn, b * turn)
         parts.append(jnp.stack([force, mixed, moment]).reshape(27, *a.shape))
-    return Held(*_over_elements(layout, parts, elements).reshape(3, 3, 3, elements, *parts[0].shape[3:]))
+    return TautCables(*_over_elements(layout, parts, elements).reshape(3, 3, 3, elements, *parts[0].shape[3:]))
 
 
 def pull_beside(

@@ -87,7 +87,7 @@ def eliminate(
     right: Float[Array, "6 stations ..."],
     rows: Float[Array, "stations 6 rows ..."],
     twist: Float[Array, "6 stations ..."],
-    held: int,
+    clamped: int,
 ) -> Eliminated:
     """Factorise and go down with a right-hand side and the rows J of constraints, over the stations that are free."""
     stations, many, lanes = right.shape[1], rows.shape[2], right.shape[-1]
@@ -96,14 +96,14 @@ def eliminate(
         triangle, solved, columns, compliance, reached, moving = before
         index, row = here
         element = _at(chain.element, index - 1)
-        below = jax.tree.map(lambda part: jnp.where(index > 0, part, 0.0), element) if held == 0 else element
+        below = jax.tree.map(lambda part: jnp.where(index > 0, part, 0.0), element) if clamped == 0 else element
         above = jax.tree.map(lambda part: jnp.where(index < stations - 1, part, 0.0), _at(chain.element, index))
         mixed = below.b - above.a
         straight = below.c + above.c + _at(chain.straight, index)
         turning = below.bb + above.aa + _at(chain.turning, index)
         block = _block(straight, mixed, transposed(mixed), turning)
         coupled = _block(-below.c, -below.b, transposed(below.a), transposed(below.ba))
-        coupling = jnp.where(index > held, _down(triangle, coupled), 0.0)
+        coupling = jnp.where(index > clamped, _down(triangle, coupled), 0.0)
         triangle = _triangle(block - sum(coupling[z][:, None] * coupling[z][None] for z in range(SIZE)))
         force = lax.dynamic_index_in_dim(right, index, 1, keepdims=False)
         speed = lax.dynamic_index_in_dim(twist, index, 1, keepdims=False)
@@ -124,7 +124,7 @@ def eliminate(
         none,
         none,
     )
-    along = jnp.arange(held, stations), rows[held:]
+    along = jnp.arange(clamped, stations), rows[clamped:]
     last, (pivot, coupling, solved, columns) = lax.scan(one, first, along)
     return Eliminated(Factor(pivot, coupling), solved, columns, *last[3:])
 

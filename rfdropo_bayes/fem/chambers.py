@@ -20,10 +20,7 @@ Layout = Float[np.ndarray, "chambers elements 6"]
 
 
 def chamber_layout(
-    body: Rod,
-    middle: Float[np.ndarray, "chambers 2"],
-    ends: Float[np.ndarray, "chambers 2"],
-    area: Sequence[float],
+    body: Rod, middle: Float[np.ndarray, "chambers 2"], ends: Float[np.ndarray, "chambers 2"], area: Sequence[float]
 ) -> Layout:
     """Chambers with their middle at x and y, from height to height [m], with areas across the axis [m2]."""
     middle, ends = np.reshape(middle, (-1, 2)), np.reshape(ends, (-1, 2))

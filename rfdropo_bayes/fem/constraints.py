@@ -241,11 +241,11 @@ def solve_constraints(
     if not len(free):
         return Impulses(previous, slips.mobilised, slips.impulse, jnp.zeros((0, 3)), jnp.array(True))
     start = jnp.concatenate([previous, jnp.zeros(runs), contacts.before.ravel()])
-    found, converged = lax.stop_gradient(settle(*lax.stop_gradient((problem, free, start))))
+    impulse_value, converged = lax.stop_gradient(settle(*lax.stop_gradient((problem, free, start))))
     # One more iteration, which carries the derivatives and changes the impulses by rounding only.
-    law = answers(problem, free + compliance @ found)
-    held = Law(law.impulse, *lax.stop_gradient((law.line, law.block)))
-    impulse = found + _newton_step(problem, held, found)
+    law = answers(problem, free + compliance @ impulse_value)
+    constant = Law(law.impulse, *lax.stop_gradient((law.line, law.block)))
+    impulse = impulse_value + _newton_step(problem, constant, impulse_value)
     share = slips.mobilised - time_step / PRESLIDING * (free + compliance @ impulse)[cables : cables + runs]
     return Impulses(
         jnp.maximum(impulse[:cables], 0.0),

@@ -43,7 +43,7 @@ LOST = 3.0
 
 
 class System(NamedTuple):
-    """Constants of all rollouts: body, cables, number of held stations, from the first, and chambers.
+    """Constants of all rollouts: body, cables, number of clamped stations (the first ones), and chambers.
 
     Its drives are the displacements of the cables [m], then the pressures of the chambers [Pa].
     """
@@ -262,14 +262,14 @@ def within(system: System, prepared: Prepared, state: State, time_step: Scalar, 
 
 def firm(prepared: Prepared, memory: Memory) -> Sections:
     """The sections with their stiffness after softening and ``section_loads``."""
-    section, left = prepared.section, None
+    section, stiffness = prepared.section, None
     if prepared.effects.softening_rate is not None and memory.clock is not None:
-        left = jnp.exp(-prepared.effects.softening_rate * memory.clock)
+        stiffness = jnp.exp(-prepared.effects.softening_rate * memory.clock)
     if prepared.firmness is not None:
-        left = prepared.firmness if left is None else left * prepared.firmness
-    if left is None:
+        stiffness = prepared.firmness if stiffness is None else stiffness * prepared.firmness
+    if stiffness is None:
         return section
-    return section._replace(stretch=left * section.stretch, bending=left * section.bending)
+    return section._replace(stretch=stiffness * section.stretch, bending=stiffness * section.bending)
 
 
 def stage_body(
@@ -442,10 +442,10 @@ def take_stage(
         slip = slip_problem(system.cables, prepared.effects, mobilised, segment, at.position, at.orientation)
     bonds = _bonds(system, prepared, at, displacement, stage, time_step, slip, push)
     way = Way(system.clamped_stations, stage.predicted, system.cables)
-    found = solve_stage(way, body, bonds)
-    change, cables = found.change.T, len(system.cables.anchor)
+    solution = solve_stage(way, body, bonds)
+    change, cables = solution.change.T, len(system.cables.anchor)
     twist = twist_of(at) + change
-    tension = jnp.maximum(found.impulse[:cables], 0.0) / length
+    tension = jnp.maximum(solution.impulse[:cables], 0.0) / length
     memory = at.memory
     if slip is not None:
         share = end_shares(slip, bonds, twist)
@@ -455,11 +455,11 @@ def take_stage(
     moved = moved._replace(velocity=twist[:, :3], spin=twist[:, 3:], tension=tension, memory=memory)
     sudden, sudden_twist = jnp.zeros_like(twist), None
     if push is not None:
-        touched = found.impulse[-3 * len(push.touch.gap) :].reshape(-1, 3)
+        touched = solution.impulse[-3 * len(push.touch.gap) :].reshape(-1, 3)
         done = released(push, stage, time_step, twist_of(at), twist, touched)
         moved = moved._replace(cube=done.cube, touch=done.touch)
         sudden, sudden_twist = done.sudden, done.sudden_twist
-    taken, info = accept(system, state, moved, found.converged > 0.5)
+    taken, info = accept(system, state, moved, solution.converged > 0.5)
     return taken, info, _carried_from(state, taken, sudden, sudden_twist, info) if stage.predicted else None
 
 

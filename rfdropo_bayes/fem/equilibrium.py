@@ -70,7 +70,7 @@ class Task(NamedTuple):
     moves: Float[Array, ""]  # 0 for a body that missed an earlier equilibrium, which stays where it is
 
 
-class Found(NamedTuple):
+class Equilibrium(NamedTuple):
     """An equilibrium."""
 
     position: Float[Array, "stations 3"]
@@ -134,7 +134,7 @@ def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Arr
     return jnp.where(away, FARTHEST, jnp.clip(share, SHORTEST, FARTHEST))
 
 
-def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
+def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibrium:
     """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`.
     A matrix without a solution is tried again without the forces that turn, which near a loss of stability leave it
     indefinite; they are back after a whole increment. The increments to come are no more than a geometric series that
@@ -146,10 +146,10 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
         body = _body(system, task, current.place)
-        found, softness = solved_stage(way, body._replace(turning=current.turning), bonds)
+        solution, softness = solved_stage(way, body._replace(turning=current.turning), bonds)
         count = current.iterations + 1.0
-        again = ~jnp.isfinite(jnp.sum(found.change**2)) & (current.turning.share > 0.0)
-        increment = found.change / scales
+        again = ~jnp.isfinite(jnp.sum(solution.change**2)) & (current.turning.share > 0.0)
+        increment = solution.change / scales
         far, wide = jnp.max(jnp.abs(increment[:3])), jnp.max(jnp.abs(increment[3:]))
         size = jnp.maximum(far, wide)
         grown = size > current.largest
@@ -157,14 +157,16 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
         paced = (current.pace > 0.0) & (size < NEAR)
         plain = jnp.where(grown, SLOWER, 1.0) * jnp.minimum(limit, 1.0)
         share = jnp.where(paced, jnp.minimum(limit, _pace(current, increment)), plain)
-        left = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
-        left = jnp.where(share > 1.0, share * size, left)
+        remaining = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
+        remaining = jnp.where(share > 1.0, share * size, remaining)
         before, kind = current.turning
-        turning = Turning(before + share * (stresses(body, found.change) - before), jnp.where(share < 1.0, kind, 1.0))
+        turning = Turning(
+            before + share * (stresses(body, solution.change) - before), jnp.where(share < 1.0, kind, 1.0)
+        )
         pace = jnp.where(turning.share == kind, share, 0.0)
-        place = displaced(current.place, share * found.change.T)
-        rest = left > bound, found.converged, count, softness
-        taken = _Iterate(place, found.impulse, turning, size, increment, pace, *rest)
+        place = displaced(current.place, share * solution.change.T)
+        rest = remaining > bound, solution.converged, count, softness
+        taken = _Iterate(place, solution.impulse, turning, size, increment, pace, *rest)
         waiting = current._replace(turning=Turning(before, none[0, 0]), pace=none[0, 0], iterations=count)
         return jax.tree.map(lambda old, new: jnp.where(again, old, new), waiting, taken)
 
@@ -174,7 +176,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
     rest = task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
     first = _Iterate(task.start, impulse, turning, jnp.array(jnp.inf), none, jnp.zeros(()), *rest)
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
-    return Found(
+    return Equilibrium(
         last.place.position,
         last.place.orientation,
         last.impulse,
@@ -185,49 +187,57 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Found:
 
 
 def _unbalanced(
-    system: System, task: Task, found: Found, change: Float[Array, "stations 6"], impulse: Float[Array, " rows"]
+    system: System,
+    task: Task,
+    equilibrium: Equilibrium,
+    change: Float[Array, "stations 6"],
+    impulse: Float[Array, " rows"],
 ) -> tuple[Float[Array, "6 free"], Float[Array, " rows"]]:
     """Residuals of forces and constraints near an equilibrium."""
-    place = displaced(task.start._replace(position=found.position, orientation=found.orientation), change)
-    body, cables = _body(system, task, place), len(found.softness)
-    bonds = _bonds(system, task, place, found.impulse[:cables])
+    place = displaced(task.start._replace(position=equilibrium.position, orientation=equilibrium.orientation), change)
+    body, cables = _body(system, task, place), len(equilibrium.softness)
+    bonds = _bonds(system, task, place, equilibrium.impulse[:cables])
     way = Way(system.clamped_stations, True, system.cables)
     line = linearised(way, body, bonds.thread, bonds.previous)
     rows, reached = all_rows(way, body, bonds, line.course)
     forces = line.right + jnp.einsum("sir,r->is", rows, impulse)
     tension = impulse[:cables]
-    slack = bonds.reach - reached + (bonds.give + found.softness) * tension
-    lacking = jnp.where(found.impulse[:cables] > 0.0, slack, tension)
+    slack = bonds.reach - reached + (bonds.give + equilibrium.softness) * tension
+    lacking = jnp.where(equilibrium.impulse[:cables] > 0.0, slack, tension)
     if task.slip is not None and bonds.base is not None:
         share = jnp.clip(task.slip.mobilised - bonds.base / PRESLIDING, -1.0, 1.0)
         lacking = jnp.concatenate([lacking, impulse[cables:] - task.slip.strength * share])
     return forces[:, system.clamped_stations :], lacking
 
 
-def _balanced(system: System, iterations: int, bound: float, task: Task) -> Found:
+def _balanced(system: System, iterations: int, bound: float, task: Task) -> Equilibrium:
     """The equilibrium, with derivatives by the implicit function theorem."""
 
     @jax.custom_jvp
-    def solution(task: Task) -> Found:
+    def solution(task: Task) -> Equilibrium:
         return _find(system, iterations, bound, task)
 
-    def rule(primals: Any, tangents: Any) -> tuple[Found, Found]:
-        found = lax.stop_gradient(_find(system, iterations, bound, *primals))
-        held, stations = system.clamped_stations, len(found.position)
-        free = 6 * (stations - held)
+    def rule(primals: Any, tangents: Any) -> tuple[Equilibrium, Equilibrium]:
+        equilibrium = lax.stop_gradient(_find(system, iterations, bound, *primals))
+        clamped, stations = system.clamped_stations, len(equilibrium.position)
+        free = 6 * (stations - clamped)
 
         def lacking(task: Task, unknown: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-            change = jnp.concatenate([jnp.zeros((held, 6)), unknown[:free].reshape(-1, 6)])
-            forces, rows = _unbalanced(system, task, found, change, unknown[free:])
+            change = jnp.concatenate([jnp.zeros((clamped, 6)), unknown[:free].reshape(-1, 6)])
+            forces, rows = _unbalanced(system, task, equilibrium, change, unknown[free:])
             return jnp.concatenate([forces.T.ravel(), rows])
 
-        at = jnp.concatenate([jnp.zeros(free), found.impulse])
+        at = jnp.concatenate([jnp.zeros(free), equilibrium.impulse])
         slope = lax.stop_gradient(jax.jacfwd(partial(lacking, *primals))(at))
         missing = pushed_forward(lambda task: lacking(task, at), primals, tangents)
         change = jnp.linalg.solve(slope, -missing)
-        moved = jnp.concatenate([jnp.zeros((held, 6)), change[:free].reshape(-1, 6)])
-        turning = jax.jvp(lambda a: turned(found.orientation.T, a).T, (jnp.zeros((3, stations)),), (moved[:, 3:].T,))[1]
-        return found, Found(moved[:, :3], turning, change[free:], *jax.tree.map(jnp.zeros_like, (found[3:])))
+        moved = jnp.concatenate([jnp.zeros((clamped, 6)), change[:free].reshape(-1, 6)])
+        turning = jax.jvp(
+            lambda a: turned(equilibrium.orientation.T, a).T, (jnp.zeros((3, stations)),), (moved[:, 3:].T,)
+        )[1]
+        return equilibrium, Equilibrium(
+            moved[:, :3], turning, change[free:], *jax.tree.map(jnp.zeros_like, (equilibrium[3:]))
+        )
 
     solution.defjvp(rule, symbolic_zeros=True)
     return solution(task)
@@ -264,25 +274,30 @@ def settled(
         slip,
         jnp.asarray(moves, float),
     )
-    found = _balanced(system, iterations, bound, task)
+    equilibrium = _balanced(system, iterations, bound, task)
     cables, unknown = len(system.cables.anchor), jnp.zeros((len(state.position), 6))
-    forces = _unbalanced(system, task, found, unknown, found.impulse)[0]
-    loads = jnp.sum(jnp.abs(prepared.weight)) + jnp.sum(jnp.abs(external)) + jnp.sum(jnp.abs(found.impulse))
+    forces = _unbalanced(system, task, equilibrium, unknown, equilibrium.impulse)[0]
+    loads = jnp.sum(jnp.abs(prepared.weight)) + jnp.sum(jnp.abs(external)) + jnp.sum(jnp.abs(equilibrium.impulse))
     if system.chambers is not None:
         loads = loads + thrust(system.chambers, drive[cables:])
     residual = lax.stop_gradient(jnp.max(jnp.abs(forces[:3]), initial=0.0) / jnp.maximum(loads, 1e-300))
-    tension = jnp.maximum(found.impulse[:cables], 0.0)
+    tension = jnp.maximum(equilibrium.impulse[:cables], 0.0)
     if slip is not None:
         strength = jnp.where(slip.strength > 0.0, slip.strength, 1.0)
-        shares, segment = slipped(system.cables, slip, found.impulse[cables:] / strength, tension)
+        shares, segment = slipped(system.cables, slip, equilibrium.impulse[cables:] / strength, tension)
         memory = memory._replace(slip=shares, segment=segment)
     none = jnp.zeros_like(state.velocity)
     moved = state._replace(
-        position=found.position, orientation=found.orientation, velocity=none, spin=none, tension=tension, memory=memory
+        position=equilibrium.position,
+        orientation=equilibrium.orientation,
+        velocity=none,
+        spin=none,
+        tension=tension,
+        memory=memory,
     )
-    taken, info = accept(system, state, moved, found.solved > 0.5)
+    taken, info = accept(system, state, moved, equilibrium.solved > 0.5)
     converged = info.converged & ~info.diverged
-    return taken, EquilibriumInfo(residual, converged, info.diverged, found.iterations)
+    return taken, EquilibriumInfo(residual, converged, info.diverged, equilibrium.iterations)
 
 
 def static_equilibrium(

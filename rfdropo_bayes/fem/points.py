@@ -18,7 +18,7 @@ def point_positions(
     return jnp.sum(points.weight * position.T[:, points.station] + lever, axis=2).T
 
 
-def spread_forces(
+def distribute_forces(
     points: PointMap, force: Float[Array, "points 3"], orientation: Float[Array, "stations 4"]
 ) -> Float[Array, "stations 6"]:
     """Forces [N] and moments [N m] on the stations that are equivalent to forces at attached points."""

@@ -4,7 +4,7 @@ Strains are Simo and Reissner's in the frame half-way between both sections, (R_
 the vector part of the quaternion from one section to the other (Simo and Vu-Quoc 1986, Comput. Methods Appl. Mech.
 Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent neglects the rotation of the forces. The
 forces of guided cables rotate with the rod's: the sum of both is the stiffness of taut strings between sections, which
-depends on the strains alone (``cables.held``).
+depends on the strains alone (``cables.taut_cables``).
 
 An element bends within itself as the forces at its ends let it, up to the second order in its length. Its flexibility
 in shear is 1 / k G A + h^2 / 12 E I: the second part is bending to the shape of an S. Its stretch is
@@ -27,7 +27,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.cables import Held
+from rfdropo_bayes.fem.cables import TautCables
 from rfdropo_bayes.fem.components import (
     Matrix,
     Quaternion,
@@ -136,13 +136,13 @@ def station_forces(elements: Elements, resultant: Six) -> Six:
     return jnp.concatenate([first, none], axis=1) + jnp.concatenate([none, second], axis=1)
 
 
-def held_resultant(elements: Elements, held: Held, rates: Six) -> Six:
+def taut_resultant(elements: Elements, taut: TautCables, rates: Six) -> Six:
     """Forces and moments between the stations in the elements' frames, of cables that resist strain rates."""
     along = (rates[2] - dot(elements.lean[:2], rates[:2])) / elements.lean[2]
     rates = jnp.concatenate([rates[:2], along[None], rates[3:]])
     stretching, bending = (elements.length * times(elements.frame, part) for part in (rates[:3], rates[3:]))
-    force = times(held.force, stretching) + times(held.mixed, bending)
-    moment = transposed_times(held.mixed, stretching) + times(held.moment, bending)
+    force = times(taut.force, stretching) + times(taut.mixed, bending)
+    moment = transposed_times(taut.mixed, stretching) + times(taut.moment, bending)
     return jnp.concatenate([transposed_times(elements.frame, force), transposed_times(elements.frame, moment)])
 
 
@@ -166,7 +166,7 @@ def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six,
     return Stiffness(c, a - tilt, b - tilt, aa + swing, bb + swing, ba + swing - roll)
 
 
-def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held: Held | None = None) -> Stiffness:
+def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, taut: TautCables | None = None) -> Stiffness:
     """Stiffness of the elements, from the stiffness of the sections, a diagonal and a diagonal or a matrix, and of the
     cables that hold them."""
     frame, way = elements.frame, elements.way
@@ -174,8 +174,8 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held:
     c = product(axes * (stretch / elements.length)[None], transposed(axes))
     turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
     bent = product(turned / elements.length, transposed(frame))
-    if held is not None:
-        c, bent = c + held.force, bent + held.moment
+    if taut is not None:
+        c, bent = c + taut.force, bent + taut.moment
     for _ in range(2):  # W from the left, then, as the matrix is symmetric, from the right
         row = transposed_times(bent, elements.bend)
         bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
@@ -186,9 +186,9 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, held:
     lever_a, lever_b = turn + fold, turn - fold
     a, b = product(c, lever_a), product(c, lever_b)
     back_a, back_b = transposed(lever_a), transposed(lever_b)
-    if held is None:
+    if taut is None:
         return Stiffness(c, a, b, product(back_a, a) + bent, product(back_b, b) + bent, product(back_b, a) - bent)
-    mixed = held.mixed - (elements.share * times(held.mixed, elements.bend))[:, None] * elements.bend[None]
+    mixed = taut.mixed - (elements.share * times(taut.mixed, elements.bend))[:, None] * elements.bend[None]
     more = transposed(mixed)
     turning_a, turning_b = bent - product(more, lever_a), bent + product(more, lever_b)
     a, b = a - mixed, b + mixed

@@ -105,10 +105,10 @@ def slopes(section: Sections, strain: Float[Array, "6 ..."]) -> Sections:
     """Tangent stiffness of the sections. It neglects the coupling of stretch and bending."""
     if section.fibre is None:
         return section
-    left = jnp.maximum(1.0 - 3.0 * section.fibre * strain[2], LEAST_TANGENT)
-    axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * left.ndim)
-    planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * left.ndim)
-    softer = left - 1.0
+    tangent = jnp.maximum(1.0 - 3.0 * section.fibre * strain[2], LEAST_TANGENT)
+    axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * tangent.ndim)
+    planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * tangent.ndim)
+    softer = tangent - 1.0
     return section._replace(
         stretch=section.stretch * (1.0 + axial * softer), bending=section.bending * (1.0 + planar * softer)
     )

@@ -41,7 +41,7 @@ class _Done(NamedTuple):
     """Impulses [N s], [N m s] and work [J] of a stage, or of a step."""
 
     residual: Float[Array, "stations 6"]  # of holding and touching bodies
-    held: Float[Array, ""]  # its work
+    contact_work: Float[Array, ""]
     pulled: Float[Array, ""]  # work of cables and chambers
     lost: Float[Array, ""]  # to Rayleigh damping
 
@@ -99,7 +99,9 @@ def _step(
             going = begun.stage.going
             impact, velocity = going * carried.sudden, twist_of(here)
             done = jax.tree.map(lambda part, share=1.0 + going: share * part, done)
-            done = done._replace(residual=done.residual - impact, held=done.held - jnp.sum(impact * velocity))
+            done = done._replace(
+                residual=done.residual - impact, contact_work=done.contact_work - jnp.sum(impact * velocity)
+            )
         after, _, following = take_stage(system, prepared, here, given, stage, carried, **around)
         own = _done(system, prepared, here, after, begun, begun.stage.span * around["time_step"])
         done = own if done is None else jax.tree.map(jnp.add, done, own)
@@ -140,9 +142,9 @@ def stepped_balance(
     way = Way(system.clamped_stations, True, system.cables)
     right = linearised(way, body, threads(system.cables), first.tension).right
     still = -right.T / time_step - cable_wrench(system, first, first.tension)
-    held = (jnp.arange(len(still)) < system.clamped_stations)[:, None]
+    clamped = (jnp.arange(len(still)) < system.clamped_stations)[:, None]
     acting = jnp.concatenate([still[None], reached.done.residual / time_step])
-    clamp = jnp.where(held, acting, 0.0)
+    clamp = jnp.where(clamped, acting, 0.0)
     touch = (acting - clamp).at[0].set(0.0)  # no step leads to the initial state: it may be about to fall
     stored = jax.tree.map(
         lambda row, rows: jnp.concatenate([row[None], rows]), energies(system, prepared, first), reached.stored
@@ -160,6 +162,6 @@ def stepped_balance(
         elastic_energy=stored.elastic,
         gravitational_energy=stored.gravitational,
         cable_work=summed(reached.done.pulled),
-        contact_work=summed(reached.done.held),
+        contact_work=summed(reached.done.contact_work),
         damping_loss=summed(reached.done.lost),
     )

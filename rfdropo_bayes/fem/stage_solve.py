@@ -24,13 +24,13 @@ from rfdropo_bayes.fem.cable_problem import settle_cables
 from rfdropo_bayes.fem.cables import (
     CableLayout,
     Courses,
-    Held,
+    TautCables,
     Threads,
     courses,
-    held,
     lengths,
     pull_beside,
     station_rows,
+    taut_cables,
 )
 from rfdropo_bayes.fem.chain import Chain, Eliminated, Factor, ascend, descend, eliminate
 from rfdropo_bayes.fem.components import (
@@ -99,9 +99,9 @@ class Bonds(NamedTuple):
 
 
 class Way(NamedTuple):
-    """Static settings: number of held stations, whether forces are taken at the predicted position, and the cables."""
+    """Static settings: number of clamped stations, whether forces are at the predicted position, and the cables."""
 
-    held: int
+    clamped: int
     predicted: bool
     layout: CableLayout
 
@@ -109,7 +109,7 @@ class Way(NamedTuple):
 class Solution(NamedTuple):
     """Solution of a stage."""
 
-    change: Float[Array, "6 stations"]  # of velocities and spins; zero at held stations
+    change: Float[Array, "6 stations"]  # of velocities and spins; zero at clamped stations
     impulse: Float[Array, " rows"]  # of all constraints [N s]
     converged: Float[Array, ""]  # 1 if the impulses were found, else 0
 
@@ -121,7 +121,7 @@ class Linearised(NamedTuple):
     slope: Sections
     frame: Matrix  # of the stations
     course: Courses  # of the cables
-    held: Held  # of the elements between them
+    taut: TautCables  # of the elements between them
     right: Six
     pull: Six | None = None  # of the cables beside the elements, of an equilibrium
 
@@ -146,7 +146,7 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
     """The right-hand side of a stage, and the parts of its matrix, at the tensions [N] of the previous stage."""
     frame = rotation(body.orientation)
     course = courses(way.layout, thread, body.position, frame)
-    between = held(way.layout, course, tension, len(body.length))
+    between = taut_cables(way.layout, course, tension, len(body.length))
     elements = rod_elements.shape(body.length, body.position, body.orientation, body.section.inner)
     slope = slopes(body.section, elements.strain)
     rates = rod_elements.strain_rates(elements, body.twist)
@@ -157,7 +157,7 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
         resultant = resultant - body.blown
     resultant = rod_elements.leant(elements, resultant)
     if not way.predicted:
-        resultant = resultant + body.span * rod_elements.held_resultant(elements, between, rates)
+        resultant = resultant + body.span * rod_elements.taut_resultant(elements, between, rates)
     momentum = inertia_times(body, frame, body.twist)
     force = rod_elements.station_forces(elements, resultant) + body.load - body.loss * momentum
     gyroscopic = cross(body.twist[3:], momentum[3:])
@@ -180,7 +180,7 @@ def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
     """A times a field."""
     rates = rod_elements.strain_rates(line.elements, change)
     strained = rod_elements.leant(line.elements, body.lookahead * linear(line.slope, rates))
-    strained = strained + body.span * rod_elements.held_resultant(line.elements, line.held, rates)
+    strained = strained + body.span * rod_elements.taut_resultant(line.elements, line.taut, rates)
     stiff = -body.span * rod_elements.station_forces(line.elements, strained)
     result = stiff + (1.0 + body.span * body.loss) * inertia_times(body, line.frame, change)
     if body.added is None:
@@ -192,7 +192,7 @@ def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
 def matrix(body: StageBody, line: Linearised) -> Chain:
     """A."""
     scale = body.span * body.lookahead
-    taut = Held(*(body.span**2 * part for part in line.held))
+    taut = TautCables(*(body.span**2 * part for part in line.taut))
     stretch, bending = scale * line.slope.stretch, scale * line.slope.bending
     if body.turning is not None:
         axial = body.turning.share * body.turning.resultant[2]
@@ -238,8 +238,8 @@ def _condense(way: Way, body: StageBody, bonds: Bonds) -> tuple[Eliminated, Floa
     """Elimination, and the velocities of the constraints without them; on lanes."""
     line = linearised(way, body, bonds.thread, bonds.previous / body.span)
     rows, reached = all_rows(way, body, bonds, line.course)
-    found = eliminate(matrix(body, line), line.right, rows, body.twist, way.held)
-    return found, free_velocities(way, body, bonds, found.moving, reached) + found.reached
+    eliminated = eliminate(matrix(body, line), line.right, rows, body.twist, way.clamped)
+    return eliminated, free_velocities(way, body, bonds, eliminated.moving, reached) + eliminated.reached
 
 
 def _project(factor: Factor, columns: Array, right: Six) -> tuple[Array, Array]:
@@ -253,8 +253,8 @@ def _finish(factor: Factor, solved: Array, columns: Array, impulse: Array) -> Si
     return jnp.moveaxis(ascend(factor, pulled), 0, 1)
 
 
-def _padded(free: Six, held: int) -> Six:
-    return jnp.concatenate([jnp.zeros_like(free[:, :1])] * held + [free], axis=1)
+def _padded(free: Six, clamped: int) -> Six:
+    return jnp.concatenate([jnp.zeros_like(free[:, :1])] * clamped + [free], axis=1)
 
 
 def _problem(bonds: Bonds, span: Scalar, compliance: Array) -> Problem:
@@ -277,27 +277,27 @@ def _solve(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Kept]:
     change = laned(_finish)(factor, eliminated.solved, columns, impulse)
     slope = slope_matrix(answers(problem, free + problem.compliance @ impulse))
     system = jnp.eye(len(impulse)) + slope @ problem.compliance
-    found = Solution(_padded(change, way.held), impulse, jnp.asarray(converged, float))
-    return found, Kept(factor, columns, system, slope, problem)
+    solution = Solution(_padded(change, way.clamped), impulse, jnp.asarray(converged, float))
+    return solution, Kept(factor, columns, system, slope, problem)
 
 
-def _lacking(way: Way, found: Solution, kept: Kept, body: StageBody, bonds: Bonds) -> tuple[Array, Array]:
+def _lacking(way: Way, solution: Solution, kept: Kept, body: StageBody, bonds: Bonds) -> tuple[Array, Array]:
     """Residuals of a stage's equations at a solution, as functions of the inputs."""
     line = linearised(way, body, bonds.thread, bonds.previous / body.span)
     rows, reached = all_rows(way, body, bonds, line.course)
-    pulled = jnp.einsum("sir,r->is", rows, found.impulse)
-    forces = matrix_times(body, line, found.change) - line.right - pulled
+    pulled = jnp.einsum("sir,r->is", rows, solution.impulse)
+    forces = matrix_times(body, line, solution.change) - line.right - pulled
     cables = len(bonds.previous)
-    velocity = free_velocities(way, body, bonds, along(rows, body.twist), reached) + along(rows, found.change)
-    velocity = velocity.at[:cables].add(bonds.give / body.span**2 * found.impulse[:cables])
+    velocity = free_velocities(way, body, bonds, along(rows, body.twist), reached) + along(rows, solution.change)
+    velocity = velocity.at[:cables].add(bonds.give / body.span**2 * solution.impulse[:cables])
     problem = kept.problem._replace(time_step=bonds.follows)
     if bonds.compliance is not None:
-        velocity = velocity.at[cables:].add(bonds.compliance @ found.impulse[cables:])
+        velocity = velocity.at[cables:].add(bonds.compliance @ solution.impulse[cables:])
     if bonds.slips is not None:
         problem = problem._replace(slips=bonds.slips)
     if bonds.contacts is not None:
         problem = problem._replace(contacts=bonds.contacts)
-    return forces[:, way.held :], found.impulse - answers(problem, velocity)[0]
+    return forces[:, way.clamped :], solution.impulse - answers(problem, velocity)[0]
 
 
 def _linear_solve(kept: Kept, forces: Array, impulses: Array) -> tuple[Array, Array]:
@@ -326,11 +326,11 @@ def solve_stage(way: Way, body: StageBody, bonds: Bonds) -> Solution:
         return _solve(way, body, bonds)[0]
 
     def rule(primals: Any, tangents: Any) -> tuple[Solution, Solution]:
-        found, kept = lax.stop_gradient(_solve(way, *primals))
-        lacking = partial(_lacking, way, found, kept)
+        reached, kept = lax.stop_gradient(_solve(way, *primals))
+        lacking = partial(_lacking, way, reached, kept)
         forces, impulses = pushed_forward(lacking, primals, tangents)
         change, impulse = _linear_solve(kept, -forces, -impulses)
-        return found, Solution(_padded(change, way.held), impulse, jnp.zeros_like(found.converged))
+        return reached, Solution(_padded(change, way.clamped), impulse, jnp.zeros_like(reached.converged))
 
     solution.defjvp(rule, symbolic_zeros=True)
     return solution(body, bonds)
@@ -338,5 +338,5 @@ def solve_stage(way: Way, body: StageBody, bonds: Bonds) -> Solution:
 
 def solved_stage(way: Way, body: StageBody, bonds: Bonds) -> tuple[Solution, Float[Array, " cables"]]:
     """`solve_stage` without derivatives, and the softness of the cables' constraints."""
-    found, kept = _solve(way, body, bonds)
-    return found, kept.problem.softness
+    solution, kept = _solve(way, body, bonds)
+    return solution, kept.problem.softness

@@ -44,7 +44,7 @@ class TetrahedralBody(NamedTuple):
 
     rest: Float[np.ndarray, "nodes 3"]  # [m]
     element: Int[np.ndarray, "elements 4"]
-    fixed: Bool[np.ndarray, " nodes"]  # held at rest in all three directions
+    fixed: Bool[np.ndarray, " nodes"]  # at rest in all three directions
     gradient: Float[np.ndarray, "elements 4 3"]  # of the shape functions at rest [1/m]
     volume: Float[np.ndarray, " elements"]  # [m3]
     rest_frame: Float[np.ndarray, "elements 3 3"]  # rows: axes of the element's frame at rest
@@ -82,11 +82,11 @@ def tetrahedral_body(
     fixed: Bool[np.ndarray, " nodes"],
     frames: str = "polar",
 ) -> TetrahedralBody:
-    """Body from node coordinates [m], tetrahedra of positive volume, and which nodes are held.
+    """Body from node coordinates [m], tetrahedra of positive volume, and which nodes are fixed.
 
     Raises:
-        InputError: an unknown kind of frame, arrays that do not fit together, a flat or inverted element, no held node,
-        or parts of the mesh that hang on none.
+        InputError: an unknown kind of frame, arrays that do not match, a flat or inverted element, no fixed node, or
+        parts of the mesh that are tied to no fixed node.
     """
     rest, element, fixed = np.asarray(rest, float), np.asarray(element, int), np.asarray(fixed, bool)
     if frames not in FRAMES:
@@ -100,8 +100,8 @@ def tetrahedral_body(
     ):
         raise InputError(f"shapes {rest.shape}, {element.shape} and {fixed.shape} do not fit together", where="mesh")
     if not np.any(fixed):
-        raise InputError("no node is held", where="mesh", remedy="fix the nodes of the clamped end")
-    _check_held(element, fixed)
+        raise InputError("no node is fixed", where="mesh", remedy="fix the nodes of the clamped end")
+    _check_fixed(element, fixed)
     edges = np.swapaxes(rest[element[:, 1:]] - rest[element[:, :1]], 1, 2)
     volume = np.linalg.det(edges) / 6.0
     if not np.all(volume > 0.0):
@@ -114,15 +114,15 @@ def tetrahedral_body(
     return TetrahedralBody(rest, element, fixed, gradient, volume, rest_frame, frames)
 
 
-def _check_held(element: Int[np.ndarray, "elements 4"], fixed: Bool[np.ndarray, " nodes"]) -> None:
-    """Raise InputError for a free node that no chain of elements ties to a held one."""
+def _check_fixed(element: Int[np.ndarray, "elements 4"], fixed: Bool[np.ndarray, " nodes"]) -> None:
+    """Raise InputError for a free node that no chain of elements ties to a fixed node."""
     first, second = np.repeat(element[:, 0], 3), element[:, 1:].ravel()
     graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(fixed), len(fixed)))
     part = connected_components(graph, directed=False)[1]
     loose = ~np.isin(part, part[fixed])
     if np.any(loose):
         raise InputError(
-            f"{np.sum(loose)} nodes hang on no held node, the first is {int(np.argmax(loose))}",
+            f"{np.sum(loose)} nodes are tied to no fixed node, the first is {int(np.argmax(loose))}",
             where="mesh", remedy="remove loose parts and unused nodes",
         )  # fmt: skip
 
@@ -157,7 +157,7 @@ def polar_rotation(deformation: Float[Array, "... 3 3"]) -> Float[Array, "... 3 
 def lame_constants(
     young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """First Lame constant and shear modulus [Pa]; Poisson's ratio is held below `POISSON_LIMIT`."""
+    """First Lame constant and shear modulus [Pa]; Poisson's ratio is limited to `POISSON_LIMIT`."""
     poisson_ratio = jnp.minimum(poisson_ratio, POISSON_LIMIT)
     shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
     return 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio), shear

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.methods import METHODS as METHODS
     from rfdropo_bayes.inference.methods import make_config as make_config
     from rfdropo_bayes.inference.methods import method_named as method_named
-    from rfdropo_bayes.inference.modes.climb import climb_cost as climb_cost
-    from rfdropo_bayes.inference.modes.climb import maximise as maximise
-    from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
     from rfdropo_bayes.inference.modes.lasting import lasting_series as lasting_series
     from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig as LaplaceConfig
     from rfdropo_bayes.inference.modes.mode_search import find_modes as find_modes
+    from rfdropo_bayes.inference.modes.optimisation import maximise as maximise
+    from rfdropo_bayes.inference.modes.optimisation import normal_at as normal_at
+    from rfdropo_bayes.inference.modes.optimisation import optimisation_cost as optimisation_cost
     from rfdropo_bayes.inference.modes.targets import Target as Target
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
     from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RfdropoConfig
-    from rfdropo_bayes.inference.smc.bridge import BridgeConfig as BridgeConfig
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SmcConfig
     from rfdropo_bayes.inference.smc.tempering import next_step as next_step
 
@@ -43,9 +42,9 @@ PUBLIC = {
     "METHODS": "methods",
     "make_config": "methods",
     "method_named": "methods",
-    "climb_cost": "modes.climb",
-    "maximise": "modes.climb",
-    "normal_at": "modes.climb",
+    "optimisation_cost": "modes.optimisation",
+    "maximise": "modes.optimisation",
+    "normal_at": "modes.optimisation",
     "lasting_series": "modes.lasting",
     "LaplaceConfig": "modes.mode_search",
     "find_modes": "modes.mode_search",
@@ -56,7 +55,6 @@ PUBLIC = {
     "InferenceResult": "result",
     "RfdropoConfig": "rfdropo.phi_search",
     "next_step": "smc.tempering",
-    "BridgeConfig": "smc.bridge",
     "SmcConfig": "smc.sampler",
 }
 """Public names, and the module of each."""

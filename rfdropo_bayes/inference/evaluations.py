@@ -16,7 +16,6 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 
-SPACINGS = ("geometric", "linear")
 NOT_A_NUMBER = "not_a_number"
 REDRAWS = 256  # most prior draws, as a multiple of the requested number
 
@@ -26,16 +25,11 @@ class Ledger:
     """Cost of the work on a problem.
 
     A rollout of horizon h counts as h / n_rows rollouts, because its cost is proportional to its steps.
-
-    Attributes:
-        rollouts: full-length equivalents used.
-        evaluations: parameter sets evaluated, at any horizon.
-        excluded: parameter sets that got no weight, counted by status.
     """
 
-    rollouts: float = 0.0
-    evaluations: int = 0
-    excluded: Counter[str] = field(default_factory=Counter)
+    rollouts: float = 0.0  # full-length equivalents used
+    evaluations: int = 0  # parameter sets evaluated, at any horizon
+    excluded: Counter[str] = field(default_factory=Counter)  # parameter sets that got no weight, counted by status
 
     @property
     def reasons(self) -> str:
@@ -96,36 +90,26 @@ def representable_draws(
     least ``n`` if `REDRAWS` times ``n`` draws suffice. A scale of 1e-400 is excluded: its logarithm is infinite.
     """
     batches: list[tuple[np.ndarray, np.ndarray]] = []
-    drawn = found = 0
-    while found < n and drawn < REDRAWS * n:
+    drawn = kept = 0
+    while kept < n and drawn < REDRAWS * n:
         values = problem.sample_prior(jax.random.fold_in(key, drawn) if drawn else key, n)
         u = np.array(problem.to_unconstrained(values), dtype=float)
         base = evaluate_prior(problem, u)
-        held = np.isfinite(u).all(axis=1) & np.isfinite(base)
-        batches.append((u[held], base[held]))
-        drawn, found = drawn + n, found + int(held.sum())
+        finite = np.isfinite(u).all(axis=1) & np.isfinite(base)
+        batches.append((u[finite], base[finite]))
+        drawn, kept = drawn + n, kept + int(finite.sum())
     positions, densities = zip(*batches, strict=True)
     return np.concatenate(positions), np.concatenate(densities), drawn
 
 
-def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tuple[int, ...]:
-    """Prefix lengths of a sequential method; strictly increasing, ending at ``n_rows``.
-
-    Args:
-        n_rows: rows of data.
-        blocks: number of blocks wanted; fewer if there are too few rows.
-        spacing: ``"geometric"`` doubles (the sum of all prefixes stays below ``2 n_rows``), ``"linear"`` has equal
-            blocks.
+def block_boundaries(n_rows: int, blocks: int) -> tuple[int, ...]:
+    """Prefix lengths of a sequential method: at most ``blocks``, which double and end at ``n_rows``. Their sum stays
+    below ``2 n_rows``.
 
     Raises:
-        InputError: no row, no block, or an unknown spacing.
+        InputError: no row, or no block.
     """
     if n_rows < 1 or blocks < 1:
         raise InputError("a schedule needs at least one row and one block", where="[inference] blocks")
-    if spacing == "linear":
-        raw = [n_rows * (k + 1) / blocks for k in range(blocks)]
-    elif spacing == "geometric":
-        raw = [n_rows * 2.0 ** (k + 1 - blocks) for k in range(blocks)]
-    else:
-        raise InputError(f"unknown spacing {spacing!r}", where="[inference] spacing", remedy=f"use one of {SPACINGS}")
+    raw = [n_rows * 2.0 ** (k + 1 - blocks) for k in range(blocks)]
     return tuple(sorted({max(1, math.ceil(value - 1e-9)) for value in raw}))

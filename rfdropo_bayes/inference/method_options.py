@@ -16,13 +16,9 @@ _WIDTH = 110
 
 
 class MethodOptions:
-    """Base of the options of every method: frozen dataclasses with a section "Attributes" in their docstring.
+    """Base of the options of every method: frozen dataclasses with a section "Attributes" in their docstring."""
 
-    Attributes:
-        called: name of the class in ``import rfdropo_bayes as rb``.
-    """
-
-    called: ClassVar[str]
+    called: ClassVar[str]  # name of the class in ``import rfdropo_bayes as rb``
 
     def __init_subclass__(cls, *, called: str) -> None:
         cls.called = called
@@ -61,8 +57,6 @@ def options_table(options: Any) -> dict[str, Any]:
 
 
 def _entry(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return options_table(value)
     if isinstance(value, Mapping):
         return {name: _entry(each) for name, each in value.items() if each is not None}
     return [_entry(each) for each in value] if isinstance(value, list | tuple) else value
@@ -71,16 +65,16 @@ def _entry(value: Any) -> Any:
 def attributes_of(kind: type) -> dict[str, str]:
     """Text on each name in the section "Attributes" of a docstring; ``a, b: text`` describes both."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     names: list[str] = []
     for line in section.splitlines():
         entry = _ENTRY.match(line)
         if entry:
             names = entry[1].split(", ")
-            found |= dict.fromkeys(names, entry[2])
+            texts |= dict.fromkeys(names, entry[2])
         elif line.startswith(" " * 8):
-            found |= {name: f"{found[name]} {line.strip()}" for name in names}
-    return found
+            texts |= {name: f"{texts[name]} {line.strip()}" for name in names}
+    return texts
 
 
 def settings_text(value: Any) -> str:
@@ -100,6 +94,4 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 def _written(value: Any) -> str:
     """A value in a few characters."""
-    if isinstance(value, MethodOptions):
-        return value.call
     return f"{value:.12g}" if isinstance(value, float) else repr(value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,30 +18,23 @@ from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
-from rfdropo_bayes.inference.smc import bridge, sampler
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc import start as starts
 from rfdropo_bayes.tables import nearest, plain
 
 
 class Method(NamedTuple):
-    """One way of inference.
+    """One way of inference."""
 
-    Attributes:
-        config: its configuration, a frozen dataclass.
-        run: ``run(problem, config, key, logbook) -> InferenceResult``.
-        posterior: its draws are of a posterior, and not of a distribution to randomise over.
-    """
-
-    config: type[Any]
-    run: Callable[..., InferenceResult]
-    posterior: bool = True
+    config: type[Any]  # its configuration, a frozen dataclass
+    run: Callable[..., InferenceResult]  # ``run(problem, config, key, logbook) -> InferenceResult``
+    posterior: bool = True  # its draws are of a posterior, and not of a distribution to randomise over
 
 
 METHODS: dict[str, Method] = {
     "smc": Method(sampler.SmcConfig, starts.run),
     "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run, posterior=False),
     "laplace": Method(laplace.LaplaceConfig, laplace.run),
-    "bridge": Method(bridge.BridgeConfig, bridge.run),
     "nuts": Method(nuts.NutsConfig, nuts.run),
     "nested": Method(nested.NestedConfig, nested.run),
 }
@@ -77,7 +70,12 @@ def make_config(name: str, options: Mapping[str, Any]) -> Any:
     Raises:
         InputError: an option that this method does not have (the nearest is offered), or of a wrong type.
     """
-    return _build(method_named(name).config, options, "[inference]", beside=("method",))
+    kind, where = method_named(name).config, "[inference]"
+    hints, names = typing.get_type_hints(kind), [field.name for field in dataclasses.fields(kind)]
+    for option in options:
+        if option not in names:
+            raise InputError(f"unknown option {option!r}", where=where, remedy=nearest(option, [*names, "method"]))
+    return kind(**{option: _convert(hints[option], value, f"{where} {option}") for option, value in options.items()})
 
 
 def run(
@@ -111,26 +109,9 @@ def run(
     return method.run(problem, config, key, Logbook(checkpoint_dir, resume, progress))
 
 
-def _build(kind: type, options: Mapping[str, Any], where: str, beside: Sequence[str] = ()) -> Any:
-    """A configuration from a table; an error mentions the keys ``beside`` it."""
-    hints = typing.get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(kind)]
-    values = {}
-    for name, value in options.items():
-        if name not in names:
-            raise InputError(f"unknown option {name!r}", where=where, remedy=nearest(name, [*names, *beside]))
-        values[name] = _convert(hints[name], value, f"{where} {name}")
-    return kind(**values)
-
-
 def _convert(hint: Any, value: Any, where: str) -> Any:
     """Value of an option as its field wants it; TOML has lists for tuples and writes 20000 for 20000.0."""
     value = plain(value)
-    if dataclasses.is_dataclass(hint):
-        if isinstance(value, hint):  # type: ignore[arg-type]
-            return value
-        if isinstance(value, Mapping):
-            return _build(hint, value, where)  # type: ignore[arg-type]
     choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     for choice in choices:
         origin = typing.get_origin(choice) or choice

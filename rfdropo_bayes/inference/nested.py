@@ -58,9 +58,9 @@ def run(problem: Problem, config: NestedConfig, key: PRNGKeyArray, logbook: Logb
     for index in range(MOST_STEPS):
         state, info = advance(jax.random.fold_in(step_key, index), state)
         dead.append(jax.device_get(info))
-        left = float(state.integrator.logZ_live - state.integrator.logZ)
-        logbook.stage(float(np.clip(1.0 + REMAINING / min(left, -1e-9), 0.0, 1.0)), method="nested")
-        if left < REMAINING:
+        remaining = float(state.integrator.logZ_live - state.integrator.logZ)
+        logbook.stage(float(np.clip(1.0 + REMAINING / min(remaining, -1e-9), 0.0, 1.0)), method="nested")
+        if remaining < REMAINING:
             break
     final = utils.finalise(state, dead, update_info=False)
     values = np.asarray(jax.scipy.special.logsumexp(utils.log_weights(weight_key, final, SHRINKAGES), axis=0))
@@ -68,7 +68,7 @@ def run(problem: Problem, config: NestedConfig, key: PRNGKeyArray, logbook: Logb
     ledger = Ledger()
     ledger.charge(problem, config.live + len(dead) * replaced * slices * EVALUATIONS, problem.n_rows)
     sentence = f"nested sampling stopped after {MOST_STEPS} steps, before the evidence was in"
-    short = [Caution(Code.EVIDENCE_UNFINISHED, sentence, grave=True)] * (left >= REMAINING)
+    short = [Caution(Code.EVIDENCE_UNFINISHED, sentence, grave=True)] * (remaining >= REMAINING)
     return InferenceResult(
         "nested",
         draws,

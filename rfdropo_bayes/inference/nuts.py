@@ -19,7 +19,7 @@ from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
 
-CHAINS, SCREEN = 2, 64  # chains, which start at the best of this number of prior draws
+CHAINS, PRIOR_DRAWS = 2, 64  # chains, which start at the best of this number of prior draws
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,7 +41,7 @@ def run(problem: Problem, config: NutsConfig, key: PRNGKeyArray, logbook: Logboo
     """Sample the posterior. Chains keep no checkpoint: an interrupted run starts again.
 
     Raises:
-        InputError: the likelihood has no gradient, or no screened prior draw has a likelihood.
+        InputError: the likelihood has no gradient, or no starts_of_draws prior draw has a likelihood.
     """
     prior, likelihood = traced_densities(problem)
 
@@ -55,12 +55,12 @@ def run(problem: Problem, config: NutsConfig, key: PRNGKeyArray, logbook: Logboo
         what = "NUTS needs the gradient of the simulator, which this engine does not have"
         remedy = 'set simulator.engine = "jax", or use method = "smc"'
         raise InputError(what, where="[inference] method", remedy=remedy) from error
-    began, ledger, (screen_key, run_key) = time.monotonic(), Ledger(), jax.random.split(key)
-    u = np.asarray(problem.to_unconstrained(problem.sample_prior(screen_key, SCREEN)), dtype=float)
+    began, ledger, (draw_key, run_key) = time.monotonic(), Ledger(), jax.random.split(key)
+    u = np.asarray(problem.to_unconstrained(problem.sample_prior(draw_key, PRIOR_DRAWS)), dtype=float)
     density = evaluate_prior(problem, u) + evaluate_rows(problem, u, problem.n_rows, ledger).sum(axis=1)
     best = np.argsort(-density, kind="stable")[:CHAINS]
     if not np.isfinite(density[best]).all():
-        what = f"too few of {SCREEN} prior draws have a positive likelihood"
+        what = f"too few of {PRIOR_DRAWS} prior draws have a positive likelihood"
         raise InputError(what, where="[model.priors]", remedy="widen the priors")
     kernel, size = NUTS(potential_fn=potential), config.draws
     sampler = MCMC(

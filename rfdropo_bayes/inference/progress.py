@@ -112,7 +112,7 @@ class Progress:
             append_line(self.log, json.dumps({k: _plain(v) for k, v in line.items()}))
 
     @property
-    def seconds_left(self) -> float | None:
+    def remaining_seconds(self) -> float | None:
         """Time left at the pace since the first report [s]; None until enough work is done."""
         if self._first is None or self.share - self._first[1] < SMALLEST_SHARE:
             return None
@@ -124,8 +124,8 @@ class Progress:
         now = time.monotonic()
         if self._first is None:
             self._first = (now, self.share)
-        left = self.seconds_left
-        words = "" if left is None or self.share >= 1.0 else f"{clock(left)} left"
+        remaining = self.remaining_seconds
+        words = "" if remaining is None or self.share >= 1.0 else f"{clock(remaining)} left"
         self._bar.update(self._task, completed=self.share, left=words, words=self._words)
         if self._prints and (ends or now - self._printed >= SECONDS_BETWEEN_LINES):
             self._printed = now
@@ -265,18 +265,12 @@ UNSAVED = Checkpoint(None, "")
 
 @dataclass(frozen=True)
 class Logbook:
-    """Checkpoints and progress of a run; the empty logbook stores and shows nothing.
+    """Checkpoints and progress of a run; the empty logbook stores and shows nothing."""
 
-    Attributes:
-        folder: folder for checkpoints; None keeps none.
-        resume: continue from its checkpoints.
-        progress: receives reports of stages.
-        begin, end: shares of the whole work before and after this part.
-    """
-
-    folder: Path | None = None
-    resume: bool = False
-    progress: Progress | None = None
+    folder: Path | None = None  # folder for checkpoints; None keeps none
+    resume: bool = False  # continue from its checkpoints
+    progress: Progress | None = None  # receives reports of stages
+    # begin, end: shares of the whole work before and after this part
     begin: float = 0.0
     end: float = 1.0
 

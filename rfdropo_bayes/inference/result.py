@@ -28,43 +28,30 @@ Draws = dict[str, Float[np.ndarray, "chain draw"]]
 
 @dataclass(frozen=True)
 class InferenceResult:
-    """Draws of equal weight, and facts about the run.
+    """Draws of equal weight, and facts about the run."""
 
-    Attributes:
-        method: registry name of the method.
-        draws: one array (chain, draw) per parameter, physical units; independent repetitions are chains.
-        log_evidence: value and standard deviation in nats, or None; the deviation is NaN if it was not measured.
-        prefix_log_evidence: log p(first h rows) for h = 1 ... n_rows, NaN if the method did not pass h; or None.
-        block_scores: prequential scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` =
-            log p(block | rows before it) and its ``sd`` over repetitions.
-        log_likelihood: (chain, draw, row) log density of each row at each draw, or None.
-        trace: one dictionary per stage.
-        rollouts: full-length equivalents used; evaluations: parameter sets tried.
-        excluded: parameter sets that got no weight, by reason.
-        cautions: reasons to doubt the draws.
-        seconds: time spent, earlier parts of a resumed run included.
-        phi: distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None.
-        held: {name: value} of fixed parameters.
-        optimum: posterior mode {name: value} if the method finds it; else None.
-        details: further numbers of the method, plain values.
-    """
-
-    method: str
-    draws: Draws
+    method: str  # registry name of the method
+    draws: Draws  # one array (chain, draw) per parameter, physical units; independent repetitions are chains
+    # value and standard deviation in nats, or None; the deviation is NaN if it was not measured
     log_evidence: tuple[float, float] | None = None
+    # log p(first h rows) for h = 1 ... n_rows, NaN if the method did not pass h; or None.
     prefix_log_evidence: Float[np.ndarray, " n_rows"] | None = None
+    # prequential scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows
+    # before it) and its ``sd`` over repetitions
     block_scores: list[dict[str, Any]] = field(default_factory=list)
+    # (chain, draw, row) log density of each row at each draw, or None
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None
-    trace: list[dict[str, Any]] = field(default_factory=list)
-    rollouts: float = 0.0
-    evaluations: int = 0
-    excluded: dict[str, int] = field(default_factory=dict)
-    cautions: list[Caution] = field(default_factory=list)
-    seconds: float = 0.0
+    trace: list[dict[str, Any]] = field(default_factory=list)  # one dictionary per stage
+    rollouts: float = 0.0  # full-length equivalents used
+    evaluations: int = 0  # parameter sets tried
+    excluded: dict[str, int] = field(default_factory=dict)  # parameter sets that got no weight, by reason
+    cautions: list[Caution] = field(default_factory=list)  # reasons to doubt the draws
+    seconds: float = 0.0  # time spent, earlier parts of a resumed run included
+    # distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None
     phi: dict[str, dict[str, Any]] | None = None
-    held: dict[str, float] = field(default_factory=dict)
-    optimum: dict[str, float] | None = None
-    details: dict[str, Any] = field(default_factory=dict)
+    fixed: dict[str, float] = field(default_factory=dict)  # {name: value} of fixed parameters
+    optimum: dict[str, float] | None = None  # posterior mode {name: value} if the method finds it; else None
+    details: dict[str, Any] = field(default_factory=dict)  # further numbers of the method, plain values
 
     @property
     def spent(self) -> Ledger:
@@ -86,7 +73,7 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
     most of its linear mass near the lower end.
     """
     drawn, ends = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS), problem.prior_ends
-    found, apart = [], []
+    cautions, apart = [], []
     for name, values in draws.items():
         values, (low, high), prior = np.ravel(values), ends[name], np.asarray(drawn[name], dtype=float)
         side = cut_off_at(values, low, high)
@@ -97,10 +84,10 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
             hard = np.isclose(end, problem.bounds[name], rtol=1e-6, atol=0.0).any()
             what = f"its {word} bound {end:g}" if hard else f"the {word} end {end:g} of its prior"
             sentence = f"{name} sits on {what}, which decides it instead of the data"
-            found.append(Caution(Code.AT_BOUND, sentence))
+            cautions.append(Caution(Code.AT_BOUND, sentence))
         elif contradicts(values, prior):
             apart.append(name)
-    return found + [Caution(Code.AGAINST_PRIOR, contradiction(apart))] * bool(apart)
+    return cautions + [Caution(Code.AGAINST_PRIOR, contradiction(apart))] * bool(apart)
 
 
 def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
@@ -114,7 +101,7 @@ def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None) -> list[
         trace: a dictionary per stage, as in the result of `smc.sampler`.
         rollouts: their budget.
     """
-    found = []
+    cautions = []
     leaps = [row for row in trace if row["budget_exhausted"] and not row.get("final")]
     if leaps:
         worst, whole = min(row["ess"] for row in leaps), max(row["progress"] for row in trace)
@@ -123,29 +110,28 @@ def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None) -> list[
             f"the budget of {rollouts:.0f} rollouts ran out{place}: the rest of the data was brought in by "
             f"reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
         )
-        found.append(Caution(Code.BUDGET_SPENT, sentence, grave=True))
+        cautions.append(Caution(Code.BUDGET_SPENT, sentence, grave=True))
     if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > STUCK:
         sentence = (
             f"the last moves left the particles {stuck:.2f} correlated with their old positions, so that "
             "the posterior may be too narrow: several modes, a rugged likelihood, or a shape that moves "
             "cannot follow; compare replicates"
         )
-        found.append(Caution(Code.PARTICLES_STUCK, sentence, grave=True))
-    return found
+        cautions.append(Caution(Code.PARTICLES_STUCK, sentence, grave=True))
+    return cautions
 
 
 def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) -> list[Caution]:
     """Cautions if independent repetitions disagree on the evidence or on parameters (R-hat)."""
     if len(log_evidence) < 2:
         return []
-    found, sd = [], float(np.std(log_evidence, ddof=1))
+    cautions, sd = [], float(np.std(log_evidence, ddof=1))
     if sd > SCATTERED:
         sentence = (
             f"the log evidences of {len(log_evidence)} replicates scatter by {sd:.2g}: compare models "
-            "only if they differ by several times that, or take more particles or a target_ess closer to "
-            "1"
+            "only if they differ by several times that, or take more particles"
         )
-        found.append(Caution(Code.EVIDENCE_SCATTERED, sentence))
+        cautions.append(Caution(Code.EVIDENCE_SCATTERED, sentence))
     apart = {}
     for name, values in draws.items():
         within = float(np.mean(np.var(values, axis=1, ddof=1)))
@@ -158,18 +144,19 @@ def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
             f"replicates disagree about {', '.join(worst[:3])}{others} (R-hat {apart[worst[0]]:.2f}): some have "
             "not seen all of the posterior"
         )
-        found.append(Caution(Code.REPLICATES_DISAGREE, sentence))
-    return found
+        cautions.append(Caution(Code.REPLICATES_DISAGREE, sentence))
+    return cautions
 
 
-def unseen_modes(replicates: int, climbs: int | None = None) -> list[Caution]:
+def unseen_modes(replicates: int, optimisations: int | None = None) -> list[Caution]:
     """A caution if a lost mode would go unnoticed: particles of one replicate may end in a single mode.
 
     Args:
         replicates: independent repetitions of the sampler.
-        climbs: number of independent optimisations for the starts of all replicates; None for starts at the prior.
+        optimisations: number of independent optimisations for the starts of all replicates; None for starts at the
+        prior.
     """
-    if replicates > 1 and climbs != 1:
+    if replicates > 1 and optimisations != 1:
         return []
     alone = "one replicate" if replicates == 1 else "a single optimisation"
     sentence = (

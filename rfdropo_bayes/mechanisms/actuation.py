@@ -474,9 +474,9 @@ class GuideAzimuth(MemorylessActuation):
 
 def _strains(cable: Cable, ends: Sequence[float], turn: float) -> Float[np.ndarray, " strain"]:
     """Shortening of a cable by bending about both axes and by stretch of each segment, relative to its length."""
-    azimuth, radius, found, begin = math.radians(cable.azimuth_deg) + turn, cable.guide_radius_m[-1], [], 0.0
+    azimuth, radius, strains, begin = math.radians(cable.azimuth_deg) + turn, cable.guide_radius_m[-1], [], 0.0
     for end in ends:
         length = max(min(end, cable.guide_z_m[-1]) - begin, 0.0)
-        found += [length * radius * math.cos(azimuth), length * radius * math.sin(azimuth), length * radius]
+        strains += [length * radius * math.cos(azimuth), length * radius * math.sin(azimuth), length * radius]
         begin = end
-    return np.array(found)
+    return np.array(strains)

@@ -210,9 +210,9 @@ def gauges_of(path: Float[Array, "row 3"]) -> Float[Array, "row 4"]:
 def motion_dictionary() -> list[Feature]:
     """All features of the motion: position and velocity of the last marker, and its largest distance so far."""
     last = len(GAUGES) - 1
-    found = [Feature("position", (k,), of_motion=True) for k in range(len(GAUGES))]
-    found += [Feature("rate", (k,), of_motion=True) for k in range(last)]
-    return [*found, Feature("largest", (last,), of_motion=True)]
+    features = [Feature("position", (k,), of_motion=True) for k in range(len(GAUGES))]
+    features += [Feature("rate", (k,), of_motion=True) for k in range(last)]
+    return [*features, Feature("largest", (last,), of_motion=True)]
 
 
 def dictionary(channels: int, stroke: float) -> list[Feature]:
@@ -226,7 +226,7 @@ def own_dictionary(stroke: float) -> list[Feature]:
 
 
 def _of_channels(channels: Sequence[int], stroke: float) -> list[Feature]:
-    found = []
+    features = []
     for name, kind in KINDS.items():
         if name == "position":
             continue
@@ -234,8 +234,8 @@ def _of_channels(channels: Sequence[int], stroke: float) -> list[Feature]:
         if name == "play":
             shapes = [share * stroke for share in kind.shapes]
         places = combinations_with_replacement(channels, kind.channels)
-        found += [Feature(name, place, shape) for place in places for shape in shapes]
-    return found
+        features += [Feature(name, place, shape) for place in places for shape in shapes]
+    return features
 
 
 def feature_named(

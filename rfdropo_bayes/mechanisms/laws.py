@@ -30,17 +30,11 @@ WIDE = 0.5  # deviation of a shape's prior, as a share of the shape: audits try 
 
 
 class Term(NamedTuple):
-    """One coefficient of a law, and the feature that it belongs to.
+    """One coefficient of a law, and the feature that it belongs to."""
 
-    Attributes:
-        feature: feature with its initial shape.
-        spec: specification of the coefficient.
-        shape: parameter that replaces the feature's shape; None for a fixed shape.
-    """
-
-    feature: Feature
-    spec: ParameterSpec
-    shape: ParameterSpec | None = None
+    feature: Feature  # feature with its initial shape
+    spec: ParameterSpec  # specification of the coefficient
+    shape: ParameterSpec | None = None  # parameter that replaces the feature's shape; None for a fixed shape
 
     def shaped(self, values: Values) -> Feature:
         """The feature with the shape of these values."""
@@ -112,11 +106,11 @@ class CableLaw(Law):
         numbers = [member.number for member in self._ports.members(self.port)]
         return [(k, [term._replace(feature=term.feature.of(k)) for term in self.terms]) for k in numbers]
 
-    def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
+    def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
         """See `ActuationMechanism`."""
-        reached = held
+        reached = constant
         for k, terms in self._cables:
-            parts = (values[term.spec.name] * term.feature.at_rest(held) for term in terms)
+            parts = (values[term.spec.name] * term.feature.at_rest(constant) for term in terms)
             reached = reached.at[k].add(sum(parts, jnp.zeros(())))
         return reached
 
@@ -212,11 +206,7 @@ class BodyLaw(SignalLaw):
         return self._ports.push(self.port, w)
 
     def push(
-        self,
-        values: Values,
-        command: Float[Array, "row channel"],
-        path: Float[Array, "row 3"] | None,
-        time_step: float,
+        self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
     ) -> BodySignals:
         """See `PushingMechanism`."""
         w = _summed([t for t in self.terms if not t.feature.of_motion], values, command, time_step)
@@ -242,11 +232,7 @@ class SensingLaw(SignalLaw):
         return sensed(self.port, w, position, time)
 
     def sense_with_commands(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
-        meanwhile: Meanwhile,
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"], meanwhile: Meanwhile
     ) -> Float[Array, "time marker 3"]:
         """See `CommandedSensingMechanism`."""
         w = sample(self.signal(values, meanwhile.levels, meanwhile.time_step), meanwhile.commands)

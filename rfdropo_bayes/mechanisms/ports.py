@@ -30,29 +30,17 @@ PLACES = ("base", "middle", "tip")
 
 
 class Port(NamedTuple):
-    """A place at which a signal w(t) may act.
+    """A place at which a signal w(t) may act."""
 
-    Attributes:
-        name: name in files, such as "cable left" or "marker m3 along".
-        stage: "actuation", "body" or "sensing".
-        kind: kind of place.
-        number: index within its kind: a channel, a place or a marker; for "cables" the number of cables.
-        axis: 0 to 2, and 3 along the body; -1 without an axis.
-        unit: unit of the signal.
-        size: size of a typical effect: the scale of priors and of differences.
-        look: check to make at the robot.
-        spoken: its name in sentences, tables and figures, if it differs from the name in files; see `words`.
-    """
-
-    name: str
-    stage: str
-    kind: str
-    number: int
-    axis: int
-    unit: str
-    size: float
-    look: str
-    spoken: str = ""
+    name: str  # name in files, such as "cable left" or "marker m3 along"
+    stage: str  # "actuation", "body" or "sensing"
+    kind: str  # kind of place
+    number: int  # index within its kind: a channel, a place or a marker; for "cables" the number of cables
+    axis: int  # 0 to 2, and 3 along the body; -1 without an axis
+    unit: str  # unit of the signal
+    size: float  # size of a typical effect: the scale of priors and of differences
+    look: str  # check to make at the robot
+    spoken: str = ""  # its name in sentences, tables and figures, if it differs from the name in files; see `words`
 
     @property
     def words(self) -> str:
@@ -61,20 +49,13 @@ class Port(NamedTuple):
 
 
 class PortMap(NamedTuple):
-    """The ports of a robot on an engine, and the composition of signals there.
+    """The ports of a robot on an engine, and the composition of signals there."""
 
-    Attributes:
-        ports: all of them.
-        left_out: ports that the body cannot carry, with the reason.
-        channels: number of commands; places: number of stations for forces, 0 if none.
-        gravity: acceleration [m/s2].
-    """
-
-    ports: tuple[Port, ...]
-    left_out: dict[str, str]
-    channels: int
-    places: int
-    gravity: tuple[float, float, float]
+    ports: tuple[Port, ...]  # all of them
+    left_out: dict[str, str]  # ports that the body cannot carry, with the reason
+    channels: int  # number of commands
+    places: int  # number of stations for forces, 0 if none
+    gravity: tuple[float, float, float]  # acceleration [m/s2]
 
     def named(self, name: str) -> Port | None:
         """A port by its name in files or in sentences; None if there is none."""
@@ -172,44 +153,44 @@ def _of_actuation(channels: Sequence[str], unit: str, usual: float | None, *, wo
     cables, size = wound or unit == "m", SIZES.get(unit, SHARE) if usual is None else SHARE * usual
     look = "guide, spool and tension of cable {0}, and all parts shared with other cables"
     look = look if wound else "the drive of {0}, its load, and all parts shared with other drives"
-    found = []
+    ports = []
     for k, name in enumerate(channels):
         words = f"cable {name}" if cables else f"actuator {name}"
-        found.append(Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name), words))
-    if len(found) > 1:
+        ports.append(Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name), words))
+    if len(ports) > 1:
         look_at = "all parts shared by drives and cables: gears, spools, guides, and the material of the cables"
         look_at = look_at if wound else "what all drives share"
         words = EVERY_CABLE if cables else EVERY_ACTUATOR
-        found.append(Port(EVERY_CABLE, "actuation", "cables", len(found), -1, unit, size, look_at, words))
+        ports.append(Port(EVERY_CABLE, "actuation", "cables", len(ports), -1, unit, size, look_at, words))
     look = "the way of commands to the drives: queues, buses, and clocks"
-    return [*found, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
+    return [*ports, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
 
 
 def _of_body(places: int, gravity: tuple[float, float, float], force: float) -> list[Port]:
     look = "anything that pulls, pushes or touches the body near its {0}"
-    found = [
+    ports = [
         Port(f"force {AXES[i]} at the {name}", "body", "force", k, i, "N", force, look.format(name))
         for k, name in enumerate(PLACES[3 - places :] if places <= 3 else PLACES)
         for i in range(3)
     ]
-    found.append(Port("stiffness", "body", "stiffness", 0, -1, "-", 0.1, "warmth, use and age of the body's material"))
-    found.append(Port("damping", "body", "damping", 0, -1, "-", 0.3, "friction or flow in the body and along it"))
+    ports.append(Port("stiffness", "body", "stiffness", 0, -1, "-", 0.1, "warmth, use and age of the body's material"))
+    ports.append(Port("damping", "body", "damping", 0, -1, "-", 0.3, "friction or flow in the body and along it"))
     for i in range(3):
         if any(abs(g) > 0.0 for k, g in enumerate(gravity) if k != i):
-            found.append(Port(f"base tilt {AXES[i]}", "body", "tilt", 0, i, "rad", 0.05, "whether the base moves"))
-    return found
+            ports.append(Port(f"base tilt {AXES[i]}", "body", "tilt", 0, i, "rad", 0.05, "whether the base moves"))
+    return ports
 
 
 def _of_sensing(markers: Sequence[str], length: float) -> list[Port]:
-    found: list[Port] = []
+    ports: list[Port] = []
     for k, name in enumerate(markers):
         look = f"whether marker {name} slides, comes loose or is confused with another marker"
         ends = [*enumerate(AXES), (3, "along the body")] if len(markers) > 1 else list(enumerate(AXES))
-        found += [Port(f"marker {name} {way}", "sensing", "marker", k, i, "m", length, look) for i, way in ends]
+        ports += [Port(f"marker {name} {way}", "sensing", "marker", k, i, "m", length, look) for i, way in ends]
     look = "whether the cameras move against the base"
-    found += [Port(f"camera {a}", "sensing", "camera", 0, i, "m", length, look) for i, a in enumerate(AXES)]
-    found += [Port(f"camera turn {a}", "sensing", "turn", 0, i, "rad", 0.01, look) for i, a in enumerate(AXES)]
+    ports += [Port(f"camera {a}", "sensing", "camera", 0, i, "m", length, look) for i, a in enumerate(AXES)]
+    ports += [Port(f"camera turn {a}", "sensing", "turn", 0, i, "rad", 0.01, look) for i, a in enumerate(AXES)]
     look = "the cameras' calibration of lengths"
-    found.append(Port("camera scale", "sensing", "scale", 0, -1, "-", 0.01, look))
+    ports.append(Port("camera scale", "sensing", "scale", 0, -1, "-", 0.01, look))
     look = "the cameras' clock against the drives' clock"
-    return [*found, Port("observation delay", "sensing", "observation", 0, -1, "s", 0.02, look)]
+    return [*ports, Port("observation delay", "sensing", "observation", 0, -1, "s", 0.02, look)]

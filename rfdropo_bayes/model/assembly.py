@@ -69,12 +69,10 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
     "object_pose": (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME),
     "orientation": (ORIENTATION_NOISE, *FRAME_TURNS),
 }
-GAINS = (TENSION_GAIN, *FRAME_TURNS)
-"""Parameters of channels that are known unless they have a prior."""
+GAINS = (TENSION_GAIN, *FRAME_TURNS)  # parameters of channels that are known unless they have a prior
 
 
-REST_CLOCK = 0.05
-"""Step [s] of drives and cameras of a body at rest, which has no time step itself."""
+REST_CLOCK = 0.05  # step [s] of drives and cameras of a body at rest, which has no time step itself
 
 
 def robot_of(spec: ModelSpec) -> Robot:

@@ -77,8 +77,7 @@ class ModelTable(ExperimentTable):
         description="effects on top of the base simulator, by name, or file.py:ClassName of your own",
     )
     laws: list[LawTable] = Field(
-        default_factory=list,
-        description="effects that have no name: laws at ports, as an audit describes them",
+        default_factory=list, description="effects that have no name: laws at ports, as an audit describes them"
     )
     noise: NoiseModel = Field(
         default="auto",
@@ -87,8 +86,7 @@ class ModelTable(ExperimentTable):
         "see docs/likelihood.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
-        default_factory=dict,
-        description="inferred parameters: parameter = prior; {} asks for the default prior",
+        default_factory=dict, description="inferred parameters: parameter = prior; {} asks for the default prior"
     )
     fixed: dict[str, float] = Field(default_factory=dict, description="values of parameters that are not inferred")
     per_recording: dict[str, str | list[str]] = Field(
@@ -102,8 +100,7 @@ class ModelTable(ExperimentTable):
         "group forms its own",
     )
     drives: list[DriveTravel] = Field(
-        default_factory=list,
-        description="known properties of the drives, in addition to the robot file",
+        default_factory=list, description="known properties of the drives, in addition to the robot file"
     )
     per_group: dict[str, float] = Field(
         default_factory=dict,
@@ -122,8 +119,7 @@ class ModelTable(ExperimentTable):
         "1 unless it has a prior",
     )
     motor_angle: bool = Field(
-        default=False,
-        description="use recorded motor angles; their noise motor_angle_noise is inferred",
+        default=False, description="use recorded motor angles; their noise motor_angle_noise is inferred"
     )
     orientation: bool = Field(
         default=False,
@@ -136,8 +132,7 @@ class ModelTable(ExperimentTable):
         "object_turn_noise and, unless noise is white, object_correlation_time are inferred",
     )
     weighed: list[WeighedTable] = Field(
-        default_factory=list,
-        description="measured parameters, or measured sums of parameters",
+        default_factory=list, description="measured parameters, or measured sums of parameters"
     )
 
 
@@ -163,12 +158,10 @@ class SimulatorTable(ExperimentTable):
     )
     tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
     engine: Literal["auto", "jax", "numba"] = Field(
-        default="auto",
-        description='"auto" is the compiled engine, or JAX if it has a GPU and the body is a rod',
+        default="auto", description='"auto" is the compiled engine, or JAX if it has a GPU and the body is a rod'
     )
     precision: Literal["float64", "float32"] = Field(
-        default="float64",
-        description="floating-point precision of the compiled engine; stiff bodies need float64",
+        default="float64", description="floating-point precision of the compiled engine; stiff bodies need float64"
     )
     time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
     integrator: Literal["euler", "sdirk2"] | None = Field(
@@ -202,8 +195,7 @@ class SimulatorTable(ExperimentTable):
         return self
 
 
-ROLLOUTS = 20000
-"""Budget of an experiment that states none."""
+ROLLOUTS = 20000  # budget of an experiment that states none
 
 
 class InferenceTable(BaseModel):
@@ -212,8 +204,7 @@ class InferenceTable(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     method: str = Field(
-        default="smc",
-        description="see docs/reference/methods.md; options of the method stand beside it",
+        default="smc", description="see docs/reference/methods.md; options of the method stand beside it"
     )
     rollouts: int | None = Field(
         default=None, ge=1, description=f"budget in full-length rollouts; {ROLLOUTS} without minutes"
@@ -236,8 +227,7 @@ class CommandsTable(ExperimentTable):
 
     duration: float = Field(gt=0.0, description="length of a recording [s]")
     interval: float = Field(
-        gt=0.0,
-        description="time between changes [s]: one channel, chosen at random, moves up or down",
+        gt=0.0, description="time between changes [s]: one channel, chosen at random, moves up or down"
     )
     step: float = Field(gt=0.0, description="size of a change, in the robot's unit of commands")
     low: float = Field(description="least command")
@@ -253,9 +243,7 @@ class NoiseTable(ExperimentTable):
 
     standard_deviation: float = Field(ge=0.0, description="standard deviation of one coordinate of one marker [m]")
     correlation_time: float | None = Field(
-        default=None,
-        gt=0.0,
-        description="correlation time of the noise [s]; white by default",
+        default=None, gt=0.0, description="correlation time of the noise [s]; white by default"
     )
 
 
@@ -263,8 +251,7 @@ class AuditTable(ExperimentTable):
     """[audit]: candidates and effort of ``rfdropo audit``."""
 
     candidates: list[str] = Field(
-        default_factory=list,
-        description="further mechanisms to try, e.g. mine.py:MyMechanism",
+        default_factory=list, description="further mechanisms to try, e.g. mine.py:MyMechanism"
     )
     exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
     library: bool = Field(
@@ -272,13 +259,10 @@ class AuditTable(ExperimentTable):
         description="try the registry's mechanisms, quantities of the robot, and differences between groups",
     )
     ports: bool = Field(
-        default=True,
-        description="look for unknown causes, as laws at ports, if the library leaves a misfit",
+        default=True, description="look for unknown causes, as laws at ports, if the library leaves a misfit"
     )
     matters_mm: float | None = Field(
-        default=None,
-        gt=0.0,
-        description="distance of a marker [mm] below which a discrepancy does not matter",
+        default=None, gt=0.0, description="distance of a marker [mm] below which a discrepancy does not matter"
     )
     bootstraps: int = Field(default=999, ge=199, description="number of simulated data sets for the p-values")
     minutes: float = Field(
@@ -303,7 +287,7 @@ class Experiment(ExperimentTable):
 
     robot: str = Field(
         description="name of a robot that comes with the package, or path of a robot file, relative to this file; the "
-        "path of a MuJoCo model (.xml, .urdf); or module:attribute or file.py:attribute of another simulator",
+        "path of a MuJoCo model (.xml, .urdf); or module:attribute or file.py:attribute of another simulator"
     )
     adapter: dict[str, Any] = Field(
         default_factory=dict,
@@ -314,21 +298,17 @@ class Experiment(ExperimentTable):
     title: str = Field(default="", description="heading of the report; the file's name by default")
     data: DataSpec | None = Field(default=None, description="the recordings")
     commands: CommandsTable | None = Field(
-        default=None,
-        description="random commands to simulate, if no recording is replayed",
+        default=None, description="random commands to simulate, if no recording is replayed"
     )
     noise: NoiseTable | None = Field(
-        default=None,
-        description="noise that simulate adds to positions, and that an audit without repeats assumes",
+        default=None, description="noise that simulate adds to positions, and that an audit without repeats assumes"
     )
     model: ModelTable = Field(
-        default_factory=ModelTable,
-        description="additions to the base simulator, and inferred parameters",
+        default_factory=ModelTable, description="additions to the base simulator, and inferred parameters"
     )
     simulator: SimulatorTable = Field(default_factory=SimulatorTable, description="body, engine and discretisation")
     inference: InferenceTable = Field(
-        default_factory=InferenceTable,
-        description="method, budget and the method's options",
+        default_factory=InferenceTable, description="method, budget and the method's options"
     )
     audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
     design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")

@@ -13,8 +13,7 @@ from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 
-INTEGRATOR = "integrator"
-"""Attribute of a posterior: how time steps were taken in its fit."""
+INTEGRATOR = "integrator"  # attribute of a posterior: how time steps were taken in its fit
 
 
 def stated_integrator(spec: ModelSpec) -> dict[str, str]:

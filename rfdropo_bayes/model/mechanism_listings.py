@@ -11,8 +11,7 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import BODIES, ENGINES, Mechanism, bodies_of, engines_of
 
 Row = dict[str, str]
-EXAMPLE_ROBOT = "smooth_arm"
-"""Robot for which mechanisms with parameters per cable are listed."""
+EXAMPLE_ROBOT = "smooth_arm"  # robot for which mechanisms with parameters per cable are listed
 
 
 def mechanism_rows() -> list[Row]:

@@ -42,15 +42,10 @@ from rfdropo_bayes.tables import parse_table
 
 
 class ExperimentFile(NamedTuple):
-    """The file that a model was read from.
+    """The file that a model was read from."""
 
-    Attributes:
-        path: path of the file.
-        tables: its tables with the overrides applied.
-    """
-
-    path: Path
-    tables: Mapping[str, Any]
+    path: Path  # path of the file
+    tables: Mapping[str, Any]  # its tables with the overrides applied
 
 
 class Model:

@@ -36,8 +36,7 @@ from rfdropo_bayes.simulators.adapters import adapted, is_adapted
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import nearest
 
-Workpiece = Robot | BlackBox
-"""Type of the simulated object."""
+Workpiece = Robot | BlackBox  # type of the simulated object
 
 
 @dataclass(frozen=True)

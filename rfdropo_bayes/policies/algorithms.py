@@ -20,12 +20,7 @@ OBJECTS = ("action_noise", "replay_buffer_class", "rollout_buffer_class")
 """Arguments that are Python objects: experiment files and settings of checkpoints cannot hold them."""
 
 LARGEST_BATCH = 512
-PPO_DEFAULTS: dict[str, Any] = {
-    "n_steps": 16,
-    "n_epochs": 5,
-    "learning_rate": 7e-4,
-    "gae_lambda": 0.95,
-}
+PPO_DEFAULTS: dict[str, Any] = {"n_steps": 16, "n_epochs": 5, "learning_rate": 7e-4, "gae_lambda": 0.95}
 """For a hundred environments or more at once: short rollouts, large batches."""
 
 

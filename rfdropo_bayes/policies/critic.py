@@ -27,14 +27,10 @@ LIMIT = 10.0
 
 
 class VariedParameters(NamedTuple):
-    """Parameters that differ between episodes, in the order of the randomisation.
+    """Parameters that differ between episodes, in the order of the randomisation."""
 
-    Attributes:
-        names: names of the parameters.
-        mean, deviation: statistics of `DRAWS` draws [parameter units].
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # names of the parameters
+    # mean, deviation: statistics of `DRAWS` draws [parameter units]
     mean: Float[np.ndarray, " parameter"]
     deviation: Float[np.ndarray, " parameter"]
 

@@ -59,23 +59,20 @@ class EpisodeStep(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a task.
+    """Settings of a task."""
 
-    Attributes:
-        actions, observed, period, step, history: see `layout_of`.
-        noise: standard deviation of white noise on the observed positions of markers and cube [m]. A marker's
-            displacement is the difference of two observations, as on a robot.
-        near: an episode ends within this distance of the goal [m]; None never, with the reward of staying there.
-        tension_limit: an episode ends once a cable pulls more [N], as drives stop then; None lets it pull.
-    """
-
+    # actions, observed, period, step, history: see `layout_of`
     actions: Actions = "discrete"
     observed: Observed = "paper"
     period: float = 0.05
     step: float | Sequence[float] | None = None
+    # standard deviation of white noise on the observed positions of markers and cube [m]. A marker's displacement is
+    # the difference of two observations, as on a robot.
     noise: float = 0.0
     history: int = 1
+    # an episode ends within this distance of the goal [m]; None never, with the reward of staying there
     near: float | None = None
+    # an episode ends once a cable pulls more [N], as drives stop then; None lets it pull
     tension_limit: float | None = None
 
 

@@ -20,10 +20,8 @@ from rfdropo_bayes.errors import InputError
 
 THRESHOLDS = (0.005, 0.01, 0.01525, 0.02157, 0.030)
 """Distances [m] within which an episode succeeds; the last three are the paper's."""
-EVALUATION_SEED = 2_000_003
-"""None of the seeds that training or its evaluations use."""
-Act = Callable[[Float[np.ndarray, "lane size"]], np.ndarray]
-"""From observations to actions of the environments."""
+EVALUATION_SEED = 2_000_003  # None of the seeds that training or its evaluations use
+Act = Callable[[Float[np.ndarray, "lane size"]], np.ndarray]  # from observations to actions of the environments
 
 
 @dataclass(frozen=True)
@@ -36,25 +34,15 @@ class Case:
 
 @dataclass(frozen=True)
 class Episode:
-    """Result of one case.
+    """Result of one case."""
 
-    Attributes:
-        case: index of the case.
-        distances: distance to the goal after every action [m].
-        total: sum of rewards.
-        diverged: whether the simulation failed; the episode then counts as a failure at every distance.
-        actions: the actions taken, to see the episode again.
-        tension: largest tension of any cable [N]; NaN if the simulator reports none.
-        stopped: whether a tension beyond the limit ended it; it then counts as a failure at every distance.
-    """
-
-    case: int
-    distances: Float[np.ndarray, " action"]
-    total: float
-    diverged: bool
-    actions: np.ndarray = field(repr=False)
-    tension: float = float("nan")
-    stopped: bool = False
+    case: int  # index of the case
+    distances: Float[np.ndarray, " action"]  # distance to the goal after every action [m]
+    total: float  # sum of rewards
+    diverged: bool  # whether the simulation failed; the episode then counts as a failure at every distance
+    actions: np.ndarray = field(repr=False)  # the actions taken, to see the episode again
+    tension: float = float("nan")  # largest tension of any cable [N]; NaN if the simulator reports none
+    stopped: bool = False  # whether a tension beyond the limit ended it; it then counts as a failure at every distance
 
     @property
     def distance(self) -> float:

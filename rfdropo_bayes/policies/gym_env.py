@@ -54,13 +54,7 @@ class TrunkEnv(gymnasium.Env):
             "tension": float(step.tension[0]),
             "stopped": bool(step.stopped[0]),
         }
-        return (
-            step.observation[0],
-            float(step.reward[0]),
-            bool(step.terminated[0]),
-            bool(step.truncated[0]),
-            info,
-        )
+        return (step.observation[0], float(step.reward[0]), bool(step.terminated[0]), bool(step.truncated[0]), info)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """A picture of trunk, cables, cube and goal, (height, width, 3)."""

@@ -20,8 +20,7 @@ from jaxtyping import Float
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 
-LAYOUT = "rfdropo_layout"
-"""Key of the layout among the metadata."""
+LAYOUT = "rfdropo_layout"  # key of the layout among the metadata
 OPSET, IR_VERSION = 17, 9
 ACTIVATIONS = {"Tanh": "Tanh", "ReLU": "Relu", "ELU": "Elu", "LeakyReLU": "LeakyRelu", "Sigmoid": "Sigmoid"}
 

@@ -26,8 +26,7 @@ SMALLEST, USUAL, LARGEST = 0.01, 3.0, 20.0
 """Observations in deviations from their mean: nearly zero, usual for a trained policy, and twice the clipping limit of
 a normalisation.
 """
-DEVIATION = 0.1
-"""Deviation of observations without normalisation [m]."""
+DEVIATION = 0.1  # deviation of observations without normalisation [m]
 
 TOLERANCE = 1e-3
 """Largest difference of a continuous action, which ranges from -1 to 1. The order of float32 operations causes less

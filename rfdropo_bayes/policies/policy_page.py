@@ -47,17 +47,11 @@ EVERY = 2  # frames of an episode that a film shows
 
 
 class Played(NamedTuple):
-    """Episodes of a policy under its own randomisation.
+    """Episodes of a policy under its own randomisation."""
 
-    Attributes:
-        cases: parameters and goals of the episodes.
-        episodes: results of the cases.
-        films: GIFs of single episodes, by title.
-    """
-
-    cases: Sequence[Case]
-    episodes: Sequence[Episode]
-    films: Mapping[str, bytes]
+    cases: Sequence[Case]  # parameters and goals of the episodes
+    episodes: Sequence[Episode]  # results of the cases
+    films: Mapping[str, bytes]  # GIFs of single episodes, by title
 
     @property
     def varied(self) -> dict[str, np.ndarray]:

@@ -146,18 +146,13 @@ class Draws:
 
 
 @dataclass(frozen=True)
-class Days:
-    """Rows of a posterior, each in a new session that no fit has seen.
+class Sessions:
+    """Rows of a posterior, each in a new session that no fit has seen."""
 
-    Attributes:
-        draws: the rows; their parameters are shared by all sessions.
-        spreads: standard deviations between sessions of the varying parameters, one value per row.
-        ends: hard bounds of these parameters.
-    """
-
-    draws: Draws
+    draws: Draws  # the rows; their parameters are shared by all sessions
+    # standard deviations between sessions of the varying parameters, one value per row
     spreads: Mapping[str, Float[np.ndarray, " draw"]]
-    ends: Mapping[str, tuple[float, float]]
+    ends: Mapping[str, tuple[float, float]]  # hard bounds of these parameters
     kind: str = "posterior"
 
     @property
@@ -171,8 +166,9 @@ class Days:
         return _digest([self.draws.sha256, {name: column.tolist() for name, column in self.spreads.items()}])
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
-        """One row, and a day's deviations from it: normal, of the row's own spread; sums end at the hard bounds, as in
-        fits and predictions."""
+        """One row, and a session's deviations from it: normal, of the row's own spread; sums end at the hard bounds, as
+        in fits and predictions.
+        """
         index = int(rng.integers(len(self.draws.rows)))
         values = dict(zip(self.names, map(float, self.draws.rows[index]), strict=True))
         for name, column in self.spreads.items():
@@ -182,15 +178,10 @@ class Days:
 
 @dataclass(frozen=True)
 class Layers:
-    """Several randomisations at once; if two vary the same parameter, the later part wins.
+    """Several randomisations at once; if two vary the same parameter, the later part wins."""
 
-    Attributes:
-        parts: randomisations, from fixed values to values that differ between episodes.
-        kind: kind of the part that names the whole.
-    """
-
-    parts: tuple[Randomisation, ...]
-    kind: str
+    parts: tuple[Randomisation, ...]  # randomisations, from fixed values to values that differ between episodes
+    kind: str  # kind of the part that names the whole
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -217,7 +208,7 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
         for part in randomisation.parts:
             fitting(part, specs)
         return randomisation
-    if isinstance(randomisation, Days):
+    if isinstance(randomisation, Sessions):
         fitting(randomisation.draws, specs)
         return randomisation
     where = f"randomisation ({randomisation.kind})"
@@ -260,7 +251,7 @@ def with_width(randomisation: Randomisation, width: float, specs: Sequence[Param
         *before, last = randomisation.parts
         return replace(randomisation, parts=(*before, with_width(last, width, specs)))
     known = {spec.name: spec for spec in specs}
-    if isinstance(randomisation, Days):
+    if isinstance(randomisation, Sessions):
         spreads = {name: width * column for name, column in randomisation.spreads.items()}
         return replace(randomisation, draws=_spread_rows(randomisation.draws, width, known), spreads=spreads)
     if isinstance(randomisation, Draws):

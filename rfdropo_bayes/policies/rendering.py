@@ -14,8 +14,7 @@ from rfdropo_bayes.report.motion import CUBE_FACES, cube_corners, silhouette, sm
 if TYPE_CHECKING:
     from rfdropo_bayes.policies.episodes import Episodes
 
-WIDTH, HEIGHT, FINER = 640, 480, 2
-"""Size of a picture, and how much finer it is drawn before it is scaled down."""
+WIDTH, HEIGHT, FINER = 640, 480, 2  # size of a picture, and how much finer it is drawn before it is scaled down
 FOREGROUND = {
     "trunk": (86, 140, 196),
     "cube": (232, 163, 61),
@@ -26,8 +25,7 @@ FOREGROUND = {
 PAPER, PLATE, GRID, INK = (250, 250, 250), (232, 232, 228), (205, 205, 200), (40, 40, 40)
 LIGHT = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
 GOAL_RADIUS = 0.004
-THICKNESS = 0.03
-"""Radius over length of the line that is drawn through the markers of a black box."""
+THICKNESS = 0.03  # radius over length of the line that is drawn through the markers of a black box
 
 
 class View(NamedTuple):

@@ -7,8 +7,7 @@ from gymnasium import spaces
 
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 
-FAR = 1e3
-"""Bound above all observed values, in SI units; Gymnasium requires bounds."""
+FAR = 1e3  # bound above all observed values, in SI units; Gymnasium requires bounds
 
 
 def spaces_of(layout: PolicyLayout) -> tuple[spaces.Box, spaces.Space]:

@@ -27,12 +27,10 @@ from rfdropo_bayes.robots.policy_layout import (
 Actions = Literal["discrete", "continuous"]
 Observed = Literal["full", "paper", "markers"]
 
-EPISODE = 100
-"""Actions of an episode."""
+EPISODE = 100  # actions of an episode
 PERIOD = 0.05
 """Control period [s]: five steps of SOFA's 10 ms. The authors' robot was driven at 10 Hz, a period of 0.1 s."""
-STEP = 0.005
-"""Largest movement of a cable by an action [m], by default."""
+STEP = 0.005  # largest movement of a cable by an action [m], by default
 TRACKED_HEIGHTS = (0.0363, 0.0792, 0.1292, 0.179)
 """Heights along the axis at which motion capture tracks the physical trunk [m]."""
 
@@ -70,24 +68,16 @@ class Commanded(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """A goal for the tip, or for a cube that the trunk pushes.
+    """A goal for the tip, or for a cube that the trunk pushes."""
 
-    Attributes:
-        name: name of the environment.
-        robot: the robot it is made for.
-        push: whether a cube stands before the trunk; its centre must then reach the goal.
-        goal_low, goal_high: corners of the box that goals are drawn from [m], in the frame of the base.
-        axes: coordinates in which the distance to the goal is measured.
-        gamma: discount factor of one action with which the task is learnt well.
-    """
-
-    name: str
-    robot: str
-    push: bool
+    name: str  # name of the environment
+    robot: str  # the robot it is made for
+    push: bool  # whether a cube stands before the trunk; its centre must then reach the goal
+    # goal_low, goal_high: corners of the box that goals are drawn from [m], in the frame of the base
     goal_low: tuple[float, float, float]
     goal_high: tuple[float, float, float]
-    axes: tuple[int, ...]
-    gamma: float
+    axes: tuple[int, ...]  # coordinates in which the distance to the goal is measured
+    gamma: float  # discount factor of one action with which the task is learnt well
 
 
 TASKS = {
@@ -124,8 +114,7 @@ def reward(
     return (beginning - potential(distance)) / beginning - 0.05
 
 
-NEAREST = 0.005
-"""Least initial distance that scales the rewards [m]: the potential goes through zero at a millimetre."""
+NEAREST = 0.005  # least initial distance that scales the rewards [m]: the potential goes through zero at a millimetre
 FLOOR = -1.05
 """Reward for each action that is missing after a failed simulation: the reward at about twice the initial distance.
 After a stop by the tension limit the episode's worst reward is used if it is lower.
@@ -239,10 +228,5 @@ def parts_seen(
     """Pieces of an observation that a layout may ask for, from the measurements now and one action ago."""
     seen, moved = marker[:, shown], (marker - before)[:, shown]
     lanes = len(goal)
-    parts = {
-        "markers": seen.reshape(lanes, -1),
-        "goal": goal,
-        "commands": commands,
-        "moved": moved.reshape(lanes, -1),
-    }
+    parts = {"markers": seen.reshape(lanes, -1), "goal": goal, "commands": commands, "moved": moved.reshape(lanes, -1)}
     return parts if pose is None else {**parts, "object": pose}

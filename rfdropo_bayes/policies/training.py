@@ -30,8 +30,7 @@ from rfdropo_bayes.policies.training_config import TrainingTable
 EVALUATION_SEED = 1_000_003  # evaluations play other episodes than the first of a training
 CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
 LAST, BEST = "", "best_"  # prefixes of a checkpoint's files
-STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")
-"""Keys of a checkpoint's state.json."""
+STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")  # keys of a checkpoint's state.json
 
 NO_END = 1e300  # in the place of an infinite distance, for quantiles
 LEAST_SPREAD = 0.01
@@ -42,25 +41,17 @@ in reports/table2/README.md."""
 
 @dataclass(frozen=True)
 class Trained:
-    """The policy of the evaluation with the highest reward: the last evaluation need not be the best.
+    """The policy of the evaluation with the highest reward: the last evaluation need not be the best."""
 
-    Attributes:
-        model: model of Stable-Baselines3.
-        normalisation: the ``VecNormalize`` around its environments, or None.
-        curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m],
-            infinite without an end; episodes whose simulation failed; with tensions, median and maximum of the
-            episodes' largest tension [N], and the number of episodes stopped by the limit.
-        diverged: training episodes that ended because the simulation failed.
-        seconds: run time of all legs.
-        redrawn: number of parameter sets redrawn because no initial state was found.
-    """
-
-    model: Any
-    normalisation: Any
+    model: Any  # model of Stable-Baselines3
+    normalisation: Any  # the ``VecNormalize`` around its environments, or None
+    # a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m], infinite
+    # without an end; episodes whose simulation failed; with tensions, median and maximum of the episodes' largest
+    # tension [N], and the number of episodes stopped by the limit
     curve: list[dict[str, float]]
-    diverged: int
-    seconds: float
-    redrawn: int = 0
+    diverged: int  # training episodes that ended because the simulation failed
+    seconds: float  # run time of all legs
+    redrawn: int = 0  # number of parameter sets redrawn because no initial state was found
 
     @property
     def best(self) -> dict[str, float]:

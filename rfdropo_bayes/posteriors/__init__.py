@@ -11,10 +11,10 @@ from rfdropo_bayes.posteriors.inference_data import (
     to_tree,
 )
 from rfdropo_bayes.posteriors.parameter_info import SHARED, DrawsByOwner, ParameterInfo, Scope, by_owner, label
-from rfdropo_bayes.posteriors.record import HELD, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors.record import FIXED, PosteriorRecord, RecordingPrediction
 
 __all__ = [
-    "HELD",
+    "FIXED",
     "SHARED",
     "DrawsByOwner",
     "InferenceData",

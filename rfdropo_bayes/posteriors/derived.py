@@ -17,20 +17,13 @@ class ProductOfPowers:
     """A product of powers of positive parameters: in logarithms a weighted sum.
 
     Every combination that a scale ridge leaves determined has this form (E / density, friction / E, ...).
-
-    Attributes:
-        parameter: name of the quantity.
-        unit: SI unit, "-" if it has none.
-        powers: exponent of each parameter, ``{"young_modulus": 1, "density": -1}``.
-        description: one line on its physical meaning.
-        owner: the recording or group that has it; empty if all share it.
     """
 
-    parameter: str
-    unit: str
-    powers: Mapping[str, float]
-    description: str = ""
-    owner: str = ""
+    parameter: str  # name of the quantity
+    unit: str  # SI unit, "-" if it has none
+    powers: Mapping[str, float]  # exponent of each parameter, ``{"young_modulus": 1, "density": -1}``
+    description: str = ""  # one line on its physical meaning
+    owner: str = ""  # the recording or group that has it; empty if all share it
 
     @property
     def name(self) -> str:

@@ -14,21 +14,13 @@ Draws = Mapping[str, Float[np.ndarray, " n"]]
 
 @dataclass(frozen=True)
 class Scope:
-    """Owner of a parameter, and the composition of its value.
+    """Owner of a parameter, and the composition of its value."""
 
-    Attributes:
-        owner: the recording or group of recordings that has it; empty if all recordings share it.
-        group: whether the owner is a group, whose further recordings have it as well.
-        added_to: the parameter that it is added to; empty if it is not added to another parameter.
-        scaled_by: the parameter that is its standard deviation, instead of its prior's; empty if there is none.
-        spread: whether it is the standard deviation of others, between groups.
-    """
-
-    owner: str = ""
-    group: bool = False
-    added_to: str = ""
-    scaled_by: str = ""
-    spread: bool = False
+    owner: str = ""  # the recording or group of recordings that has it; empty if all recordings share it
+    group: bool = False  # whether the owner is a group, whose further recordings have it as well
+    added_to: str = ""  # the parameter that it is added to; empty if it is not added to another parameter
+    scaled_by: str = ""  # the parameter that is its standard deviation, instead of its prior's; empty if there is none
+    spread: bool = False  # whether it is the standard deviation of others, between groups
 
 
 SHARED = Scope()
@@ -41,24 +33,17 @@ def label(name: str, owner: str) -> str:
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """Facts about a parameter beside its draws.
+    """Facts about a parameter beside its draws."""
 
-    Attributes:
-        parameter: name in the experiment file.
-        unit: SI unit, "-" if it has none.
-        low, high: hard bounds, infinite without a bound.
-        prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.
-        description: one line on its physical meaning.
-        scope: its owner and the composition of its value.
-    """
-
-    parameter: str
-    unit: str
+    parameter: str  # name in the experiment file
+    unit: str  # SI unit, "-" if it has none
+    # low, high: hard bounds, infinite without a bound
     low: float = -np.inf
     high: float = np.inf
+    # table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived
     prior: Mapping[str, Any] = field(default_factory=dict)
-    description: str = ""
-    scope: Scope = SHARED
+    description: str = ""  # one line on its physical meaning
+    scope: Scope = SHARED  # its owner and the composition of its value
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> ParameterInfo:
@@ -97,8 +82,7 @@ class ParameterInfo:
         return np.full(count, float(self.prior["scale"]))
 
 
-DrawsByOwner = Mapping[str, Draws]
-"""Draws by parameter and by owner, see `Scope`."""
+DrawsByOwner = Mapping[str, Draws]  # draws by parameter and by owner, see `Scope`
 
 
 def by_owner(infos: Iterable[ParameterInfo], draws: Draws) -> dict[str, dict[str, Float[np.ndarray, " n"]]]:

@@ -27,38 +27,28 @@ from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, Scope
 
 AXES = ("x", "y", "z")
 DRAWS = "draws"  # attribute of a prediction: how many draws are its own
-HELD = "held_parameters"  # attribute of a posterior
+FIXED = "fixed_parameters"  # attribute of a posterior
 
 
 @dataclass(frozen=True)
 class RecordingPrediction:
-    """One recording, measured and predicted, in the robot's base frame.
+    """One recording, measured and predicted, in the robot's base frame."""
 
-    Attributes:
-        name: name of the recording.
-        split: "fit" if the parameters were inferred from it, "test" if no fit ever saw it.
-        time: [s].
-        marker_names: base to tip; the last marker is the headline.
-        observed: measured positions [m]; finite placeholders if masked.
-        mask: True for usable positions.
-        predicted: predictive draws of the measurement [m], observation noise included.
-        mean: predictive mean without noise [m]; the mean of ``predicted`` if None.
-        prior_predicted: the same as ``predicted`` under the prior, or None.
-        repeat_group: equal numbers mark repeats of the same commands; -1 marks none.
-        object_pose: draws of a pushed object's pose, position [m] and unit quaternion (x, y, z, w), or None. It is not
-            kept in `posterior.nc`.
-    """
-
-    name: str
-    split: str
-    time: Float[np.ndarray, " time"]
-    marker_names: tuple[str, ...]
-    observed: Float[np.ndarray, "time marker 3"]
-    mask: Bool[np.ndarray, "time marker"]
+    name: str  # name of the recording
+    split: str  # "fit" if the parameters were inferred from it, "test" if no fit ever saw it
+    time: Float[np.ndarray, " time"]  # [s]
+    marker_names: tuple[str, ...]  # base to tip; the last marker is the headline
+    observed: Float[np.ndarray, "time marker 3"]  # measured positions [m]; finite placeholders if masked
+    mask: Bool[np.ndarray, "time marker"]  # True for usable positions
+    # predictive draws of the measurement [m], observation noise included
     predicted: Float[np.ndarray, "draw time marker 3"]
+    # predictive mean without noise [m]; the mean of ``predicted`` if None
     mean: Float[np.ndarray, "time marker 3"] | None = None
+    # the same as ``predicted`` under the prior, or None
     prior_predicted: Float[np.ndarray, "draw time marker 3"] | None = None
-    repeat_group: int = -1
+    repeat_group: int = -1  # equal numbers mark repeats of the same commands; -1 marks none
+    # draws of a pushed object's pose, position [m] and unit quaternion (x, y, z, w), or None. It is not kept in
+    # `posterior.nc`.
     object_pose: Float[np.ndarray, "draw time 7"] | None = None
 
     def __post_init__(self) -> None:
@@ -78,30 +68,20 @@ class RecordingPrediction:
 
 @dataclass(frozen=True)
 class PosteriorRecord:
-    """Everything that `posterior.nc` holds.
+    """Everything that `posterior.nc` holds."""
 
-    Attributes:
-        parameters: one entry per variable of ``posterior``, derived quantities included.
-        posterior: draws of equal weight, physical units.
-        prior: prior draws, physical units; may be empty.
-        recordings: predictions; may be empty.
-        derived: definitions of the variables that are functions of others.
-        trace: numbers of the sampler, one dictionary per stage.
-        block_scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows
-            before it), ``sd``.
-        log_likelihood: log likelihood of each data row at each draw, or None.
-        attrs: data hash, seed, versions and the like.
-    """
-
-    parameters: tuple[ParameterInfo, ...]
-    posterior: Mapping[str, Float[np.ndarray, "chain draw"]]
+    parameters: tuple[ParameterInfo, ...]  # one entry per variable of ``posterior``, derived quantities included
+    posterior: Mapping[str, Float[np.ndarray, "chain draw"]]  # draws of equal weight, physical units
+    # prior draws, physical units; may be empty
     prior: Mapping[str, Float[np.ndarray, " draw"]] = field(default_factory=dict)
-    recordings: tuple[RecordingPrediction, ...] = ()
-    derived: tuple[ProductOfPowers, ...] = ()
-    trace: Sequence[Mapping[str, float]] = ()
+    recordings: tuple[RecordingPrediction, ...] = ()  # predictions; may be empty
+    derived: tuple[ProductOfPowers, ...] = ()  # definitions of the variables that are functions of others
+    trace: Sequence[Mapping[str, float]] = ()  # numbers of the sampler, one dictionary per stage
+    # per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows before it), ``sd``
     block_scores: Sequence[Mapping[str, float]] = ()
+    # log likelihood of each data row at each draw, or None
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None
-    attrs: Mapping[str, Any] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)  # data hash, seed, versions and the like
 
     def __post_init__(self) -> None:
         if tuple(info.name for info in self.parameters) != tuple(self.posterior):
@@ -114,9 +94,9 @@ class PosteriorRecord:
         return tuple(info for info in self.parameters if info.name not in names)
 
     @property
-    def held(self) -> list[tuple[ParameterInfo, float]]:
+    def fixed(self) -> list[tuple[ParameterInfo, float]]:
         """Parameters whose values the fit took for known, with these."""
-        return [(ParameterInfo.from_dict(each["parameter"]), each["value"]) for each in self.attrs.get(HELD, ())]
+        return [(ParameterInfo.from_dict(each["parameter"]), each["value"]) for each in self.attrs.get(FIXED, ())]
 
     def flat(self, name: str) -> Float[np.ndarray, " n"]:
         """Draws of one variable, chains joined."""

@@ -22,24 +22,16 @@ CONSTANT_ROUNDS = 5  # until share and memory agree
 
 
 class ModelError(NamedTuple):
-    """Residuals of a fitted model: size for each coordinate of each marker, and correlation time.
+    """Residuals of a fitted model: size for each coordinate of each marker, and correlation time."""
 
-    Attributes:
-        markers: names of the markers.
-        scale: root mean square [m] of x, y and z of each marker.
-        correlation_time: correlation time [s].
-        share: weight of a coordinate of a row, because errors of markers are correlated; the number of independent
-            coordinates is the participation ratio of the correlation matrix.
-        step: time between rows of the fitted recordings [s].
-        memory: autocorrelation at lags 0, 1, 2 ... rows, about zero; empty if unknown.
-    """
-
-    markers: tuple[str, ...]
-    scale: tuple[float, ...]
-    correlation_time: float
+    markers: tuple[str, ...]  # names of the markers
+    scale: tuple[float, ...]  # root mean square [m] of x, y and z of each marker
+    correlation_time: float  # correlation time [s]
+    # weight of a coordinate of a row, because errors of markers are correlated; the number of independent coordinates
+    # is the participation ratio of the correlation matrix
     share: float = 1.0
-    step: float = 0.0
-    memory: tuple[float, ...] = ()
+    step: float = 0.0  # time between rows of the fitted recordings [s]
+    memory: tuple[float, ...] = ()  # autocorrelation at lags 0, 1, 2 ... rows, about zero; empty if unknown.
 
     def of_marker(self, name: str) -> float:
         """Root mean square error [m] of a marker, scaled so that coordinates of a row count as independent."""

@@ -25,21 +25,13 @@ Residuals = Callable[[Float[np.ndarray, "b k"], Int[np.ndarray, " b"]], Float[np
 
 
 class OwnFit(NamedTuple):
-    """Optima of all draws.
+    """Optima of all draws."""
 
-    Attributes:
-        point: coordinates of each draw's optimum.
-        residual: residuals at the point; not finite if the simulation failed.
-        slope: derivatives of the residuals there.
-        converged: draws whose predicted or last gain is less than `TOLERANCE`.
-        steps: number of steps.
-    """
-
-    point: Float[np.ndarray, "n k"]
-    residual: Float[np.ndarray, "n m"]
-    slope: Float[np.ndarray, "n m k"]
-    converged: Bool[np.ndarray, " n"]
-    steps: int
+    point: Float[np.ndarray, "n k"]  # coordinates of each draw's optimum
+    residual: Float[np.ndarray, "n m"]  # residuals at the point; not finite if the simulation failed
+    slope: Float[np.ndarray, "n m k"]  # derivatives of the residuals there
+    converged: Bool[np.ndarray, " n"]  # draws whose predicted or last gain is less than `TOLERANCE`
+    steps: int  # number of steps
 
 
 def fit_own(

@@ -34,10 +34,10 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import NoRolloutError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction, Scope
-from rfdropo_bayes.prediction.day_error import DayError
-from rfdropo_bayes.prediction.day_spread import draw_deviation
 from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
+from rfdropo_bayes.prediction.session_deviation import draw_deviation
+from rfdropo_bayes.prediction.session_error import SessionError
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
@@ -52,25 +52,17 @@ Batch = dict[str, Float[np.ndarray, " n"]]
 
 
 class NewPredictions(NamedTuple):
-    """Predictions of recordings that no fit has seen.
+    """Predictions of recordings that no fit has seen."""
 
-    Attributes:
-        recordings: the predictions.
-        unmatched: number of draws that did not converge on a first row.
-        far: distance of the measured from the simulated first row in units of the model error, by recording, if it
-            exceeds chance.
-        without: cautions on groups that no fit has seen, see `without_cautions`.
-    """
-
-    recordings: list[RecordingPrediction]
-    unmatched: int
+    recordings: list[RecordingPrediction]  # the predictions
+    unmatched: int  # number of draws that did not converge on a first row
+    # distance of the measured from the simulated first row in units of the model error, by recording, if it exceeds
+    # chance
     far: dict[str, float]
-    without: list[Caution]
+    without: list[Caution]  # cautions on groups that no fit has seen, see `without_cautions`
 
 
-def predicted_after_fit(
-    predict: Callable[[], NewPredictions],
-) -> tuple[list[RecordingPrediction], list[Caution]]:
+def predicted_after_fit(predict: Callable[[], NewPredictions]) -> tuple[list[RecordingPrediction], list[Caution]]:
     """Predictions of recordings that a finished fit has not seen, and cautions. If no draw can be simulated under their
     commands, they are left out with a caution, so that the fit is not lost."""
     try:
@@ -143,7 +135,7 @@ def predict_new(
     fitted: Sequence[str],
     model_error: ModelError | None = None,
     groups: Patterns | None = None,
-    slow: Mapping[str, DayError] | None = None,
+    slow: Mapping[str, SessionError] | None = None,
 ) -> NewPredictions:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
@@ -193,7 +185,7 @@ def predict_new(
     predictions = _predictions(problem, extended, noise_key, "test", unseen=unseen, model_error=model_error)
     keys = jax.random.split(jax.random.fold_in(noise_key, 2), len(predictions))
     predictions = [
-        with_day_error(p, slow[p.name], k) if slow and p.name in slow else p
+        with_session_error(p, slow[p.name], k) if slow and p.name in slow else p
         for p, k in zip(predictions, keys, strict=True)
     ]
     patterns = groups or {}
@@ -202,8 +194,8 @@ def predict_new(
     return NewPredictions(predictions, unmatched, first_row_distances(predictions, model_error), without)
 
 
-def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKeyArray) -> RecordingPrediction:
-    """A prediction whose draws have the slow error of an unseen day; markers outside the fit are unchanged."""
+def with_session_error(prediction: RecordingPrediction, slow: SessionError, key: PRNGKeyArray) -> RecordingPrediction:
+    """A prediction whose draws have the slow error of an unseen session; markers outside the fit are unchanged."""
     known = [i for i, name in enumerate(prediction.marker_names) if name in slow.markers]
     if not known:
         return prediction

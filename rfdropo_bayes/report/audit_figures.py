@@ -23,26 +23,18 @@ SIGN = "direction"  # the cause that is a sign
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of the fitted recordings and their possible causes; rows of all groups in sequence.
+    """Residuals of the fitted recordings and their possible causes; rows of all groups in sequence."""
 
-    Attributes:
-        main: the residual's dominant pattern over the channels, a coordinate per row [m].
-        share: part of the mean square in this pattern.
-        time: [s]; command: of every channel at that time, and its rate per second; tension: of every cable [N].
-        position: simulated coordinate along the same pattern [m].
-        channels, cables: their names; unit: of the commands.
-    """
-
-    main: Float[np.ndarray, " row"]
-    share: float
-    time: Float[np.ndarray, " row"]
-    command: Float[np.ndarray, "row channel"]
+    main: Float[np.ndarray, " row"]  # the residual's dominant pattern over the channels, a coordinate per row [m]
+    share: float  # part of the mean square in this pattern
+    time: Float[np.ndarray, " row"]  # [s]
+    command: Float[np.ndarray, "row channel"]  # of every channel at that time, and its rate per second
     rate: Float[np.ndarray, "row channel"]
-    tension: Float[np.ndarray, "row cable"]
-    position: Float[np.ndarray, " row"]
-    channels: tuple[str, ...]
+    tension: Float[np.ndarray, "row cable"]  # of every cable [N]
+    position: Float[np.ndarray, " row"]  # simulated coordinate along the same pattern [m]
+    channels: tuple[str, ...]  # channels, cables: their names
     cables: tuple[str, ...]
-    unit: str
+    unit: str  # of the commands
 
 
 def _strongest(series: np.ndarray, main: np.ndarray) -> int:
@@ -54,17 +46,13 @@ def _strongest(series: np.ndarray, main: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class ClassEffect:
-    """Part of the residuals explained by a class of candidates, row by row as in `Residuals`.
+    """Part of the residuals explained by a class of candidates, row by row as in `Residuals`."""
 
-    Attributes:
-        names: candidates of the class, the leading one first.
-        before, after: mean square of the whitened residual of the markers, without and with its linear effect.
-        markers, recordings: both mean squares of each marker and each group of repeats, by name.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # candidates of the class, the leading one first
+    # before, after: mean square of the whitened residual of the markers, without and with its linear effect
     before: Float[np.ndarray, " row"]
     after: Float[np.ndarray, " row"]
+    # markers, recordings: both mean squares of each marker and each group of repeats, by name
     markers: Mapping[str, tuple[float, float]]
     recordings: Mapping[str, tuple[float, float]]
 
@@ -76,54 +64,37 @@ class ClassEffect:
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal at a port, with its band.
+    """A signal at a port, with its band."""
 
-    Attributes:
-        port, unit: port, and unit of the signal.
-        recordings: names, the first of each group of repeats.
-        time: [s].
-        mean, sd: posterior mean and deviation in every recording [unit].
-    """
-
+    # port, unit: port, and unit of the signal
     port: str
     unit: str
-    recordings: tuple[str, ...]
-    time: Float[np.ndarray, " spline"]
+    recordings: tuple[str, ...]  # names, the first of each group of repeats
+    time: Float[np.ndarray, " spline"]  # [s]
+    # mean, sd: posterior mean and deviation in every recording [unit]
     mean: Float[np.ndarray, "recording spline"]
     sd: Float[np.ndarray, "recording spline"]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Data of the figures of an audit.
+    """Data of the figures of an audit."""
 
-    Attributes:
-        residuals: residuals of the base model.
-        blocks: misfit of each block of rows, for each model; 1 if a model is right.
-        seconds: length of a block [s].
-        models: names of the base model and of its extensions, in the order of ``blocks``.
-        names: names of the tested candidates.
-        cosines: cosines between their signatures.
-        unseen: time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst:
-            measured, base model, extended model; None without the model.
-        remainder: time [s], mean and deviation [m] of the final model's residual at the last marker; None if nothing
-            remains.
-        tracks: replays of unseen recordings.
-        port: the signal at the port with an effect that the library lacks; None without such an effect.
-        classes: leading classes of candidates.
-    """
-
-    residuals: Residuals
-    blocks: Sequence[Sequence[float]]
-    seconds: float
-    models: Sequence[str]
-    names: Sequence[str]
-    cosines: Float[np.ndarray, "k k"]
+    residuals: Residuals  # residuals of the base model
+    blocks: Sequence[Sequence[float]]  # misfit of each block of rows, for each model; 1 if a model is right
+    seconds: float  # length of a block [s]
+    models: Sequence[str]  # names of the base model and of its extensions, in the order of ``blocks``
+    names: Sequence[str]  # names of the tested candidates
+    cosines: Float[np.ndarray, "k k"]  # cosines between their signatures
+    # time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst: measured,
+    # base model, extended model; None without the model
     unseen: tuple[Float[np.ndarray, " row"], Mapping[str, Float[np.ndarray, "row 3"]]] | None
+    # time [s], mean and deviation [m] of the final model's residual at the last marker; None if nothing remains
     remainder: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row 3"], Float[np.ndarray, "row 3"]] | None
-    tracks: Sequence[Track] = ()
+    tracks: Sequence[Track] = ()  # replays of unseen recordings
+    # the signal at the port with an effect that the library lacks; None without such an effect
     port: Signal | None = None
-    classes: Sequence[ClassEffect] = ()
+    classes: Sequence[ClassEffect] = ()  # leading classes of candidates
 
 
 def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:

@@ -187,10 +187,7 @@ def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[st
     """The figures of the page by name, None if there is nothing to show."""
     drawn = {
         "robot": (robot_figure(outline), "The robot from the side and from its base") if outline else None,
-        "panels": (
-            figures.panels_figure(seen.residuals),
-            "Residual against time, command, rate, position and tension",
-        ),
+        "panels": (figures.panels_figure(seen.residuals), "Residual against time, command, rate, position and tension"),
         "blocks": (figures.blocks_figure(seen), "Misfit of each block of rows"),
         "cosines": (figures.cosine_figure(seen), "Cosines between signatures") if len(seen.names) > 1 else None,
         "overlay": (figures.unseen_figure(seen), "Measured, base model and extended model") if seen.unseen else None,

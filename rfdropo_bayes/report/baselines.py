@@ -23,22 +23,15 @@ Predictor = Callable[[Trajectory], Float[np.ndarray, "time marker 3"]]
 
 @dataclass(frozen=True)
 class BaselineErrors:
-    """Errors of one predictor.
+    """Errors of one predictor."""
 
-    Attributes:
-        name: key in summary.json.
-        title: name for people.
-        description: the method, in one sentence.
-        fit, test: errors on fitted and on test recordings; None without such recordings.
-        reason: why it could not predict; empty if it could.
-    """
-
-    name: str
-    title: str
-    description: str
+    name: str  # key in summary.json
+    title: str  # name for people
+    description: str  # the method, in one sentence
+    # fit, test: errors on fitted and on test recordings; None without such recordings
     fit: ErrorFigures | None
     test: ErrorFigures | None
-    reason: str = ""
+    reason: str = ""  # why it could not predict; empty if it could
 
 
 def held_initial_pose(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
@@ -127,11 +120,7 @@ def _tolerance(recording: Trajectory) -> float:
 
 
 def baseline_errors(
-    fit: Sequence[Trajectory],
-    test: Sequence[Trajectory],
-    *,
-    markers: Sequence[str] | None = None,
-    trained_on: str = "",
+    fit: Sequence[Trajectory], test: Sequence[Trajectory], *, markers: Sequence[str] | None = None, trained_on: str = ""
 ) -> dict[str, BaselineErrors]:
     """Train every predictor on the fit recordings and score it on both roles, by the markers that all of them have.
 
@@ -191,12 +180,7 @@ def _describe(fir: FirRegression, trained_on: str) -> str:
 
 
 def scored(
-    name: str,
-    title: str,
-    description: str,
-    predict: Predictor,
-    fit: Sequence[Trajectory],
-    test: Sequence[Trajectory],
+    name: str, title: str, description: str, predict: Predictor, fit: Sequence[Trajectory], test: Sequence[Trajectory]
 ) -> BaselineErrors:
     """Errors of a predictor on the fitted and the test recordings, or the reason if it cannot predict."""
     figures: list[ErrorFigures | None] = []

@@ -65,19 +65,12 @@ def probability_transform(recording: RecordingPrediction) -> Float[np.ndarray, "
 
 
 class TransformCurve(NamedTuple):
-    """Empirical distribution of the transform, and its band around the diagonal under chance.
+    """Empirical distribution of the transform, and its band around the diagonal under chance."""
 
-    Attributes:
-        grid: probabilities.
-        ecdf: share of the values at or below them.
-        independent: number of independent values that the data are worth.
-        half_width: half width of the 95 % simultaneous band about the diagonal (Kolmogorov).
-    """
-
-    grid: Float[np.ndarray, " grid"]
-    ecdf: Float[np.ndarray, " grid"]
-    independent: float
-    half_width: float
+    grid: Float[np.ndarray, " grid"]  # probabilities
+    ecdf: Float[np.ndarray, " grid"]  # share of the values at or below them
+    independent: float  # number of independent values that the data are worth
+    half_width: float  # half width of the 95 % simultaneous band about the diagonal (Kolmogorov)
 
 
 def transform_curve(recordings: Sequence[RecordingPrediction]) -> TransformCurve | None:

@@ -15,8 +15,7 @@ from rfdropo_bayes.report.object_scores import ObjectScore
 from rfdropo_bayes.report.residuals import ResidualCheck
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
-LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")
-"""Packages that policies are made with."""
+LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")  # packages that policies are made with
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class RunFacts:
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
         optimum: posterior mode; None without.
         objects: scores of the predicted final position of a pushed object, by unseen recording.
-        unseen_days: error in sessions that no fit has seen, with the key "sentence" for people; empty for a model
+        unseen_sessions: error in sessions that no fit has seen, with the key "sentence" for people; empty for a model
             without sessions.
         limits: further sentences on the limits of this analysis.
         versions: versions of the software.
@@ -118,7 +117,7 @@ class RunFacts:
     phi: Mapping[str, Mapping[str, Any]] | None = None
     optimum: Mapping[str, float] | None = None
     objects: Mapping[str, ObjectScore] = field(default_factory=dict)
-    unseen_days: Mapping[str, Any] = field(default_factory=dict)
+    unseen_sessions: Mapping[str, Any] = field(default_factory=dict)
     limits: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)

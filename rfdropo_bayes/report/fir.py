@@ -19,29 +19,20 @@ BLOCKS = 5
 
 @dataclass(frozen=True)
 class FirRegression:
-    """A trained regression.
+    """A trained regression."""
 
-    Attributes:
-        lags: ages of its input commands [s].
-        degree: highest power of a command.
-        low, high: range of each feature in training; features are cut there, so that powers do not run away.
-        centre, scale: constants that standardise the features.
-        offset: mean pose.
-        weights: weights of the standardised features.
-        penalty: ridge penalty per row.
-        error: cross-validated root mean square distance, all markers [m].
-    """
-
-    lags: Float[np.ndarray, " lag"]
-    degree: int
+    lags: Float[np.ndarray, " lag"]  # ages of its input commands [s]
+    degree: int  # highest power of a command
+    # low, high: range of each feature in training; features are cut there, so that powers do not run away
     low: Float[np.ndarray, " feature"]
     high: Float[np.ndarray, " feature"]
+    # centre, scale: constants that standardise the features
     centre: Float[np.ndarray, " feature"]
     scale: Float[np.ndarray, " feature"]
-    offset: Float[np.ndarray, "marker 3"]
-    weights: Float[np.ndarray, "marker feature 3"]
-    penalty: float
-    error: float
+    offset: Float[np.ndarray, "marker 3"]  # mean pose
+    weights: Float[np.ndarray, "marker feature 3"]  # weights of the standardised features
+    penalty: float  # ridge penalty per row
+    error: float  # cross-validated root mean square distance, all markers [m]
 
     def predict(self, recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
         """Positions [m] from the commands alone."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-FEW_DRAWS = 100
-"""Effective draws that central intervals need."""
+FEW_DRAWS = 100  # effective draws that central intervals need
 
 
 def headline(summary: Mapping[str, Any]) -> list[str]:
@@ -17,7 +16,7 @@ def headline(summary: Mapping[str, Any]) -> list[str]:
             _fitted(summary),
             _errors(summary),
             _against(summary),
-            (summary.get("unseen_days") or {}).get("sentence", ""),
+            (summary.get("unseen_sessions") or {}).get("sentence", ""),
             _objects(summary),
             _bounds(summary),
             _excluded(summary),

@@ -34,23 +34,14 @@ TIMES = " \u00d7 "
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters and its uncertainty.
+    """A product of powers of parameters and its uncertainty."""
 
-    Attributes:
-        powers: exponent of each parameter that takes part; the largest is 1 in absolute value.
-        unit: "log" if ``sd`` refers to a logarithm, else the unit of the single parameter.
-        sd: posterior standard deviation of the logarithm of the product, or of the parameter.
-        prior_sd: the same under the prior; None without prior draws.
-        verdict: "determined", "partly" or "free"; "unknown" without prior draws.
-        sentence: the same in words.
-    """
-
-    powers: dict[str, float]
-    unit: str
-    sd: float
-    prior_sd: float | None
-    verdict: str
-    sentence: str
+    powers: dict[str, float]  # exponent of each parameter that takes part; the largest is 1 in absolute value
+    unit: str  # "log" if ``sd`` refers to a logarithm, else the unit of the single parameter
+    sd: float  # posterior standard deviation of the logarithm of the product, or of the parameter
+    prior_sd: float | None  # the same under the prior; None without prior draws
+    verdict: str  # "determined", "partly" or "free"; "unknown" without prior draws
+    sentence: str  # the same in words
 
     @property
     def contraction(self) -> float | None:

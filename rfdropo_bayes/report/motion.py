@@ -19,8 +19,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.report.style import ACCENT, POSTERIOR
 
-AROUND, ALONG = 16, 60
-"""Points around and along a tube."""
+AROUND, ALONG = 16, 60  # points around and along a tube
 FRAME = (960, 640)  # [pixel]
 CUBE_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 CUBE_FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])

@@ -25,10 +25,8 @@ from rfdropo_bayes.report.style import ACCENT, MEASURED, WIDTH, styled
 
 PLANES = {"from the side": (0, 2), "from above": (0, 1)}
 AXES = ("along [mm]", "across [mm]", "up [mm]")
-INSTANTS = 6
-"""Instants that a still shows."""
-TICKS = 5
-"""Ticks along the longest axis in space; shorter axes have fewer, so that their labels do not meet."""
+INSTANTS = 6  # instants that a still shows
+TICKS = 5  # ticks along the longest axis in space; shorter axes have fewer, so that their labels do not meet
 GROUND = "#D9D9D9"
 MILLIMETRES = 1e3
 

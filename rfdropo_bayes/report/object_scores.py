@@ -23,20 +23,13 @@ from rfdropo_bayes.report.scores import FINAL_ROWS, MILLIMETRES
 
 @dataclass(frozen=True)
 class ObjectScore:
-    """Scores of the final position of one recording's object.
+    """Scores of the final position of one recording's object."""
 
-    Attributes:
-        energy_score_mm: energy score of the predictive draws.
-        error_mm: distance of their mean from the object's final position.
-        repeats_mm: energy score of the other repeats of the same commands, mean over leave-one-out; None with fewer
-            than three.
-        held_mm: distance between its first and final position, the score of predicting no motion.
-    """
-
-    energy_score_mm: float
-    error_mm: float
+    energy_score_mm: float  # energy score of the predictive draws
+    error_mm: float  # distance of their mean from the object's final position
+    # energy score of the other repeats of the same commands, mean over leave-one-out; None with fewer than three
     repeats_mm: float | None
-    held_mm: float
+    held_mm: float  # distance between its first and final position, the score of predicting no motion
 
 
 def energy_score(draws: Float[np.ndarray, "n d"], outcome: Float[np.ndarray, " d"]) -> float:

@@ -30,19 +30,12 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Safety:
-    """The answer and its grounds.
+    """The answer and its grounds."""
 
-    Attributes:
-        verdict: "safe", "with care" or "unsafe".
-        sentence: the same in words.
-        reasons: reasons against it, worst first.
-        advice: recommendations for drawing.
-    """
-
-    verdict: str
-    sentence: str
-    reasons: list[str]
-    advice: list[str]
+    verdict: str  # "safe", "with care" or "unsafe"
+    sentence: str  # the same in words
+    reasons: list[str]  # reasons against it, worst first
+    advice: list[str]  # recommendations for drawing
 
     def as_dict(self) -> dict[str, Any]:
         """For summary.json."""

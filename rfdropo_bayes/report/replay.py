@@ -24,21 +24,13 @@ MOST_RECORDINGS = 8
 
 @dataclass(frozen=True)
 class Track:
-    """Replay of one recording.
+    """Replay of one recording."""
 
-    Attributes:
-        name: name of the recording.
-        role: "fit", "test" or "unseen".
-        time: [s].
-        markers: names, base to tip.
-        series: positions [m] by label, "measured" first; NaN if unknown.
-    """
-
-    name: str
-    role: str
-    time: Float[np.ndarray, " time"]
-    markers: tuple[str, ...]
-    series: Mapping[str, Float[np.ndarray, "time marker 3"]]
+    name: str  # name of the recording
+    role: str  # "fit", "test" or "unseen"
+    time: Float[np.ndarray, " time"]  # [s]
+    markers: tuple[str, ...]  # names, base to tip
+    series: Mapping[str, Float[np.ndarray, "time marker 3"]]  # positions [m] by label, "measured" first; NaN if unknown
 
 
 def tracks_of(recordings: Sequence[RecordingPrediction]) -> list[Track]:

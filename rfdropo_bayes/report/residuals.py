@@ -29,23 +29,14 @@ NO_REMEDY = "rfdropo audit can find the effect that the simulator lacks"
 
 
 class ResidualCheck(NamedTuple):
-    """Statistics of the whitened residuals of one marker, or of all.
+    """Statistics of the whitened residuals of one marker, or of all."""
 
-    Attributes:
-        correlation: between whitened residuals of successive rows.
-        narrowing: factor by which intervals are too narrow.
-        correlated: whether ``narrowing`` exceeds chance and `TOO_NARROW`.
-        far: share of the whitened residuals beyond `FAR` deviations.
-        heavy: whether ``far`` exceeds chance.
-        values: number of residuals.
-    """
-
-    correlation: float
-    narrowing: float
-    correlated: bool
-    far: float
-    heavy: bool
-    values: int
+    correlation: float  # between whitened residuals of successive rows
+    narrowing: float  # factor by which intervals are too narrow
+    correlated: bool  # whether ``narrowing`` exceeds chance and `TOO_NARROW`
+    far: float  # share of the whitened residuals beyond `FAR` deviations
+    heavy: bool  # whether ``far`` exceeds chance
+    values: int  # number of residuals
 
 
 def check_residuals(

@@ -26,23 +26,14 @@ LEAST_HELD = 0.25  # of the rows
 
 @dataclass(frozen=True)
 class MeasuredPath:
-    """Measured marker positions of one recording.
+    """Measured marker positions of one recording."""
 
-    Attributes:
-        name: name of the recording.
-        time: [s].
-        position: [m].
-        mask: True for usable positions.
-        marker_names: base to tip.
-        repeat_group: equal numbers mark repeats of the same commands; -1 marks none.
-    """
-
-    name: str
-    time: Float[np.ndarray, " time"]
-    position: Float[np.ndarray, "time marker 3"]
-    mask: Bool[np.ndarray, "time marker"]
-    marker_names: tuple[str, ...]
-    repeat_group: int = -1
+    name: str  # name of the recording
+    time: Float[np.ndarray, " time"]  # [s]
+    position: Float[np.ndarray, "time marker 3"]  # [m]
+    mask: Bool[np.ndarray, "time marker"]  # True for usable positions
+    marker_names: tuple[str, ...]  # base to tip
+    repeat_group: int = -1  # equal numbers mark repeats of the same commands; -1 marks none
 
     @classmethod
     def of_prediction(cls, recording: RecordingPrediction) -> MeasuredPath:
@@ -82,18 +73,13 @@ class RecordingErrors:
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Errors pooled over recordings [mm]; None if there is nothing to score.
+    """Errors pooled over recordings [mm]; None if there is nothing to score."""
 
-    Attributes:
-        over_time: error of each marker over time.
-        moving, final: errors of the last marker, over the recordings that end in a hold.
-        recordings: last marker, each recording by itself.
-    """
-
-    over_time: dict[str, float | None]
+    over_time: dict[str, float | None]  # error of each marker over time
+    # moving, final: errors of the last marker, over the recordings that end in a hold
     moving: float | None
     final: float | None
-    recordings: dict[str, RecordingErrors] = field(default_factory=dict)
+    recordings: dict[str, RecordingErrors] = field(default_factory=dict)  # last marker, each recording by itself
 
     @property
     def headline(self) -> float | None:

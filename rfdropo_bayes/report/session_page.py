@@ -23,10 +23,8 @@ SECTIONS = (
     ("reproduce", "To reproduce"),
 )
 PLANNED = "finished"
-ROUTINE = "checked"
-"""The kind of event that every drive has, whatever happens."""
-CLIPPED = 1e-9
-"""Rounding error of a command, in its own unit; larger differences mean that it was clipped."""
+ROUTINE = "checked"  # the kind of event that every drive has, whatever happens
+CLIPPED = 1e-9  # rounding error of a command, in its own unit; larger differences mean that it was clipped
 REMEDIES = {
     "deadlines_missed": "Keep other work off this machine, and give the loop real-time scheduling: rfdropo doctor "
     "measures both.",
@@ -43,22 +41,14 @@ REMEDIES = {
 
 
 class MotorSession(NamedTuple):
-    """Files of a motor session.
+    """Files of a motor session."""
 
-    Attributes:
-        name: name of its folder.
-        summary: content of summary.json.
-        events: lines of log.jsonl.
-        config: config.toml as text, and ``goal`` its goal [m] by axis.
-        recording: session.nc; None if a session recorded nothing, as a check does.
-    """
-
-    name: str
-    summary: Mapping[str, Any]
-    events: Sequence[Mapping[str, Any]]
-    config: str
+    name: str  # name of its folder
+    summary: Mapping[str, Any]  # content of summary.json
+    events: Sequence[Mapping[str, Any]]  # lines of log.jsonl
+    config: str  # config.toml as text, and ``goal`` its goal [m] by axis
     goal: Mapping[str, float]
-    recording: Trajectory | None
+    recording: Trajectory | None  # session.nc; None if a session recorded nothing, as a check does
 
 
 def render_session(session: MotorSession) -> str:

@@ -70,34 +70,21 @@ P = ParamSpec("P")
 
 @dataclass(frozen=True)
 class Panel:
-    """A part of a figure: one cell of its grid, or its legend.
+    """A part of a figure: one cell of its grid, or its legend."""
 
-    Attributes:
-        source: data URI.
-        share: share of the figure's width, in percent.
-        kind: "cell"; "legend"; "whole" if the figure has no parts.
-    """
-
-    source: str
-    share: float
-    kind: Literal["cell", "legend", "whole"]
+    source: str  # data URI
+    share: float  # share of the figure's width, in percent
+    kind: Literal["cell", "legend", "whole"]  # "cell"; "legend"; "whole" if the figure has no parts
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure inside a page: panels that fill its rows side by side, or stand below each other on a narrow screen.
+    """A figure inside a page: panels that fill its rows side by side, or stand below each other on a narrow screen."""
 
-    Attributes:
-        panels: panels from the upper left to the lower right.
-        alt: text for readers who cannot see it.
-        caption: explanation of the figure.
-        width: width in CSS pixels.
-    """
-
-    panels: tuple[Panel, ...]
-    alt: str
-    caption: str
-    width: int
+    panels: tuple[Panel, ...]  # panels from the upper left to the lower right
+    alt: str  # text for readers who cannot see it
+    caption: str  # explanation of the figure
+    width: int  # width in CSS pixels
 
 
 @contextmanager

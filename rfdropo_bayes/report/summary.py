@@ -31,39 +31,32 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One line of the posterior table; physical (SI) units.
+    """One line of the posterior table; physical (SI) units."""
 
-    Attributes:
-        name, unit, description: facts of the parameter.
-        parameter, owner: name without the owner, and the recording or group that has it; see `Scope`.
-        mean, sd, q05, median, q95: statistics of the draws.
-        at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
-        bound: "low", "high" or None.
-        prior_q05, prior_q95: quantiles of the prior draws, None without them.
-        contraction: posterior over prior standard deviation, of the logarithm if the prior is logarithmic and for
-            derived products.
-        ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain.
-        derived: a function of other parameters.
-    """
-
+    # name, unit, description: facts of the parameter
     name: str
     unit: str
     description: str
+    # mean, sd, q05, median, q95: statistics of the draws
     mean: float
     sd: float
     q05: float
     median: float
     q95: float
-    at_bound: bool
-    bound: str | None
+    at_bound: bool  # the posterior is piled up at a hard bound, or at an end of its prior
+    bound: str | None  # "low", "high" or None
+    # prior_q05, prior_q95: quantiles of the prior draws, None without them
     prior_q05: float | None
     prior_q95: float | None
+    # posterior over prior standard deviation, of the logarithm if the prior is logarithmic and for derived products
     contraction: float | None
+    # ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain
     ess_bulk: float
     ess_tail: float
     mcse_mean: float
     r_hat: float
-    derived: bool
+    derived: bool  # a function of other parameters
+    # parameter, owner: name without the owner, and the recording or group that has it; see `Scope`
     parameter: str
     owner: str
 
@@ -223,7 +216,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "objects": {name: asdict(scores) for name, scores in facts.objects.items()},
         "cautions": [caution.as_dict() for caution in facts.cautions],
         "warnings": [caution.sentence for caution in facts.cautions],
-        "unseen_days": dict(facts.unseen_days) or None,
+        "unseen_sessions": dict(facts.unseen_sessions) or None,
         "limits": list(facts.limits),
         "outline": facts.outline and dict(facts.outline),
         "versions": dict(facts.versions),

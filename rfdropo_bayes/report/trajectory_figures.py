@@ -126,13 +126,7 @@ def residual_figure(recording: RecordingPrediction, settled: int | None) -> Figu
     over_time, distance, memory = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 0.9))
     low, high = np.quantile(deviation, [0.05, 0.95], axis=0).mean(axis=-1)
     over_time.fill_between(
-        recording.time[rows],
-        low,
-        high,
-        color=style.PRIOR,
-        alpha=0.25,
-        linewidth=0,
-        label="90 % band",
+        recording.time[rows], low, high, color=style.PRIOR, alpha=0.25, linewidth=0, label="90 % band"
     )
     for axis in range(3):
         over_time.plot(recording.time[rows], residual[rows, axis], color=style.AXIS_COLOURS[axis], label=AXES[axis])

@@ -137,11 +137,7 @@ class Calibration:
         return axes
 
     def plot_fit(
-        self,
-        recording: str | int = 0,
-        marker: str | int = -1,
-        axis: str | None = None,
-        ax: Axes | None = None,
+        self, recording: str | int = 0, marker: str | int = -1, axis: str | None = None, ax: Axes | None = None
     ) -> Axes:
         """Draw one coordinate of one marker over time: measured, with its 50 % and 90 % predictive bands.
 

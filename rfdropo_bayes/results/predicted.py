@@ -56,7 +56,7 @@ class Prediction:
             **self.facts,
             "group": self.group,
             "group_fitted": self.group_fitted,
-            "unseen_day": self.unseen or None,
+            "unseen_session": self.unseen or None,
             "rows": len(self.drawn.time),
             "draws": int(self.drawn.predicted.shape[0]),
             "draws_that_did_not_match_the_first_row": self.bands.attrs["draws_that_did_not_match_the_first_row"],

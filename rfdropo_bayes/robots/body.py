@@ -36,17 +36,16 @@ class Body(RobotTable):
     """
 
     station_m: tuple[float, ...] = Field(
-        min_length=2,
-        description="axial coordinates of the S stations; the first is clamped",
+        min_length=2, description="axial coordinates of the S stations; the first is clamped"
     )
     half_width_m: tuple[Pair, ...] = Field(
         description="half widths in x and y, at each station: the outer size of the body, which encloses the cable "
-        "guides",
+        "guides"
     )
     axial_area_m2: tuple[Positive, ...] = Field(description="EA / E of the S - 1 layers")
     bending_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
         description="EI / E of each layer: [integral of x^2, integral of y^2]; the first resists bending in the x-z "
-        "plane",
+        "plane"
     )
     torsion_constant_m4: tuple[Positive, ...] = Field(description="GJ / G of each layer")
     elements: tuple[Annotated[int, Field(ge=1)], ...] = Field(
@@ -56,13 +55,10 @@ class Body(RobotTable):
     )
     mass_area_m2: tuple[Positive, ...] = Field(description="volume per length of each layer")
     mass_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
-        description="rotary inertia per density and length of each layer, ordered like bending_moment_area_m4",
+        description="rotary inertia per density and length of each layer, ordered like bending_moment_area_m4"
     )
     reference_poisson_ratio: float = Field(
-        default=0.45,
-        ge=0.0,
-        le=0.499,
-        description="Poisson ratio that the profile holds for",
+        default=0.45, ge=0.0, le=0.499, description="Poisson ratio that the profile holds for"
     )
     poisson_stiffening: tuple[tuple[float, float, float], ...] = Field(
         default=(),
@@ -70,7 +66,7 @@ class Body(RobotTable):
         "robots.body.poisson_terms; empty for a stiffness without this dependence",
     )
     volume_m3: Positive = Field(
-        description="volume of the whole body, clamped part included; the density is the trunk mass over this volume",
+        description="volume of the whole body, clamped part included; the density is the trunk mass over this volume"
     )
     point_masses: tuple[PointMass, ...] = Field(default=(), description="rigid parts on top of the body's own mass")
 

@@ -26,8 +26,7 @@ class Cable(RobotTable):
     anchor_radius_m: Positive = Field(description="distance of the anchor from the axis")
     anchor_azimuth_deg: float | None = Field(default=None, description="azimuth of the anchor, if it differs")
     guide_z_m: tuple[float, ...] = Field(
-        min_length=1,
-        description="axial coordinates of the guides in the undeformed body; the cable ends at the last",
+        min_length=1, description="axial coordinates of the guides in the undeformed body; the cable ends at the last"
     )
     guide_radius_m: tuple[Positive, ...] = Field(description="distance of each guide from the axis")
     drive: Literal["displacement", "tension"] = Field(
@@ -106,12 +105,11 @@ class Channels(RobotTable):
     """Map from commands to the drives of cables and chambers: ``radius * gain @ command``."""
 
     names: tuple[Name, ...] = Field(
-        min_length=1,
-        description="the command channels, in the order of the columns of gain",
+        min_length=1, description="the command channels, in the order of the columns of gain"
     )
     gain: tuple[tuple[float, ...], ...] = Field(
         description="one row per cable, then per chamber, one column per channel: displacement [m], tension [N] or "
-        "pressure [Pa] = gain @ command, times the radius if commands are angles; pull > 0",
+        "pressure [Pa] = gain @ command, times the radius if commands are angles; pull > 0"
     )
     radius_parameter: Name | None = Field(
         default=None,

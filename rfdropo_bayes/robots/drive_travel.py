@@ -17,8 +17,7 @@ from rfdropo_bayes.groups import whole
 from rfdropo_bayes.robots.table import RobotTable
 from rfdropo_bayes.tables import nearest
 
-ROUNDING = 1e-9
-"""How far [m or rad] a sum of commands may be beyond a limit that it reaches exactly."""
+ROUNDING = 1e-9  # how far [m or rad] a sum of commands may be beyond a limit that it reaches exactly
 
 Values = float | tuple[float, ...]
 
@@ -38,8 +37,7 @@ class DriveTravel(RobotTable):
     low: Values | None = Field(default=None, description="least value of the counter; none by default")
     high: Values | None = Field(default=None, description="greatest value of the counter; none by default")
     start: Values | None = Field(
-        default=None,
-        description="counter at the start of a recording; by default the command in force there",
+        default=None, description="counter at the start of a recording; by default the command in force there"
     )
     count_size: float = Field(
         default=1.0,
@@ -47,7 +45,7 @@ class DriveTravel(RobotTable):
     )
     beyond: Literal["lost", "kept", "clipped"] = Field(
         description='effect of a command beyond a limit: "lost", the drive ignores all of it; "clipped", it goes '
-        'to the limit and forgets the rest; "kept", it waits at the limit until the commands come back',
+        'to the limit and forgets the rest; "kept", it waits at the limit until the commands come back'
     )
 
     @model_validator(mode="after")

@@ -15,8 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rfdropo_bayes.errors import InputError
 
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-"""Length units a mesh file may be in."""
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # length units a mesh file may be in
 
 
 class TetrahedralMesh(NamedTuple):

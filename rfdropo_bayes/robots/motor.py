@@ -30,9 +30,7 @@ class Motor(RobotTable):
     length_limit_m: Pair = Field(description="least and greatest length of cable wound up")
     rate_limit_m_s: Positive = Field(description="greatest rate of the set-points")
     acceleration_limit_m_s2: Positive = Field(description="greatest acceleration of the set-points")
-    tension_limit_n: Pair = Field(
-        description="least tension to hold, and the greatest, at which everything stops",
-    )
+    tension_limit_n: Pair = Field(description="least tension to hold, and the greatest, at which everything stops")
     homing_tension_n: Positive = Field(description="tension at which homing sets length zero")
 
     @model_validator(mode="after")
@@ -86,8 +84,3 @@ class Motor(RobotTable):
     def per_mille(self, tension: float) -> float:
         """Torque in per mille of the rated one, without sign, that holds a tension [N]."""
         return tension * self.drum_radius_m / (self.gear * self.rated_torque_n_m) * 1e3
-
-    @property
-    def stopping_time_s(self) -> float:
-        """Longest time a stop takes that keeps the limit on acceleration [s]."""
-        return self.rate_limit_m_s / self.acceleration_limit_m_s2

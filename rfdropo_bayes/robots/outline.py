@@ -12,85 +12,61 @@ import numpy as np
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, body_tables, section_profile
 
-SILICONE = 1070.0
-"""Density [kg/m3] if no mass is given; typical of silicone rubbers."""
+SILICONE = 1070.0  # density [kg/m3] if no mass is given; typical of silicone rubbers
 GRAVITY = 9.81
 DIRECTIONS = {f"{sign}{axis}": (sign, "xyz".index(axis)) for sign in "+-" for axis in "xyz"}
 SHAPES = ("cylinder", "cone", "tube", "disks")
-CABLES_AT = 0.75
-"""Distance of cables from the axis over the body's radius, if it is not given."""
-DISKS = 10
-"""Disks of a body if their number is not given, or the next number that shares out over the segments."""
+CABLES_AT = 0.75  # distance of cables from the axis over the body's radius, if it is not given
+DISKS = 10  # disks of a body if their number is not given, or the next number that shares out over the segments
 LEAST_GUIDES, GUIDES_PER_SEGMENT = 8, 4
 """Heights of guides, and layers of a body that does not taper: their elements are within .2 % of the limit if four
 cables bend a silicone arm by up to 1.5 rad, and .6 % for a body five times softer. A cone with a tip of .6 of its
 base's radius has twice this number (.6 %), and at .3 four times this number (.4 % up to half a radian).
 """
-DRIVES = {"Pa": ("chamber", "pressure")}
-"""Words for a drive and its command, if they are not a cable and its pull."""
+DRIVES = {"Pa": ("chamber", "pressure")}  # words for a drive and its command, if they are not a cable and its pull
 COMMANDS = ("m", "rad", "N", "N m", "Pa", "-")
-CHAMBER_RADIUS = 0.2
-"""Radius of a chamber over the body's, if it is not given."""
-VACUUM = -101325.0
-"""[Pa] Least pressure above the surroundings."""
-USUAL_PULL = 0.15
-"""Usual pull of a cable over the body's length."""
-FORCE_LIMIT = 5.0
-"""Ratio of a drive's largest tension to the tension of a usual command."""
-KNOWN, ASSUMED = 0.3, 1.0
-"""Standard deviation of the logarithm in the prior of a given value, and of a default."""
+CHAMBER_RADIUS = 0.2  # radius of a chamber over the body's, if it is not given
+VACUUM = -101325.0  # [Pa] Least pressure above the surroundings
+USUAL_PULL = 0.15  # usual pull of a cable over the body's length
+FORCE_LIMIT = 5.0  # ratio of a drive's largest tension to the tension of a usual command
+KNOWN, ASSUMED = 0.3, 1.0  # standard deviation of the logarithm in the prior of a given value, and of a default
 
 
 @dataclass(frozen=True)
 class RobotOutline:
-    """Answers that make a robot; lengths in m, in the frame of the base: z along the body, away from the clamp.
+    """Answers that make a robot; lengths in m, in the frame of the base: z along the body, away from the clamp."""
 
-    Attributes:
-        name: name of the robot and of its file.
-        length, radius: length of the body, and radius at its base.
-        markers: heights along the axis by name.
-        shape: "cylinder", "cone" (with ``tip_radius``), "tube" (with ``inner_radius``), or "disks" on a backbone.
-        segments: number of segments, each with cables that end at its end.
-        cables: number of cables, or of chambers, per segment, evenly around it.
-        cable_radius: distance of the cables from the axis at the base, which follow the taper; or of the chambers.
-        pairs: opposite cables share a motor: one cable is wound as the other is released.
-        command_unit: "m" of cable, "rad" or "N m" of a motor, whose spool then has ``spool_radius``, "N" of tension,
-            "-" of other drives of cables, or "Pa": the body then has chambers in place of cables.
-        gravity: direction of gravity, such as "+z" for a robot that hangs.
-        mass: mass of the body [kg]; None for silicone of its volume.
-        young_modulus: Young's modulus [Pa].
-        segment_lengths: lengths of the segments, base to tip; equal by default.
-        segment_azimuths: azimuth of the first cable of each segment [deg]; cables of all segments are spread evenly by
-            default.
-        azimuth_evidence, size_evidence: reasons for azimuths, and for sizes, that were found from a recording.
-        usual_command: size of usual commands, in their unit.
-        assumed: names of attributes that have default values.
-    """
-
-    name: str
+    name: str  # name of the robot and of its file
+    # length, radius: length of the body, and radius at its base
     length: float
     radius: float
-    markers: Mapping[str, float]
+    markers: Mapping[str, float]  # heights along the axis by name
+    # "cylinder", "cone" (with ``tip_radius``), "tube" (with ``inner_radius``), or "disks" on a backbone
     shape: Literal["cylinder", "cone", "tube", "disks"] = "cylinder"
     tip_radius: float | None = None
     inner_radius: float | None = None
     disks: int | None = None
     disk_thickness: float = 0.003
-    segments: int = 1
-    cables: int = 4
+    segments: int = 1  # number of segments, each with cables that end at its end
+    cables: int = 4  # number of cables, or of chambers, per segment, evenly around it
+    # distance of the cables from the axis at the base, which follow the taper; or of the chambers
     cable_radius: float | None = None
-    pairs: bool = False
+    pairs: bool = False  # opposite cables share a motor: one cable is wound as the other is released
+    # "m" of cable, "rad" or "N m" of a motor, whose spool then has ``spool_radius``, "N" of tension, "-" of other
+    # drives of cables, or "Pa": the body then has chambers in place of cables
     command_unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = "m"
     spool_radius: float = 0.01
-    gravity: str = "+z"
-    mass: float | None = None
-    young_modulus: float = 1e6
-    segment_lengths: tuple[float, ...] | None = None
+    gravity: str = "+z"  # direction of gravity, such as "+z" for a robot that hangs
+    mass: float | None = None  # mass of the body [kg]; None for silicone of its volume
+    young_modulus: float = 1e6  # Young's modulus [Pa]
+    segment_lengths: tuple[float, ...] | None = None  # lengths of the segments, base to tip; equal by default
+    # azimuth of the first cable of each segment [deg]; cables of all segments are spread evenly by default
     segment_azimuths: tuple[float, ...] | None = None
+    # azimuth_evidence, size_evidence: reasons for azimuths, and for sizes, that were found from a recording
     azimuth_evidence: str = ""
     size_evidence: str = ""
-    usual_command: float | None = None
-    assumed: frozenset[str] = frozenset()
+    usual_command: float | None = None  # size of usual commands, in their unit
+    assumed: frozenset[str] = frozenset()  # names of attributes that have default values
 
     def __post_init__(self) -> None:
         where = "robot outline"

@@ -20,8 +20,7 @@ ARGUMENTS = {
 """Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is the deviation of the
 logarithm.
 """
-ENDS = {"TruncatedNormal": ("low", "high")}
-"""Optional arguments: the ends of a truncated normal inside the hard bounds."""
+ENDS = {"TruncatedNormal": ("low", "high")}  # optional arguments: the ends of a truncated normal inside the hard bounds
 
 
 class Parameter(RobotTable):
@@ -32,12 +31,11 @@ class Parameter(RobotTable):
     low: float = Field(description="lower hard bound, below which the model has no meaning")
     high: float = Field(description="upper hard bound")
     prior: dict[str, Any] = Field(
-        description='default prior, e.g. { distribution = "LogNormal", median = 4.5e6, sigma = 0.5 }',
+        description='default prior, e.g. { distribution = "LogNormal", median = 4.5e6, sigma = 0.5 }'
     )
     description: str = Field(min_length=1, description="one line on its physical meaning")
     each: Literal["cable"] | None = Field(
-        default=None,
-        description='"cable" stands for one parameter per cable, named NAME_CABLE',
+        default=None, description='"cable" stands for one parameter per cable, named NAME_CABLE'
     )
 
     @model_validator(mode="after")

@@ -28,44 +28,29 @@ TENSION_LIMIT, STOPPED_EPISODES, EVALUATED_EPISODES = "tension_limit_n", "stoppe
 
 @dataclass(frozen=True)
 class ObservationPart:
-    """A named piece of the observation.
+    """A named piece of the observation."""
 
-    Attributes:
-        name: name of the quantity, e.g. ``"markers"``, ``"goal"``, ``"commands"``.
-        size: number of values.
-        unit: their SI unit, "-" if they have none.
-    """
-
-    name: str
-    size: int
-    unit: str
+    name: str  # name of the quantity, e.g. ``"markers"``, ``"goal"``, ``"commands"``.
+    size: int  # number of values
+    unit: str  # their SI unit, "-" if they have none
 
 
 @dataclass(frozen=True)
 class PolicyLayout:
-    """Observation and action of a policy.
+    """Observation and action of a policy."""
 
-    Attributes:
-        task: the environment it was trained in.
-        period_s: time from one action to the next [s].
-        observation: parts of the observation, in order.
-        channels: command channels that it moves, in order.
-        unit: unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "Pa" of pressure; of a black box
-            also "N m" or "-".
-        kind: "discrete" actions are rows of ``moves``; a "continuous" action is a number from -1 to 1 for every
-            channel.
-        moves: change of the commands by an action [unit]: (action, channel) if discrete; if continuous, one row, the
-            change at 1.
-        low, high: limits of each channel's command [unit].
-    """
-
-    task: str
-    period_s: float
-    observation: tuple[ObservationPart, ...]
-    channels: tuple[str, ...]
+    task: str  # the environment it was trained in
+    period_s: float  # time from one action to the next [s]
+    observation: tuple[ObservationPart, ...]  # parts of the observation, in order
+    channels: tuple[str, ...]  # command channels that it moves, in order
+    # unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "Pa" of pressure; of a black box also "N m"
+    # or "-"
     unit: CommandUnit
+    # "discrete" actions are rows of ``moves``; a "continuous" action is a number from -1 to 1 for every channel
     kind: Literal["discrete", "continuous"]
+    # change of the commands by an action [unit]: (action, channel) if discrete; if continuous, one row, the change at 1
     moves: tuple[tuple[float, ...], ...]
+    # low, high: limits of each channel's command [unit]
     low: tuple[float, ...]
     high: tuple[float, ...]
 
@@ -193,10 +178,7 @@ class Earlier:
     def parts(self, rows: Any = slice(None)) -> dict[str, Float[np.ndarray, "row size"]]:
         """The two parts of an observation, of some robots."""
         commands, moved = self._commands[rows], self._moved[rows]
-        return {
-            EARLIER_COMMANDS: commands.reshape(len(commands), -1),
-            EARLIER_MOVED: moved.reshape(len(moved), -1),
-        }
+        return {EARLIER_COMMANDS: commands.reshape(len(commands), -1), EARLIER_MOVED: moved.reshape(len(moved), -1)}
 
 
 def _brief(value: Any) -> str:

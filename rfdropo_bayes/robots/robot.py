@@ -36,14 +36,12 @@ REQUIRED = (
     "offset_z",
 )
 """Parameters every robot has."""
-ZEROS = "initial_displacement"
-"""Parameter of every cable that is driven by a displacement."""
+ZEROS = "initial_displacement"  # parameter of every cable that is driven by a displacement
 
 
 DRIVEN = {"m": "m", "rad": "m", "N": "N", "N m": "N", "Pa": ("Pa",), "-": ("N", "Pa")}
 """Units of the drives of cables and chambers, by the unit of the commands."""
-USUAL_SHARE = 0.4
-"""Usual commands over the largest command: recordings seldom use the whole travel."""
+USUAL_SHARE = 0.4  # usual commands over the largest command: recordings seldom use the whole travel
 
 
 class CommandTiming(RobotTable):
@@ -52,7 +50,7 @@ class CommandTiming(RobotTable):
     unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = Field(
         description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, "Pa" of '
         'pressure, or "-" of drives that are sent volts or a share of their supply; channels.gain has the newtons of '
-        "torques, and the newtons or pascals of such drives",
+        "torques, and the newtons or pascals of such drives"
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
@@ -88,7 +86,7 @@ class PushScene(RobotTable):
     contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
     parameters: dict[Name, Parameter] = Field(
         description="the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
-        "turn about the vertical [rad], zero if the edges are parallel to the axes",
+        "turn about the vertical [rad], zero if the edges are parallel to the axes"
     )
 
     @model_validator(mode="after")
@@ -116,7 +114,7 @@ class Robot(RobotTable):
         '"euler", the scheme of SOFA, has one solve and about ten times the error',
     )
     initial_state: Literal["rest", "equilibrium"] = Field(
-        description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',
+        description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command'
     )
     command: CommandTiming = Field(description="unit and timing of commands")
     channels: Channels = Field(description="map from commands to the drives of cables and chambers")

@@ -23,19 +23,14 @@ Radii = tuple[Positive, Positive]
 
 
 class Profile(NamedTuple):
-    """Sections of the layers of one shape.
+    """Sections of the layers of one shape."""
 
-    Attributes:
-        thickness: thickness of each layer [m].
-        outer: radius that encloses the shape at each of the layers' ends [m].
-        area, second_moment: each layer's harmonic mean for the stiffness [m2, m4].
-        mass_area, mass_second_moment: each layer's mean for the mass [m2, m4].
-    """
-
-    thickness: Float[np.ndarray, " layer"]
-    outer: Float[np.ndarray, " station"]
+    thickness: Float[np.ndarray, " layer"]  # thickness of each layer [m]
+    outer: Float[np.ndarray, " station"]  # radius that encloses the shape at each of the layers' ends [m]
+    # area, second_moment: each layer's harmonic mean for the stiffness [m2, m4]
     area: Float[np.ndarray, " layer"]
     second_moment: Float[np.ndarray, " layer"]
+    # mass_area, mass_second_moment: each layer's mean for the mass [m2, m4]
     mass_area: Float[np.ndarray, " layer"]
     mass_second_moment: Float[np.ndarray, " layer"]
 

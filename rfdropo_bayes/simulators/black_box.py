@@ -207,8 +207,8 @@ class BlackBox:
         """Results of a batched function for some rows of a batch, at most `lanes` with `one_shape`."""
         taken = np.resize(rows, self.lanes) if self.one_shape else rows
         function: Any = self.function
-        found = function({name: column[taken] for name, column in values.items()}, commands[taken])
-        parts = found if isinstance(found, Mapping) else {"position": found}
+        result = function({name: column[taken] for name, column in values.items()}, commands[taken])
+        parts = result if isinstance(result, Mapping) else {"position": result}
         arrays = {name: np.asarray(part) for name, part in parts.items()}
         return [{name: part[k] for name, part in arrays.items()} for k in range(len(rows))]
 
@@ -328,10 +328,10 @@ class BlackBoxSimulator(ExtendedSimulator):
         Raises:
             InputError: the function fails on the first rows of them, at the nominal parameters.
         """
-        found = commands_on_grid(time, value, initial, observation_time, time_step=self.time_step)
+        commands = commands_on_grid(time, value, initial, observation_time, time_step=self.time_step)
         rows = None if self.box.one_shape else PROBED_ROWS
-        self._probe(np.concatenate([np.asarray(found.initial)[None], found.step])[:rows])
-        return found
+        self._probe(np.concatenate([np.asarray(commands.initial)[None], commands.step])[:rows])
+        return commands
 
     def _probe(self, command: Float[np.ndarray, "row channel"]) -> None:
         """Raise InputError if the function violates the contract of a box."""
@@ -340,25 +340,25 @@ class BlackBoxSimulator(ExtendedSimulator):
         try:
             columns = {name: np.array([value]) for name, value in values.items()}
             if not callable(self.box.function):
-                found = self.box.simulate(columns, command[None])[0]
+                result = self.box.simulate(columns, command[None])[0]
             elif self.box.batched:
                 # On the device of callbacks, which also runs the programs compiled now.
                 with jax.default_device(jax.local_devices(backend="cpu")[0]):
-                    found = self.box.answers(columns, command[None], np.zeros(1, int))[0]
+                    result = self.box.answers(columns, command[None], np.zeros(1, int))[0]
             else:
-                found = self.box.function(values, command)
+                result = self.box.function(values, command)
         except Exception as error:
             raise InputError(f"raises {type(error).__name__}: {error}", where=self.box.name, remedy=remedy) from error
-        if found is None:
+        if result is None:
             raise InputError("fails at its nominal parameters", where=self.box.name, remedy=remedy)
-        position, tension = self._parts(found)
+        position, tension = self._parts(result)
         wanted = (len(command), len(self.marker_names), 3), (len(command), len(self.cable_names))
         if (position.shape, tension.shape) != wanted:
             shapes = f"positions {position.shape}" + (f", tensions {tension.shape}" if self.cable_names else "")
             raise InputError(f"returned {shapes}, and not {wanted}", where=self.box.name, remedy=remedy)
 
-    def _parts(self, found: Any) -> tuple[np.ndarray, np.ndarray]:
-        parts = found if isinstance(found, Mapping) else {"position": found}
+    def _parts(self, result: Any) -> tuple[np.ndarray, np.ndarray]:
+        parts = result if isinstance(result, Mapping) else {"position": result}
         position = np.asarray(parts["position"], dtype=float)
         none = np.zeros((len(position), 0)) if not self.cable_names else np.zeros((0, 0))
         return position, np.asarray(parts.get("tension", none), dtype=float)
@@ -431,8 +431,8 @@ class BlackBoxSimulator(ExtendedSimulator):
         count, rows = command.shape[:2]
         position = np.zeros((count, rows, len(self.marker_names), 3))
         tension, failed = np.zeros((count, rows, len(self.cable_names))), np.zeros(count, dtype=bool)
-        for k, found in enumerate(self.box.simulate(values, command)):
-            own, pull = self._parts(found) if found is not None else (np.full(1, np.nan), np.zeros(0))
+        for k, result in enumerate(self.box.simulate(values, command)):
+            own, pull = self._parts(result) if result is not None else (np.full(1, np.nan), np.zeros(0))
             failed[k] = not (own.shape == position[k].shape and np.isfinite(own).all() and np.isfinite(pull).all())
             if not failed[k]:
                 position[k], tension[k] = own, pull

@@ -63,14 +63,12 @@ EFFECT_SIZES = BodyEffects(
     capstan_friction=0.1,
 )
 """Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
-QUASI_STATIC: Literal["quasi-static"] = "quasi-static"
-"""Motion of a body that is at rest in every row."""
+QUASI_STATIC: Literal["quasi-static"] = "quasi-static"  # motion of a body that is at rest in every row
 FAR_WOUND = 10.0
 """[m] Beyond the displacement of any cable: a drive that goes farther winds a soft spring, or is a pressure."""
 CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
-FRICTION = 0.1
-"""Size of a coefficient of friction."""
+FRICTION = 0.1  # size of a coefficient of friction
 LOAD_PLACES = (0.3, 0.65, 1.0)
 """Shares of a body's length at which forces may act: more places are not distinguishable, as forces at neighbouring
 places move the markers similarly (cosine .95 at .06 and .2 m of an arm of .2 m).
@@ -92,17 +90,11 @@ class EngineBody(Protocol):
 
 
 class Backend(NamedTuple):
-    """Backend of the arithmetic.
+    """Backend of the arithmetic."""
 
-    Attributes:
-        name: "numba" or "jax".
-        precision: precision of "numba"; "jax" uses double precision.
-        threads: threads of "numba"; None for all processors.
-    """
-
-    name: Literal["numba", "jax"] = "numba"
-    precision: Literal["float64", "float32"] = "float64"
-    threads: int | None = None
+    name: Literal["numba", "jax"] = "numba"  # "numba" or "jax"
+    precision: Literal["float64", "float32"] = "float64"  # precision of "numba"; "jax" uses double precision
+    threads: int | None = None  # threads of "numba"; None for all processors
 
 
 class CubeInputs(NamedTuple):
@@ -124,23 +116,15 @@ class Inputs(NamedTuple):
 
 @dataclass(frozen=True)
 class Engine:
-    """The motion of a body, with or without a cube, under given displacements of cables and pressures of chambers.
+    """The motion of a body, with or without a cube, under given displacements of cables and pressures of chambers."""
 
-    Attributes:
-        body: the moving body.
-        time_step: time step of the simulation [s].
-        backend: backend of the arithmetic.
-        from_equilibrium: start in the static equilibrium of the initial drives, else undeformed; of a rod.
-        scene: geometry on which the body pushes a cube; None for a body that touches nothing.
-        integrator: scheme of a time step, see `fem.integrators`; "quasi-static" for a rod that is at rest in every
-            row, an equilibrium found from the row before.
-    """
-
-    body: EngineBody
-    time_step: float
-    backend: Backend = field(default_factory=Backend)
-    from_equilibrium: bool = False
-    scene: PushGeometry | None = None
+    body: EngineBody  # the moving body
+    time_step: float  # time step of the simulation [s]
+    backend: Backend = field(default_factory=Backend)  # backend of the arithmetic
+    from_equilibrium: bool = False  # start in the static equilibrium of the initial drives, else undeformed; of a rod
+    scene: PushGeometry | None = None  # geometry on which the body pushes a cube; None for a body that touches nothing
+    # scheme of a time step, see `fem.integrators`; "quasi-static" for a rod that is at rest in every row, an
+    # equilibrium found from the row before
     integrator: Integrator = "euler"
 
     def __post_init__(self) -> None:
@@ -251,8 +235,8 @@ class Engine:
             acting = self.section_loads(loads)
             if acting is not None:
                 under, force = loaded(system, prepared, acting, 0)
-            state, found = find_equilibrium(system, under, start, force)
-            residual = found.residual
+            state, equilibrium = find_equilibrium(system, under, start, force)
+            residual = equilibrium.residual
         if len(STAGES[self.integrator]) > 1:
             state = state._replace(commanded=jnp.asarray(start))
         return prepared, state, residual
@@ -313,8 +297,8 @@ class Engine:
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
             options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": self.section_loads(inputs.loads)}
-            found = self.native.rollout(inputs.material, inputs.drive, **begin, **options)
-            return found._replace(solves=None)
+            motion = self.native.rollout(inputs.material, inputs.drive, **begin, **options)
+            return motion._replace(solves=None)
         commands = inputs.drive[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 

@@ -95,20 +95,20 @@ class LanesBeforeCube:
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
-        found = self._bodies.reset(rows, given)
+        motion = self._bodies.reset(rows, given)
         # all lanes are computed, so that the same program serves any number of rows
-        spread = np.zeros(self._count, int)
-        spread[rows] = np.arange(len(rows))
-        spheres = found.position[:, self._shown :]
-        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (given.cube, spheres))))[rows]
-        return self._markers(found._replace(imbalance=np.where(gap < -TOUCHING, np.inf, found.imbalance)))
+        source = np.zeros(self._count, int)
+        source[rows] = np.arange(len(rows))
+        spheres = motion.position[:, self._shown :]
+        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[source], (given.cube, spheres))))[rows]
+        return self._markers(motion._replace(imbalance=np.where(gap < -TOUCHING, np.inf, motion.imbalance)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
         """See `BodyLanes`."""
         return self._markers(self._bodies.advance(displacement, loads))
 
-    def _markers(self, found: Motion) -> Motion:
-        return found._replace(position=found.position[:, : self._shown])
+    def _markers(self, motion: Motion) -> Motion:
+        return motion._replace(position=motion.position[:, : self._shown])
 
 
 class CompiledLanes:
@@ -139,10 +139,10 @@ def _ends(
     return displacement[:, -1:], jax.tree.map(lambda part: part[:, -1:], loads)
 
 
-def _last(found: Motion, begun: int = 0) -> Motion:
+def _last(motion: Motion, begun: int = 0) -> Motion:
     """The last recorded row, and the largest tensions of rows from ``begun`` on."""
-    pose, peak = None if found.pose is None else found.pose[:, -1], found.tension[:, begun:].max(axis=1)
-    return found._replace(position=found.position[:, -1], tension=found.tension[:, -1], pose=pose, peak=peak)
+    pose, peak = None if motion.pose is None else motion.pose[:, -1], motion.tension[:, begun:].max(axis=1)
+    return motion._replace(position=motion.position[:, -1], tension=motion.tension[:, -1], pose=pose, peak=peak)
 
 
 class _Lane(NamedTuple):
@@ -166,9 +166,9 @@ class ReferenceLanes:
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`. All lanes are computed, so that the same compiled program works for any number of rows."""
-        spread = np.zeros(self._count, int)
-        spread[rows] = np.arange(len(rows))
-        fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[spread], given))
+        source = np.zeros(self._count, int)
+        source[rows] = np.arange(len(rows))
+        fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[source], given))
         if self._lanes is None:
             self._lanes = fresh
         elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):

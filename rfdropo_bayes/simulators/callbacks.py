@@ -29,7 +29,7 @@ def one_callback(roll: Callable[[Any, int], Output], shapes: Output, inputs: Any
         batch, count = np.shape(limits), np.size(limits)
         flat = jax.tree.map(lambda value: np.asarray(value).reshape(count, *value.shape[len(batch) :]), given)
         chosen, place = distinct(jax.tree.leaves(flat))
-        found = roll(jax.tree.map(lambda value: value[chosen], flat), int(np.max(limits)))
+        outputs = roll(jax.tree.map(lambda value: value[chosen], flat), int(np.max(limits)))
 
         def restored(shape: jax.ShapeDtypeStruct, part: np.ndarray) -> np.ndarray:
             part = part[place]
@@ -37,7 +37,7 @@ def one_callback(roll: Callable[[Any, int], Output], shapes: Output, inputs: Any
                 part = np.pad(part, [(0, 0), (0, shape.shape[0] - part.shape[1]), *[(0, 0)] * (part.ndim - 2)])
             return part.reshape((*batch, *shape.shape))
 
-        return jax.tree.map(restored, shapes, found)
+        return jax.tree.map(restored, shapes, outputs)
 
     return jax.pure_callback(on_host, shapes, inputs, limit, vmap_method="broadcast_all")
 

@@ -22,22 +22,16 @@ UNITS = {
 
 
 class Commands(NamedTuple):
-    """A command sequence on a simulator's clock, and when it is observed.
+    """A command sequence on a simulator's clock, and when it is observed."""
 
-    Attributes:
-        initial: command in force before the first step, to which the initial state belongs [m or rad].
-        step: command reached at the end of each time step [m or rad].
-        sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
-            comes later if earlier commands are known.
-        sample_fraction: position of the observation within the following step, in [0, 1).
-        signals: further signals at the ports of the simulator (`ports.PortSignals`); None without signals.
-    """
-
+    # command in force before the first step, to which the initial state belongs [m or rad]
     initial: Float[Array, "*batch channel"]
-    step: Float[Array, "*batch step channel"]
+    step: Float[Array, "*batch step channel"]  # command reached at the end of each time step [m or rad]
+    # last step that ends at or before each observation; 0 is the initial state. The first observation comes later if
+    # earlier commands are known.
     sample_step: Int[Array, "*batch time"]
-    sample_fraction: Float[Array, "*batch time"]
-    signals: Any = None
+    sample_fraction: Float[Array, "*batch time"]  # position of the observation within the following step, in [0, 1)
+    signals: Any = None  # further signals at the ports of the simulator (`ports.PortSignals`); None without signals
 
     def of(self, index: Sequence[int] | np.ndarray) -> Commands:
         """Some of a batch."""
@@ -122,8 +116,8 @@ def animated_on_grid(
     changes = np.asarray(value, float) - np.asarray(initial, float)
     steps = animated_commands(changes, every, time_step).reshape(-1, changes.shape[1])
     length = len(grid.step)
-    held = _pad(steps, max(length, len(steps)))[:length]
-    return grid._replace(step=grid.initial + held)
+    constant = _pad(steps, max(length, len(steps)))[:length]
+    return grid._replace(step=grid.initial + constant)
 
 
 def _check_steps(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> None:
@@ -172,12 +166,12 @@ def _ramped(
 ) -> Float[np.ndarray, "step channel"]:
     """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
     given = np.concatenate([[-np.inf], time])
-    held = np.vstack([initial, value])
+    levels = np.vstack([initial, value])
     # Commands before the first command in force count as carried out, so one more or less makes no difference.
     first = np.maximum(np.searchsorted(given, at - ramp, side="right") - 2, 0)
     last = np.searchsorted(given, at, side="right")
     window = np.minimum(first[:, None] + np.arange(np.max(last - first, initial=0) + 1), len(given) - 1)
-    return carried_out(given[window], held[window], at, ramp)
+    return carried_out(given[window], levels[window], at, ramp)
 
 
 def carried_out(

@@ -41,8 +41,7 @@ from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import status_of
 
-WHOLE = 1e-6
-"""How far a control period may be from a whole number of time steps, in time steps."""
+WHOLE = 1e-6  # how far a control period may be from a whole number of time steps, in time steps
 
 
 class _Drives(NamedTuple):
@@ -152,13 +151,13 @@ class Session:
         chosen[rows] = True
         self._drives = _chosen(chosen, fresh, self._drives)
         inputs = self._bodies_of(self._values, fresh.wound, signals)
-        found = self.bodies.reset(rows, jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
-        position = np.zeros((self.lanes, *found.position.shape[1:]))
-        position[rows] = found.position
+        motion = self.bodies.reset(rows, jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
+        position = np.zeros((self.lanes, *motion.position.shape[1:]))
+        position[rows] = motion.position
         cameras, seen = self._look(self._values, None, position, np.zeros(self.lanes), signals)
         self._cameras = _chosen(chosen, cameras, self._cameras)
         self._started |= chosen
-        return self._observation(found, np.asarray(seen)[rows], np.asarray(angle)[rows])
+        return self._observation(motion, np.asarray(seen)[rows], np.asarray(angle)[rows])
 
     def act(self, commands: Float[np.ndarray, "lane channel"]) -> Observation:
         """Let all lanes run for one control period with these commands [m or rad], in force from its start.
@@ -182,10 +181,10 @@ class Session:
         sent = self._sent(commands)
         self._drives, displacement, angle, signals, loads = self._move_drives(self._values, self._drives, sent)
         acting = {} if loads is None else {"loads": jax.tree.map(np.asarray, loads)}
-        found = self.bodies.advance(np.asarray(displacement), **acting)
+        motion = self.bodies.advance(np.asarray(displacement), **acting)
         now = self.simulator.time_step * (self.steps * self._past.periods)
-        self._cameras, seen = self._look(self._values, self._cameras, found.position, now, signals)
-        return self._observation(found, np.asarray(seen), np.asarray(angle))
+        self._cameras, seen = self._look(self._values, self._cameras, motion.position, now, signals)
+        return self._observation(motion, np.asarray(seen), np.asarray(angle))
 
     def save(self) -> dict[str, np.ndarray]:
         """A copy of the state: arrays by name, one row a lane."""
@@ -314,20 +313,20 @@ class Session:
     def _loads(self, signals: Float[Array, "row signal"]) -> BodySignals | None:
         """Loads on the body from the signals of the mechanisms of `_signalling`; None without loads."""
         acts = [(m.carried, w) for m, w in zip(self._signalling, signals.T, strict=True) if hasattr(m, "push")]
-        found = [carried(w) for carried, w in acts]
-        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
+        loads = [carried(w) for carried, w in acts]
+        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *loads) if loads else None
 
     @cached_property
     def _first_drives(self) -> Any:
         """Drives of all lanes before the first step, given the command before it, encoder positions, and signals."""
         chains, interval = self._drive_chains, self.simulator.time_step
 
-        def through(chain: list[Any], values: Values, held: Array) -> tuple[tuple, Array]:
+        def through(chain: list[Any], values: Values, constant: Array) -> tuple[tuple, Array]:
             memories = []
             for mechanism in chain:
-                memories.append(mechanism.begin(values, held, interval))
-                held = settled(mechanism, values, held)
-            return tuple(memories), held
+                memories.append(mechanism.begin(values, constant, interval))
+                constant = settled(mechanism, values, constant)
+            return tuple(memories), constant
 
         def first(values: Values, command: Float[Array, " channel"]) -> tuple[_Drives, Array, Array]:
             cables, reached = through(chains[0], values, command)
@@ -410,14 +409,14 @@ class Session:
 
         return self._by_lane(look)
 
-    def _observation(self, found: Motion, position: np.ndarray, angle: np.ndarray) -> Observation:
-        status = status_of(found, self.simulator.unsolved, np)
-        pose = found.pose
+    def _observation(self, motion: Motion, position: np.ndarray, angle: np.ndarray) -> Observation:
+        status = status_of(motion, self.simulator.unsolved, np)
+        pose = motion.pose
         if pose is not None:
             pose = np.concatenate(
                 [pose[:, :3], pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)], axis=1
             )
-        return Observation(position, found.tension, pose, status, angle, found.peak)
+        return Observation(position, motion.tension, pose, status, angle, motion.peak)
 
 
 @jax.jit

@@ -37,17 +37,11 @@ class Wound(NamedTuple):
 
 
 class ExtendedSimulator:
-    """Base of simulators whose mechanisms act on the commands before the motion and on its measurement.
+    """Base of simulators whose mechanisms act on the commands before the motion and on its measurement."""
 
-    Attributes:
-        robot: moving robot; it names markers, cables and command channels.
-        mechanisms: extensions, applied in the given order within each stage.
-        time_step: time step of the simulation [s].
-    """
-
-    robot: Any
-    mechanisms: Sequence[Mechanism]
-    time_step: float
+    robot: Any  # moving robot; it names markers, cables and command channels
+    mechanisms: Sequence[Mechanism]  # extensions, applied in the given order within each stage
+    time_step: float  # time step of the simulation [s]
 
     @property
     def marker_names(self) -> tuple[str, ...]:

@@ -26,8 +26,7 @@ STAGES = ("actuation", "body", "contact", "sensing")
 BODIES = ("rod", "tetrahedra")
 ENGINES = ("jax", "numba")
 MOTIONS = ("dynamic", "quasi-static")
-BLACK_BOX = "black box"
-"""In the place of body and engine: a program whose inside nobody reaches."""
+BLACK_BOX = "black box"  # in the place of body and engine: a program whose inside nobody reaches
 
 
 class Mechanism(Protocol):
@@ -58,8 +57,8 @@ class ActuationMechanism(Mechanism, Protocol):
 
     It may have an attribute ``inside_drive``, True by default: whether an encoder on the motor shows the effect.
     Effects behind the motor, in gears, spools and cables, have ``inside_drive = False``. It may have a method
-    ``settle(values, held)``: its output for a command that was held long before the first step, by default the command
-    itself. The initial state of the body, and the ``initial`` of the next mechanism, belong to it.
+    ``settle(values, constant)``: its output for a command that was constant long before the first step. By default, it
+    is the command itself. The initial state of the body, and the ``initial`` of the next mechanism, belong to it.
     """
 
     def actuate(
@@ -95,17 +94,11 @@ class TimedSensingMechanism(Mechanism, Protocol):
 
 
 class Meanwhile(NamedTuple):
-    """Commands at the cables during a rollout.
+    """Commands at the cables during a rollout."""
 
-    Attributes:
-        levels: commands before the first step and at the end of every step [m or rad].
-        commands: commands, with the observed steps.
-        time_step: time step [s].
-    """
-
-    levels: Float[Array, "row channel"]
-    commands: Commands
-    time_step: float
+    levels: Float[Array, "row channel"]  # commands before the first step and at the end of every step [m or rad]
+    commands: Commands  # commands, with the observed steps
+    time_step: float  # time step [s]
 
 
 @runtime_checkable
@@ -113,11 +106,7 @@ class CommandedSensingMechanism(Mechanism, Protocol):
     """Acts on measurements, depending on the commands."""
 
     def sense_with_commands(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
-        meanwhile: Meanwhile,
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"], meanwhile: Meanwhile
     ) -> Float[Array, "time marker 3"]:
         """Return the measured marker positions [m], from the true positions, their times of observation [s], and the
         commands at the cables.
@@ -133,11 +122,7 @@ class PushingMechanism(Mechanism, Protocol):
         """Whether it depends on how the body moves."""
 
     def push(
-        self,
-        values: Values,
-        command: Float[Array, "row channel"],
-        path: Float[Array, "row 3"] | None,
-        time_step: float,
+        self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
     ) -> BodySignals:
         """Return the loads on the body; row 0 is before the first step.
 
@@ -217,9 +202,9 @@ class MemorylessActuation:
         """Return the command that reaches the cables, from the sent command."""
         raise NotImplementedError
 
-    def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
+    def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
         """See `ActuationMechanism`."""
-        return self.reach(values, held)
+        return self.reach(values, constant)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[()]:
         """See `SteppedMechanism`."""
@@ -238,10 +223,10 @@ class MemorylessActuation:
         return self.reach(values, command)
 
 
-def settled(mechanism: Mechanism, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
-    """Output of a mechanism of actuation for a command that was held long before the first step."""
+def settled(mechanism: Mechanism, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
+    """Output of a mechanism of actuation for a command that was constant long before the first step."""
     settle = getattr(mechanism, "settle", None)
-    return held if settle is None else settle(values, held)
+    return constant if settle is None else settle(values, constant)
 
 
 def inside_drive(mechanism: Mechanism) -> bool:
@@ -286,13 +271,13 @@ def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS
 
 def code_of(mechanisms: Iterable[Mechanism]) -> bytes:
     """Source files of mechanisms: their digests show whether the code of a name has changed."""
-    found: set[bytes] = set()
+    sources: set[bytes] = set()
     for kind in {type(mechanism) for mechanism in mechanisms}:
         try:
-            found.add(Path(inspect.getfile(kind)).read_bytes())
+            sources.add(Path(inspect.getfile(kind)).read_bytes())
         except (OSError, TypeError):  # written in a notebook or at a prompt
-            found.add(f"{kind.__module__}.{kind.__qualname__}".encode())
-    return b"".join(sorted(found))
+            sources.add(f"{kind.__module__}.{kind.__qualname__}".encode())
+    return b"".join(sorted(sources))
 
 
 def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:

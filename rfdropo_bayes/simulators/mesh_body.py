@@ -139,14 +139,14 @@ def _markers(
     rows = []
     for name, point in zip(robot.marker_names, robot.marker_points(), strict=True):
         near = {cable: np.abs(guides[cable][:, 2] - point[2]) < SAME_HEIGHT for cable in marker_cables}
-        found = [NodePoints(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
-        if len(found) not in (0, len(marker_cables)):
+        near_points = [NodePoints(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
+        if len(near_points) not in (0, len(marker_cables)):
             raise InputError(
                 f"marker {name!r} is at the height of a guide of some cables but not of all",
                 where="[simulator.tetrahedra] marker_cables",
                 remedy="name cables whose guides share their heights",
             )
-        rows.append(mean_points(found) if found else locate(body, point[None]))
+        rows.append(mean_points(near_points) if near_points else locate(body, point[None]))
     return joined(rows)
 
 
@@ -173,15 +173,12 @@ class MeshTrunkSimulator(RobotSimulator):
 
     Mechanisms of the body see the robot's layers and stations; their effect on a layer applies to its elements, and a
     mass at a station rests on the section at its height.
-
-    Attributes:
-        options: settings of the mesh; for the others see `RobotSimulator`.
     """
 
     robot: Robot
     engine: Engine
     assembly: MeshAssembly
-    options: TetrahedraTable
+    options: TetrahedraTable  # settings of the mesh; for the others see `RobotSimulator`
     time_step: float
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
 

@@ -22,24 +22,15 @@ class BodySignals(NamedTuple):
 
 
 class PortSignals(NamedTuple):
-    """Signals at the ports of a simulator; row 0 belongs to the initial state, row k to the end of step k.
+    """Signals at the ports of a simulator; row 0 belongs to the initial state, row k to the end of step k."""
 
-    Attributes:
-        command: added to the commands that reach the cables [m or rad].
-        delay: delay of commands at the cables [s].
-        body: loads on the body; None without loads.
-    """
-
-    command: Float[Array, "*batch row channel"]
-    delay: Float[Array, "*batch row"]
-    body: BodySignals | None = None
+    command: Float[Array, "*batch row channel"]  # added to the commands that reach the cables [m or rad]
+    delay: Float[Array, "*batch row"]  # delay of commands at the cables [s]
+    body: BodySignals | None = None  # loads on the body; None without loads
 
 
 def reached(
-    signals: PortSignals,
-    initial: Float[Array, " channel"],
-    command: Float[Array, "step channel"],
-    time_step: float,
+    signals: PortSignals, initial: Float[Array, " channel"], command: Float[Array, "step channel"], time_step: float
 ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
     """Commands that reach the cables before the first step and at the end of each, from commands without signals."""
     import jax.numpy as jnp

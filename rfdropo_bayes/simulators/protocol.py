@@ -39,28 +39,21 @@ _REMEDIES = {
 
 
 class Observation(NamedTuple):
-    """Observation of a rollout at the observation times, in the frame of the robot's base.
+    """Observation of a rollout at the observation times, in the frame of the robot's base."""
 
-    Attributes:
-        position: marker positions [m].
-        tension: cable tensions [N].
-        object_pose: position [m] and unit quaternion (x, y, z, w) of the object; None if the scene has none.
-        status: a `Result` value.
-        motor_angle: drive positions: the command after all effects inside the drives, such as delay and lag, before the
-            transmission to the cables, in the unit of the commands [rad or m]; None if unknown.
-        orientation: orientations of the robot's `orientations`, unit quaternions (x, y, z, w) from the base's axes to
-            the section's;
-            None if unknown.
-        peak: largest tension of each cable at the time steps of a session's last control period [N]; None if
-            unknown. In 64 pushes of models/policies/push it was up to 3.3 times the tension at the periods' ends.
-    """
-
-    position: Float[Array, "time marker 3"]
-    tension: Float[Array, "time cable"]
+    position: Float[Array, "time marker 3"]  # marker positions [m]
+    tension: Float[Array, "time cable"]  # cable tensions [N]
+    # position [m] and unit quaternion (x, y, z, w) of the object; None if the scene has none
     object_pose: Float[Array, "time 7"] | None
-    status: Int[Array, ""]
+    status: Int[Array, ""]  # a `Result` value
+    # drive positions: the command after all effects inside the drives, such as delay and lag, before the transmission
+    # to the cables, in the unit of the commands [rad or m]; None if unknown
     motor_angle: Float[Array, "time channel"] | None = None
+    # largest tension of each cable at the time steps of a session's last control period [N]; None if unknown. In 64
+    # pushes of models/policies/push it was up to 3.3 times the tension at the periods' ends.
     peak: Float[Array, " cable"] | None = None
+    # orientations of the robot's `orientations`, unit quaternions (x, y, z, w) from the base's axes to the section's;
+    # None if unknown
     orientation: Float[Array, "time section 4"] | None = None
 
 

@@ -43,8 +43,7 @@ PASSES = 2
 """Number of fixed-point iterations for laws that depend on the motion: after two, a pull and a softening are within 5 %
 of their effect after eight.
 """
-DAMPING = ("rayleigh_mass", "rayleigh_stiffness")
-"""Parameters that a body at rest does not have."""
+DAMPING = ("rayleigh_mass", "rayleigh_stiffness")  # parameters that a body at rest does not have
 SOFT = 1e4
 """[m/N] Compliance between a cable and a drive that holds its tension: a length of 1 m changes the tension by 0.1
 mN.
@@ -85,8 +84,8 @@ def orientations(points: Float[Array, "time point 3"]) -> Float[Array, "time sec
         axis=-2,
     )
     largest = jnp.argmax(jnp.stack([a - e - i, e - a - i, i - a - e, a + e + i], axis=-1), axis=-1)
-    found = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
-    return found / jnp.linalg.norm(found, axis=-1, keepdims=True)
+    quaternion = jnp.take_along_axis(ways, largest[..., None, None], axis=-2)[..., 0, :]
+    return quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)
 
 
 class RobotSimulator(ExtendedSimulator):
@@ -94,20 +93,13 @@ class RobotSimulator(ExtendedSimulator):
 
     Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
     mechanisms, and cube -> markers -> sensing mechanisms -> observation. A cube starts at rest at its given pose.
-
-    Attributes:
-        robot: simulated robot.
-        engine: engine of the motion of the body, and of a cube if it has a scene.
-        assembly: the discretised robot that the engine was made for.
-        mechanisms: extensions, applied in the given order within each stage.
-        time_step: time step of the simulation [s].
     """
 
-    robot: Robot
-    engine: Engine
-    assembly: Any
-    mechanisms: Sequence[Mechanism]
-    time_step: float
+    robot: Robot  # simulated robot
+    engine: Engine  # engine of the motion of the body, and of a cube if it has a scene
+    assembly: Any  # the discretised robot that the engine was made for
+    mechanisms: Sequence[Mechanism]  # extensions, applied in the given order within each stage
+    time_step: float  # time step of the simulation [s]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
@@ -285,7 +277,7 @@ class RobotSimulator(ExtendedSimulator):
             InputError: such mechanisms on another body than a rod without a cube.
         """
         pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
-        found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
+        loads = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
         if pushing:
             if not self.engine.carries_loads:
                 raise InputError(
@@ -295,8 +287,8 @@ class RobotSimulator(ExtendedSimulator):
                 )
             initial, command = self.actuated(values, commands, self.time_step)
             levels = jnp.concatenate([initial[None], command])
-            found += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
-        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
+            loads += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
+        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *loads) if loads else None
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.

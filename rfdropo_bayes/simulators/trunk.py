@@ -65,8 +65,7 @@ def _chambers(robot: Robot, body: Rod) -> np.ndarray | None:
     return chamber_layout(body, middle, ends, [chamber.area_m2 for chamber in robot.chambers])
 
 
-ARM = 0.01
-"""[m] Distance from the axis of the points that give a section's orientation."""
+ARM = 0.01  # [m] Distance from the axis of the points that give a section's orientation
 
 
 def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
@@ -78,16 +77,12 @@ def section_points(robot: Robot) -> Float[np.ndarray, "point 3"]:
 
 @dataclass(frozen=True)
 class TrunkSimulator(RobotSimulator):
-    """A rod with mechanisms, behind the `Simulator` protocol.
-
-    Attributes:
-        discretisation: resolution of body and time; for the others see `RobotSimulator`.
-    """
+    """A rod with mechanisms, behind the `Simulator` protocol."""
 
     robot: Robot
     engine: Engine
     assembly: Assembly
-    discretisation: Discretisation
+    discretisation: Discretisation  # resolution of body and time; for the others see `RobotSimulator`
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
 
     @property

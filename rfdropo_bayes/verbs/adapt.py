@@ -33,8 +33,6 @@ from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.prediction.day import DayFit, fit_day
-from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, reach_of, recorded_day_error
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, ModelError, recorded_model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
@@ -49,16 +47,18 @@ from rfdropo_bayes.prediction.predictive import (
     with_repeats_marked,
     without_cautions,
 )
+from rfdropo_bayes.prediction.session_error import SESSION_ERROR, SessionError, reach_of, recorded_session_error
+from rfdropo_bayes.prediction.session_fit import SessionFit, fit_session
 from rfdropo_bayes.report import BaselineErrors, build_summary
 from rfdropo_bayes.report.coverage import predictive_bands
-from rfdropo_bayes.report.day_baselines import day_baselines
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
 from rfdropo_bayes.report.scores import MeasuredPath
+from rfdropo_bayes.report.session_baselines import session_baselines
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit
 from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
-from rfdropo_bayes.verbs.left_out_days import OPENINGS
+from rfdropo_bayes.verbs.left_out_sessions import OPENINGS
 from rfdropo_bayes.verbs.predict import fitted_scopes, model_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
 
@@ -106,51 +106,42 @@ def adapt(
     model = model_of(fit)
     recording, test = given_recording(recording, "adapt"), given_recordings(test, "adapt, test")
     head, rest = _parted(recording, seconds)
-    day = group_of(recording.name, model.spec.groups) if group is None else group
-    left = model_error_of(fit.record)
-    moved = _adapted(model, left, recording, group)
-    say_step(f"adapting to {day}: {len(head.time)} rows of {recording.name}", show=show)
-    scopes = day_scopes(fit, moved, [head.name], day)
-    own = _own_of_day(fit.record, scopes, recording.name, day)
+    session = group_of(recording.name, model.spec.groups) if group is None else group
+    model_error = model_error_of(fit.record)
+    moved = _adapted(model, model_error, recording, group)
+    say_step(f"adapting to {session}: {len(head.time)} rows of {recording.name}", show=show)
+    scopes = session_scopes(fit, moved, [head.name], session)
+    own = _own_of_session(fit.record, scopes, recording.name, session)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
-    asked = Day(fit, moved, scopes, own, head, tested, "" if rest is None else rest.name, day, left)
+    asked = SessionTask(fit, moved, scopes, own, head, tested, "" if rest is None else rest.name, session, model_error)
     run = partial(_adapt, asked, draws, model.settings.seed if seed is None else seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
-        found = run(folder, (folder / CONFIG).read_text(encoding="utf-8"))
+        adaptation = run(folder, (folder / CONFIG).read_text(encoding="utf-8"))
         say_step("the session is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
-        found.save(folder)
-    return found
+        adaptation.save(folder)
+    return adaptation
 
 
-class Day(NamedTuple):
-    """A session to which a calibration is adapted.
+class SessionTask(NamedTuple):
+    """A session to which a calibration is adapted."""
 
-    Attributes:
-        fit: the calibration; model: model of the adapted run.
-        scopes: parameters of the body, the session and its recordings; own: parameters of the session.
-        head: the used part of the recording; tested: predicted recordings.
-        rest: name of the unused part of the recording among ``tested``; empty without it.
-        name: name of the session.
-        left: residuals of the model on the fitted recordings.
-    """
-
-    fit: Calibration
-    model: Model
-    scopes: Scopes
-    own: Sequence[InferredParameter]
-    head: Trajectory
-    tested: Sequence[Trajectory]
-    rest: str
-    name: str
-    left: ModelError
+    fit: Calibration  # the calibration
+    model: Model  # model of the adapted run
+    scopes: Scopes  # parameters of the body, the session and its recordings
+    own: Sequence[InferredParameter]  # parameters of the session
+    head: Trajectory  # the used part of the recording
+    tested: Sequence[Trajectory]  # predicted recordings
+    rest: str  # name of the unused part of the recording among ``tested``; empty without it
+    name: str  # name of the session
+    model_error: ModelError  # residuals of the model on the fitted recordings
 
 
-def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | None, text: str) -> Calibration:
-    """Fit the day and predict its recording; ``text`` is the experiment as TOML."""
+def _adapt(asked: SessionTask, draws: int, seed: int, show: bool | None, out: Path | None, text: str) -> Calibration:
+    """Fit the session and predict its recording; ``text`` is the experiment as TOML."""
     began, key = time.monotonic(), jax.random.key(seed)
     before_key, fit_key = jax.random.split(key)
     if asked.tested:
@@ -166,15 +157,15 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
         say_step("the rest of the recording is predicted worse: fitting the session to the first row alone", show=show)
         adapted = _fitted(asked._replace(head=_first_row(asked.head)), draws, fit_key, show)
         checks = _checks(before, adapted.predictions)
-    found = adapted.found
+    fit = adapted.fit
     result = InferenceResult(
         method="adapt",
-        draws={name: column[None] for name, column in found.values.items()},
+        draws={name: column[None] for name, column in fit.values.items()},
         rollouts=adapted.rollouts,
         evaluations=round(adapted.rollouts),
         cautions=[*adapted.cautions, *cautions],
         seconds=time.monotonic() - began,
-        details={**_details(found, asked.name, asked.own), "checks": checks, "compared": check_sentences(checks)},
+        details={**_details(fit, asked.name, asked.own), "checks": checks, "compared": check_sentences(checks)},
     )
     prior = _prior(asked.scopes, asked.own, adapted.body, seed)
     record = _record(
@@ -193,62 +184,53 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     return Calibration(record, build_summary(record, facts), text, asked.model, out)
 
 
-def _without_a_model(asked: Day) -> dict[str, BaselineErrors]:
+def _without_a_model(asked: SessionTask) -> dict[str, BaselineErrors]:
     """Errors of predictions from the first row and from copies of the fitted recordings."""
     record = asked.fit.record
     earlier = [MeasuredPath.of_prediction(each) for each in record.recordings if each.split == "fit"]
-    return day_baselines(asked.head, asked.tested, earlier, record.attrs.get(OPENINGS, {}))
+    return session_baselines(asked.head, asked.tested, earlier, record.attrs.get(OPENINGS, {}))
 
 
 class Adapted(NamedTuple):
-    """A fitted session.
+    """A fitted session."""
 
-    Attributes:
-        found: draws of body and session; body: earlier draws of the body.
-        problem: problem of the recording, with the fitted noise.
-        predictions: predictions of the recording and of the unused data.
-        cautions: reasons to doubt them.
-        rollouts: number of rollouts.
-        slow: remaining error of the session for motion beyond the used recording.
-    """
-
-    found: DayFit
-    body: Batch
-    problem: CalibrationProblem
-    predictions: list[RecordingPrediction]
-    cautions: list[Caution]
-    rollouts: float
-    slow: DayError | None
+    fit: SessionFit  # draws of body and session
+    body: Batch  # earlier draws of the body
+    problem: CalibrationProblem  # problem of the recording, with the fitted noise
+    predictions: list[RecordingPrediction]  # predictions of the recording and of the unused data
+    cautions: list[Caution]  # reasons to doubt them
+    rollouts: float  # number of rollouts
+    slow: SessionError | None  # remaining error of the session for motion beyond the used recording
 
 
-def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
+def _fitted(asked: SessionTask, draws: int, key: jax.Array, show: bool | None) -> Adapted:
     """Fit the session to the used part of the recording, and predict the rest."""
-    fit, _, scopes, own, head, _, _, day, left = asked
+    fit, _, scopes, own, head, _, _, session, model_error = asked
     simulator = asked.model.simulator
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
     posterior = fit.record.posterior
     body = thin({name: posterior[name] for name in scopes.names if name in posterior}, draws)
     body |= _drawn_spreads(scopes, body, spread_key)
-    noise = left.lasting(sample_time(head.time), len(head.time))
-    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
+    noise = model_error.lasting(sample_time(head.time), len(head.time))
+    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, model_error.markers)
     evaluations: list[float] = []
     problem = CalibrationProblem(program, chunk=simulator.lanes).telling(evaluations.append)
     with Progress("adapt", show=show) as progress:
         words = {"draws": len(next(iter(body.values()))), "parameters": len(own)}
-        found = fit_day(
+        fitted = fit_session(
             problem,
             body,
             own,
             fit_key,
             lambda step, done: progress.stage(max(done, step / MOST_STEPS), **words),
-            share=left.share,
+            share=model_error.share,
         )
-    noise = replace(noise, scale=found.excess * noise.scale)
-    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, left.markers)
+    noise = replace(noise, scale=fitted.excess * noise.scale)
+    program = TrajectoryModel.of_positions(simulator, scopes, [head], STATED, noise, model_error.markers)
     problem = CalibrationProblem(program, chunk=simulator.lanes)
     say_step(f"the session is fitted: predicting {_named([head, *asked.tested])}", show=show)
-    predictions = predict_fitted(problem, found.values, fitted_key)
-    cautions = _cautions(found)
+    predictions = predict_fitted(problem, fitted.values, fitted_key)
+    cautions = _cautions(fitted)
     slow = _error_beyond(fit.record, predictions[0])
     if asked.tested:
         names = [run.name for run in asked.tested]
@@ -256,17 +238,17 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
             lambda: predict_new(
                 problem.model,
                 asked.tested,
-                found.values,
+                fitted.values,
                 rest_key,
                 chunk=simulator.lanes,
                 fitted=[head.name],
-                model_error=left,
-                groups={day: [head.name, *names]},
+                model_error=model_error,
+                groups={session: [head.name, *names]},
                 slow=None if slow is None else dict.fromkeys(names, slow),
             )
         )
         predictions, cautions = predictions + new, cautions + more
-    return Adapted(found, body, problem, predictions, cautions, float(np.sum(evaluations)), slow)
+    return Adapted(fitted, body, problem, predictions, cautions, float(np.sum(evaluations)), slow)
 
 
 def _named(recordings: Sequence[Trajectory]) -> str:
@@ -274,32 +256,34 @@ def _named(recordings: Sequence[Trajectory]) -> str:
     return ", ".join(dict.fromkeys(whole(recording.name) for recording in recordings))
 
 
-def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayError | None:
+def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> SessionError | None:
     """The slow error of the session, for markers that move farther than in the used recording."""
-    slow = recorded_day_error(record)
+    slow = recorded_session_error(record)
     if slow is None:
         return None
     far = dict(zip(shown.marker_names, reach_of(shown.central)[-1].tolist(), strict=True))
     return slow._replace(shown=tuple(far.get(name, 0.0) for name in slow.markers))
 
 
-def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPrediction]:
+def _from_first_rows(asked: SessionTask, draws: int, key: jax.Array) -> list[RecordingPrediction]:
     """Predictions of the tested recordings by the original fit, from their commands and first rows alone."""
     record, model, names = asked.fit.record, model_of(asked.fit), [run.name for run in asked.tested]
     if not names:
         return []
     rest = [run if run.position_mask[0].any() else _with_first_row(run, asked.head) for run in asked.tested]
-    simulator, noise = asked.model.simulator, asked.left.every(sample_time(rest[0].time))
-    slow = recorded_day_error(record)
+    simulator, noise = asked.model.simulator, asked.model_error.every(sample_time(rest[0].time))
+    slow = recorded_session_error(record)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     return predict_new(
-        TrajectoryModel.of_positions(simulator, fitted_scopes(asked.fit), rest, STATED, noise, asked.left.markers),
+        TrajectoryModel.of_positions(
+            simulator, fitted_scopes(asked.fit), rest, STATED, noise, asked.model_error.markers
+        ),
         rest,
         values,
         key,
         chunk=model.simulator.lanes,
         fitted=record.attrs[FITTED],
-        model_error=asked.left,
+        model_error=asked.model_error,
         groups={asked.name: names},
         slow=None if slow is None else dict.fromkeys(names, slow._replace(shown=())),
     ).recordings
@@ -326,16 +310,16 @@ def _masked(recording: Trajectory, mask: np.ndarray) -> Trajectory:
     return Trajectory(dataset)
 
 
-def _own_of_day(fit: PosteriorRecord, scopes: Scopes, recording: str, day: str) -> list[InferredParameter]:
-    """The parameters that are the day's.
+def _own_of_session(fit: PosteriorRecord, scopes: Scopes, recording: str, session: str) -> list[InferredParameter]:
+    """The parameters that are the session's.
 
     Raises:
-        InputError: nothing is the day's.
+        InputError: nothing is the session's.
     """
     own = [p for p in scopes.parameters if p.name not in fit.posterior and p.name not in scopes.scales]
-    if not own and day in {info.scope.owner for info in fit.free}:
+    if not own and session in {info.scope.owner for info in fit.free}:
         raise InputError(
-            f"{recording} belongs to {day}, which was fitted",
+            f"{recording} belongs to {session}, which was fitted",
             where="adapt",
             remedy="predict it as it is, or give its session a new --group",
         )
@@ -362,10 +346,10 @@ def _recorded(fit: Calibration, entry: RecordingEntry) -> tuple[Calibration, Tra
         where = model.name if model.file is None else str(model.file.path)
         raise InputError("the experiment has no [data]", where=where, remedy="name the format of the recordings")
     data = _alone(read.data, entry)
-    found = load_recordings(data, model.folder)
-    if len(found) > 1:
-        raise one_at_a_time(read.data, entry.observations, len(found), "adapt to")
-    return replace(fit, model=Model.of(model.spec, replace(read, data=data))), found[0]
+    recordings = load_recordings(data, model.folder)
+    if len(recordings) > 1:
+        raise one_at_a_time(read.data, entry.observations, len(recordings), "adapt to")
+    return replace(fit, model=Model.of(model.spec, replace(read, data=data))), recordings[0]
 
 
 def fitted_model(run: Path, overrides: Sequence[str] | None = None) -> Model:
@@ -407,21 +391,22 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
     Raises:
         InputError: it holds neither.
     """
-    found = recorded_model_error(record)
-    if found is None:
+    model_error = recorded_model_error(record)
+    if model_error is None:
         raise InputError(
             "the posterior has no residuals of the fitted recordings",
             where=POSTERIOR,
             remedy="calibrate again: it was written by an earlier version",
         )
-    return found
+    return model_error
 
 
-def _adapted(model: Model, left: ModelError, recording: Trajectory, group: str | None) -> Model:
+def _adapted(model: Model, model_error: ModelError, recording: Trajectory, group: str | None) -> Model:
     """The model of the adapted run: its noise is known, and its group and its recording are named."""
     groups = model.spec.groups if group is None else in_group(recording.name, group, model.spec.groups)
     noise = NoiseTable(
-        standard_deviation=float(np.sqrt(np.mean(np.square(left.scale)))), correlation_time=left.correlation_time
+        standard_deviation=float(np.sqrt(np.mean(np.square(model_error.scale)))),
+        correlation_time=model_error.correlation_time,
     )
     return Model.of(replace(model.spec, noise=STATED, stated=noise, groups=groups), model.settings)
 
@@ -431,12 +416,12 @@ def _alone(data: DataSpec, entry: RecordingEntry) -> DataSpec:
     return changed(data, where="[data]", fit=[entry], test=[], missing="mask")
 
 
-def day_scopes(fit: Calibration, model: Model, recordings: Sequence[str], day: str) -> Scopes:
+def session_scopes(fit: Calibration, model: Model, recordings: Sequence[str], session: str) -> Scopes:
     """The body's parameters without the noise of the fit, and the parameters of a session, with or without draws."""
     noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
     pooled = pooling(model.spec, model.simulator.parameters, recordings)
-    found = fitted_scopes(fit).of_day(day, recordings, fit.record.attrs[FITTED], pooled)
-    return replace(found, parameters=tuple(p for p in found.parameters if p.spec.name not in noise))
+    scopes = fitted_scopes(fit).of_session(session, recordings, fit.record.attrs[FITTED], pooled)
+    return replace(scopes, parameters=tuple(p for p in scopes.parameters if p.spec.name not in noise))
 
 
 def _drawn_spreads(scopes: Scopes, body: Batch, key: jax.Array) -> Batch:
@@ -449,54 +434,54 @@ def _drawn_spreads(scopes: Scopes, body: Batch, key: jax.Array) -> Batch:
 
 
 def _prior(scopes: Scopes, own: Sequence[InferredParameter], body: Mapping[str, np.ndarray], seed: int) -> list[Any]:
-    """Draws of the day's parameters from their priors."""
+    """Draws of the session's parameters from their priors."""
     drawn = scopes.sample(jax.random.key(seed), len(next(iter(body.values()))))
     return [drawn[p.name] for p in own]
 
 
-def _details(found: DayFit, day: str, own: Sequence[InferredParameter]) -> dict[str, Any]:
-    fitted = {name: getattr(found, name) for name in ("power", "excess", "steps", "unconverged")}
-    return {**fitted, "day": day, "moved": [p.name for p in own]}
+def _details(fit: SessionFit, session: str, own: Sequence[InferredParameter]) -> dict[str, Any]:
+    fitted = {name: getattr(fit, name) for name in ("power", "excess", "steps", "unconverged")}
+    return {**fitted, "session": session, "moved": [p.name for p in own]}
 
 
-def _cautions(found: DayFit) -> list[Caution]:
+def _cautions(fit: SessionFit) -> list[Caution]:
     cautions = []
-    if found.excess > MUCH_WORSE:
+    if fit.excess > MUCH_WORSE:
         sentence = (
-            f"the session is fitted {found.excess:.2g} times worse than the fitted sessions, and no parameter of the "
+            f"the session is fitted {fit.excess:.2g} times worse than the fitted sessions, and no parameter of the "
             "session explains most of its squared error; check the recording and its commands, name more parameters in "
             "[model.per_group], or calibrate with the recording"
         )
-        cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
-    if found.unconverged:
+        cautions.append(Caution(Code.SESSION_UNMATCHED, sentence))
+    if fit.unconverged:
         sentence = (
-            f"the session's parameters did not converge in {MOST_STEPS} steps under {found.unconverged} of "
-            f"{len(found.chosen)} draws of the body; these count as far as they explain the recording"
+            f"the session's parameters did not converge in {MOST_STEPS} steps under {fit.unconverged} of "
+            f"{len(fit.chosen)} draws of the body; these count as far as they explain the recording"
         )
-        cautions.append(Caution(Code.DAY_UNMATCHED, sentence, grave=found.unconverged > len(found.chosen) // 2))
-    if found.power < 1.0:
+        cautions.append(Caution(Code.SESSION_UNMATCHED, sentence, grave=fit.unconverged > len(fit.chosen) // 2))
+    if fit.power < 1.0:
         sentence = (
             "few of the body's draws explain the recording: their evidences were raised to the power "
-            f"{found.power:.2g}, so that a tenth of the draws is left; the model lacks an effect of this "
+            f"{fit.power:.2g}, so that a tenth of the draws is left; the model lacks an effect of this "
             "session"
         )
-        cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
+        cautions.append(Caution(Code.SESSION_UNMATCHED, sentence))
     return cautions
 
 
 def _record(
-    asked: Day, adapted: Adapted, result: InferenceResult, prior: Mapping[str, np.ndarray], seed: int
+    asked: SessionTask, adapted: Adapted, result: InferenceResult, prior: Mapping[str, np.ndarray], seed: int
 ) -> PosteriorRecord:
     """The draws, with the data needed to predict further recordings."""
     problem, attrs = adapted.problem, asked.fit.record.attrs
     recordings, noise = problem.model.recordings, problem.model.markers.known
-    elsewhere, drawn = _of_other_groups(asked, len(adapted.found.chosen))
+    elsewhere, drawn = _of_other_groups(asked, len(adapted.fit.chosen))
     infos = (*problem.model.scopes.infos, *(p.info for p in elsewhere))
-    draws = result.draws | {name: column[adapted.found.chosen][None] for name, column in drawn.items()}
+    draws = result.draws | {name: column[adapted.fit.chosen][None] for name, column in drawn.items()}
     known: dict[str, Any] = (
         {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
     )
-    known |= {DAY_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
+    known |= {SESSION_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
     known |= stated_integrator(asked.model.spec)
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
     predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
@@ -505,7 +490,7 @@ def _record(
     return with_doubts(with_ratios(record, problem.names), doubts)
 
 
-def _of_other_groups(asked: Day, draws: int) -> tuple[list[InferredParameter], Batch]:
+def _of_other_groups(asked: SessionTask, draws: int) -> tuple[list[InferredParameter], Batch]:
     """Parameters that other groups and recordings have of their own, and their values under each draw of the body
     before: the folder of a session also predicts recordings of other sessions.
     """
@@ -521,15 +506,15 @@ def _checks(
     adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
     return {
         p.name: {
-            "from_first_row": _fared(replace(p, mask=adapted[p.name].mask)),
-            "adapted": _fared(adapted[p.name]),
+            "from_first_row": _outcome(replace(p, mask=adapted[p.name].mask)),
+            "adapted": _outcome(adapted[p.name]),
         }
         for p in before
         if p.name in adapted
     }
 
 
-def _fared(prediction: RecordingPrediction) -> dict[str, float]:
+def _outcome(prediction: RecordingPrediction) -> dict[str, float]:
     """Error of the last marker [mm], and shares of the measured coordinates in the 90 % bands."""
     bands, mask = predictive_bands(prediction.predicted), prediction.mask
     inside = (prediction.observed >= bands.low90) & (prediction.observed <= bands.high90)
@@ -543,13 +528,13 @@ def _fared(prediction: RecordingPrediction) -> dict[str, float]:
 
 def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
     """Sentence on each unused recording: its prediction error before and after the adaptation."""
-    found = []
+    sentences = []
     for name, check in checks.items():
         words = [
             f"{row['error_mm']:.3g} mm off, its 90 % bands held {100.0 * row['held']:.0f} %" for row in check.values()
         ]
-        found.append(f"{name}, as far as it was not shown: from the first row {words[0]}; adapted {words[1]}.")
-    return found
+        sentences.append(f"{name}, as far as it was not shown: from the first row {words[0]}; adapted {words[1]}.")
+    return sentences
 
 
 def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
@@ -559,4 +544,4 @@ def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
         f"{before:.3g} mm from the first row alone; the result therefore uses the first row alone, a "
         "choice made on the rest"
     )
-    return Caution(Code.DAY_UNMATCHED, sentence)
+    return Caution(Code.SESSION_UNMATCHED, sentence)

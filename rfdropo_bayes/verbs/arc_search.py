@@ -19,32 +19,21 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arcs import arcs_of, arms
 from rfdropo_bayes.verbs.arrangement import Arrangement, motion_of, neighbours, sections_of
 
-GAIN = 1e-4
-"""Agreement that another round must gain to be worth its time."""
-SWEEPS = 6
-"""Most rounds."""
+GAIN = 1e-4  # agreement that another round must gain to be worth its time
+SWEEPS = 6  # most rounds
 FINE = np.radians(15.0) * np.array([-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0])
 """Trial turns of a section about its present position."""
-TURNED = 4
-"""Number of the best exchanges after which sections are turned again."""
-HOPELESS = 3.0
-"""Ratio of unexplained motion above which the worse sign is discarded."""
-IN_PLACE = 1e-6
-"""Agreement by which a column that makes no difference is given to its own channel."""
-AZIMUTHS = 24
-"""Azimuths at which a column's cables are tried."""
+TURNED = 4  # number of the best exchanges after which sections are turned again
+HOPELESS = 3.0  # ratio of unexplained motion above which the worse sign is discarded
+IN_PLACE = 1e-6  # agreement by which a column that makes no difference is given to its own channel
+AZIMUTHS = 24  # azimuths at which a column's cables are tried
 
 
 class Placed(NamedTuple):
-    """Apparent courses of the cables of each column, regardless of the robot's description.
+    """Apparent courses of the cables of each column, regardless of the robot's description."""
 
-    Attributes:
-        kind: number of the kind of channel.
-        azimuth: azimuth [rad].
-    """
-
-    kind: tuple[int, ...]
-    azimuth: tuple[float, ...]
+    kind: tuple[int, ...]  # number of the kind of channel
+    azimuth: tuple[float, ...]  # azimuth [rad]
 
 
 class ArcSearch:
@@ -91,9 +80,7 @@ class ArcSearch:
         asked = self.command[None, :, :, None] * (sign[:, :, None] * gain)[:, None]
         flat = (guesses, columns * slots)
         made = self.chain.markers(
-            asked.reshape(guesses, len(self.command), -1),
-            arm.reshape(*flat, 3, -1),
-            there.reshape(flat),
+            asked.reshape(guesses, len(self.command), -1), arm.reshape(*flat, 3, -1), there.reshape(flat)
         )
         made = np.where(self.seen[None, ..., None], made, 0.0)
         count = np.maximum(self.seen.sum(axis=0), 1)[None, None, :, None]
@@ -111,9 +98,9 @@ class ArcSearch:
         table = np.zeros((columns, kinds, AZIMUTHS))
         for _ in range(int(moving.sum())):
             waiting = [int(c) for c in np.flatnonzero(moving) if not use[c]]
-            found = {c: self._scan(c, kind, azimuth, sign, use) for c in waiting}
-            best = max(waiting, key=lambda c: found[c].max())
-            kind[best], azimuth[best] = self._argmax(found[best])
+            scores = {c: self._scan(c, kind, azimuth, sign, use) for c in waiting}
+            best = max(waiting, key=lambda c: scores[c].max())
+            kind[best], azimuth[best] = self._argmax(scores[best])
             use[best] = True
         score = -1.0
         for _ in range(SWEEPS):
@@ -139,21 +126,21 @@ class ArcSearch:
 
     def best(self) -> list[Arrangement]:
         """The arrangements that explain the motion best, with each sign of all commands that may explain it."""
-        found = {sign: self.relaxed(sign) for sign in (1, -1)}
-        left = {sign: 1.0 - max(float(table.max()), 0.0) ** 2 for sign, (_, table) in found.items()}
-        likely = [sign for sign in found if left[sign] <= HOPELESS * min(left.values())]
-        return [self.improved(self.turned(self._assigned(*found[sign], sign))) for sign in likely]
+        relaxed = {sign: self.relaxed(sign) for sign in (1, -1)}
+        unexplained = {sign: 1.0 - max(float(table.max()), 0.0) ** 2 for sign, (_, table) in relaxed.items()}
+        likely = [sign for sign in relaxed if unexplained[sign] <= HOPELESS * min(unexplained.values())]
+        return [self.improved(self.turned(self._assigned(*relaxed[sign], sign))) for sign in likely]
 
     def improved(self, arrangement: Arrangement) -> Arrangement:
         """An arrangement that no exchange of two columns or two sections betters, sections turned anew."""
         for _ in range(SWEEPS):
             others = list(neighbours(arrangement, self.sections))
             likely = np.argsort(-self.score_of(others))[:TURNED]
-            found = [arrangement, *(self.turned_far(others[k]) for k in likely)]
-            scores = self.score_of(found)
+            tried = [arrangement, *(self.turned_far(others[k]) for k in likely)]
+            scores = self.score_of(tried)
             if scores.max() <= scores[0] + GAIN:
                 break
-            arrangement = found[int(np.argmax(scores))]
+            arrangement = tried[int(np.argmax(scores))]
         return arrangement
 
     def score_of(self, arrangements: Sequence[Arrangement]) -> np.ndarray:

@@ -20,50 +20,35 @@ from rfdropo_bayes.robots.chamber import Chamber
 ITERATIONS = 30
 LOOKED, STILL = 5, 1e-2
 """Iterations between convergence checks, and the limit of a change as a share of the largest tension."""
-SOFTENED = 1e-3
-"""Softness of a cable as a share of its own compliance: redundant cables then share the load."""
-LEAST_RADIUS = 1e-6
-"""[m] A chamber on the axis, which bends nothing, counts as beside it by this distance."""
+SOFTENED = 1e-3  # softness of a cable as a share of its own compliance: redundant cables then share the load
+LEAST_RADIUS = 1e-6  # [m] A chamber on the axis, which bends nothing, counts as beside it by this distance
 STIFFEST = 10.0
 """Stiffness against shortening over that against bending, at the cables: more would slow the iterations down, and is
 felt only by cables that pull against each other."""
 
 
 class Kind(NamedTuple):
-    """Cables of one kind of channel: equal end heights, at any azimuth.
+    """Cables of one kind of channel: equal end heights, at any azimuth."""
 
-    Attributes:
-        gain: cable displacement [m], or tension [N], of a unit command.
-        radius: radius of the cables about the axis [m].
-        azimuth: azimuth of the cables from the first [rad].
-        end: index of the arc at whose end each cable ends.
-    """
-
-    gain: tuple[float, ...]
-    radius: tuple[float, ...]
-    azimuth: tuple[float, ...]
-    end: tuple[int, ...]
+    gain: tuple[float, ...]  # cable displacement [m], or tension [N], of a unit command
+    radius: tuple[float, ...]  # radius of the cables about the axis [m]
+    azimuth: tuple[float, ...]  # azimuth of the cables from the first [rad]
+    end: tuple[int, ...]  # index of the arc at whose end each cable ends
 
 
 class Arcs(NamedTuple):
-    """The chain, and the markers on it.
+    """The chain, and the markers on it."""
 
-    Attributes:
-        length: length of each arc [m].
-        bending, axial: compliances of each arc: bending in radians per unit moment, shortening in metres per unit
-            force.
-        marker_arc, marker_share, marker_offset: arc of a marker, its position along the arc, and its offset from the
-            axis [m].
-        pulled: commands impose lengths, else tensions.
-    """
-
-    length: Float[np.ndarray, " arc"]
+    length: Float[np.ndarray, " arc"]  # length of each arc [m]
+    # bending, axial: compliances of each arc: bending in radians per unit moment, shortening in metres per unit force
     bending: Float[np.ndarray, " arc"]
     axial: Float[np.ndarray, " arc"]
+    # marker_arc, marker_share, marker_offset: arc of a marker, its position along the arc, and its offset from the axis
+    # [m]
     marker_arc: Int[np.ndarray, " marker"]
     marker_share: Float[np.ndarray, " marker"]
     marker_offset: Float[np.ndarray, "marker 2"]
-    pulled: bool
+    pulled: bool  # commands impose lengths, else tensions
 
     def markers(
         self,
@@ -92,18 +77,18 @@ class Arcs(NamedTuple):
     def _placed(self, bent: Float[np.ndarray, "guess row 3 arc"]) -> Float[np.ndarray, "guess row marker 3"]:
         shape = bent.shape[:2]
         place, frame = np.zeros((*shape, 3)), np.broadcast_to(np.eye(3), (*shape, 3, 3))
-        found = np.zeros((*shape, len(self.marker_arc), 3))
+        placed = np.zeros((*shape, len(self.marker_arc), 3))
         for arc, length in enumerate(self.length):
             for marker in np.flatnonzero(self.marker_arc == arc):
                 share = float(self.marker_share[marker])
                 way, turned = _arc(share * bent[..., arc], share * length)
                 there = place + np.einsum("...ij,...j->...i", frame, way)
                 offset = turned[..., :2] @ self.marker_offset[marker]
-                found[:, :, marker] = there + np.einsum("...ij,...j->...i", frame, offset)
+                placed[:, :, marker] = there + np.einsum("...ij,...j->...i", frame, offset)
             way, turned = _arc(bent[..., arc], length)
             place = place + np.einsum("...ij,...j->...i", frame, way)
             frame = frame @ turned
-        return found
+        return placed
 
 
 def _tensions(

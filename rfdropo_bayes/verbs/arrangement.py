@@ -13,17 +13,11 @@ from rfdropo_bayes.robots import Robot
 
 
 class Arrangement(NamedTuple):
-    """Mapping of commands to a robot.
+    """Mapping of commands to a robot."""
 
-    Attributes:
-        columns: channel k of the robot takes column ``columns[k]``.
-        signs: signs of the commands of each column, 1 or -1.
-        turns: turn of the cables of each section about +z against the description [rad], base to tip.
-    """
-
-    columns: tuple[int, ...]
-    signs: tuple[int, ...]
-    turns: tuple[float, ...]
+    columns: tuple[int, ...]  # channel k of the robot takes column ``columns[k]``
+    signs: tuple[int, ...]  # signs of the commands of each column, 1 or -1
+    turns: tuple[float, ...]  # turn of the cables of each section about +z against the description [rad], base to tip
 
     def commands(self, given: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row channel"]:
         """Commands sent to the robot's channels."""
@@ -46,15 +40,10 @@ def as_written(channels: int, sections: int) -> Arrangement:
 
 
 class Sections(NamedTuple):
-    """The sections of a robot: groups of cables and chambers with equal end height.
+    """The sections of a robot: groups of cables and chambers with equal end height."""
 
-    Attributes:
-        of_drive: number of the section of each cable, then of each chamber, base to tip.
-        of_channel: highest section that each channel drives.
-    """
-
-    of_drive: tuple[int, ...]
-    of_channel: tuple[int, ...]
+    of_drive: tuple[int, ...]  # number of the section of each cable, then of each chamber, base to tip
+    of_channel: tuple[int, ...]  # highest section that each channel drives
 
     @property
     def number(self) -> int:
@@ -105,19 +94,12 @@ def motion_of(position: Float[np.ndarray, "row marker 3"]) -> Moved:
 
 
 class Agreement(NamedTuple):
-    """Agreement of two motions.
+    """Agreement of two motions."""
 
-    Attributes:
-        straight: their correlation without rotation, -1 to 1.
-        turned: the same after the turn about +z that agrees best.
-        turn: turn from the simulated to the measured motion [rad].
-        mirrored: the same as ``turned``, of the mirror image of the simulated motion.
-    """
-
-    straight: float
-    turned: float
-    turn: float
-    mirrored: float
+    straight: float  # their correlation without rotation, -1 to 1
+    turned: float  # the same after the turn about +z that agrees best
+    turn: float  # turn from the simulated to the measured motion [rad]
+    mirrored: float  # the same as ``turned``, of the mirror image of the simulated motion
 
 
 def agreement(simulated: Moved, measured: Moved) -> Agreement:

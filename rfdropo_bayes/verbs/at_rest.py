@@ -23,8 +23,7 @@ from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE
 from rfdropo_bayes.simulators.trunk import TrunkSimulator, assemble
 from rfdropo_bayes.verbs.command_lag import JUST_BEFORE
 
-MOVING = ("time_step", "integrator")
-"""Keys of [simulator] that a body at rest does not have."""
+MOVING = ("time_step", "integrator")  # keys of [simulator] that a body at rest does not have
 
 
 class Rows(NamedTuple):
@@ -85,7 +84,7 @@ def resting(spec: ModelSpec) -> RestingRobot:
     assert isinstance(simulator, TrunkSimulator)
     kept = tuple(mechanism for mechanism in simulator.mechanisms if without_memory(mechanism))
     simulator = replace(simulator, mechanisms=kept).with_backend(Backend("numba"))
-    return RestingRobot(simulator, shown=tuple(simulator.marker_names), held=_held(spec, simulator))
+    return RestingRobot(simulator, shown=tuple(simulator.marker_names), fixed=_fixed(spec, simulator))
 
 
 def without_memory(mechanism: Any) -> bool:
@@ -94,7 +93,7 @@ def without_memory(mechanism: Any) -> bool:
     return acts and QUASI_STATIC in motions_of(mechanism)
 
 
-def _held(spec: ModelSpec, simulator: TrunkSimulator) -> dict[str, float]:
+def _fixed(spec: ModelSpec, simulator: TrunkSimulator) -> dict[str, float]:
     """Fixed values that a robot at rest has."""
     known = [each.name for each in simulator.parameters]
     given = expand_groups(spec.fixed, simulator.parameters)
@@ -107,24 +106,24 @@ class RestingRobot:
     Args:
         simulator: simulator of a rod at rest, with mechanisms without memory.
         shown: the predicted markers, in this order.
-        held: fixed parameter values; others are nominal.
+        fixed: fixed parameter values; others are nominal.
     """
 
-    def __init__(self, simulator: TrunkSimulator, shown: tuple[str, ...], held: Mapping[str, float]) -> None:
-        self.simulator, self.shown, self.held = simulator, shown, dict(held)
+    def __init__(self, simulator: TrunkSimulator, shown: tuple[str, ...], fixed: Mapping[str, float]) -> None:
+        self.simulator, self.shown, self.fixed = simulator, shown, dict(fixed)
 
     def showing(self, markers: Sequence[str]) -> RestingRobot:
         """The same robot with predictions of these markers alone."""
-        return RestingRobot(self.simulator, tuple(markers), self.held)
+        return RestingRobot(self.simulator, tuple(markers), self.fixed)
 
     def as_robot(self, robot: Robot) -> RestingRobot:
         """The same body, parameters and drives, with cables and chambers of another robot; nothing is recompiled."""
         own = self.simulator
         assembly = assemble(robot, own.discretisation)
         changed = replace(own, robot=robot, assembly=assembly, engine=replace(own.engine, body=assembly))
-        found = RestingRobot(changed, self.shown, self.held)
-        found.__dict__ |= {"_inputs": self._inputs, "_measured": self._measured}
-        return found
+        copy = RestingRobot(changed, self.shown, self.fixed)
+        copy.__dict__ |= {"_inputs": self._inputs, "_measured": self._measured}
+        return copy
 
     def markers(
         self, command: Float[np.ndarray, "row channel"], values: Mapping[str, Float[np.ndarray, " set"]] | None = None
@@ -136,7 +135,7 @@ class RestingRobot:
         """
         given = {name: np.atleast_1d(np.asarray(value, float)) for name, value in (values or {}).items()}
         count = len(next(iter(given.values()))) if given else 1
-        nominal = {spec.name: spec.nominal for spec in self.simulator.parameters} | self.held
+        nominal = {spec.name: spec.nominal for spec in self.simulator.parameters} | self.fixed
         every = {name: np.full(count, value) for name, value in nominal.items()} | given
         rows = len(command)
         material, start = self._inputs(every, np.asarray(command, float))
@@ -144,9 +143,9 @@ class RestingRobot:
         cables = start.shape[-1]
         flat = np.asarray(start).reshape(count * rows, cables)
         moved = self.simulator.engine.native.rollout(material, np.zeros((1, cables)), start=flat, steps=0)
-        found = moved.position[:, 0, : self.simulator.shown].reshape(count, rows, -1, 3)
+        position = moved.position[:, 0, : self.simulator.shown].reshape(count, rows, -1, 3)
         bad = (moved.diverged | (moved.imbalance > EQUILIBRIUM_TOLERANCE)).reshape(count, rows)
-        seen = np.asarray(self._measured(every, found))
+        seen = np.asarray(self._measured(every, position))
         chosen = [self.simulator.marker_names.index(name) for name in self.shown]
         return np.where(bad[:, :, None, None], np.nan, seen)[:, :, chosen]
 

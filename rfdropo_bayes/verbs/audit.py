@@ -140,21 +140,21 @@ def audit(
     tables = model.record({"title": model.title, "seed": chosen}, {})
     doubts = cautions_of_audit(model, [*runs, *test], nominal_paths(problem))
 
-    def found(out: Path | None) -> Audit:
+    def audited(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
         answer = ask(problem, say_lines(show), journal, deadline)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
         return _audited(answer, model, tables, data, out, doubts)
 
     if out is None:
-        return found(None)
+        return audited(None)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
     given: dict[str, Any] = {"from": fit.folder if isinstance(fit, Calibration) else fit, "seed": chosen}
     if groups is not None and groups.compared:
         given |= {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
     with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
-        answered = found(place)
+        answered = audited(place)
         answered.save(place)
     return answered
 
@@ -166,9 +166,9 @@ def nominal_paths(problem: AuditProblem) -> list[Paths]:
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
     values = problem.coordinates.nominal
     theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
-    found, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
+    fields, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
     valid = np.asarray(recordings.line.valid)
-    paths = zip(found["position"], recordings.position, valid, strict=True)
+    paths = zip(fields["position"], recordings.position, valid, strict=True)
     return [] if np.any(status) else [Paths(*each) for each in paths]
 
 
@@ -188,8 +188,8 @@ def _audited(
     page = render_audit(seen, content, model.title, describe(tables), shape)
     extended = extended_tables(dict(tables), answer, model.folder, out, model.texts())
     made = None if model.spec.named else model.robot
-    left = residual_dataset(answer) if answer.fitted else None
-    return Audit(content, extended, page, made, out or model.folder, out, seen, answer, left)
+    residuals = residual_dataset(answer) if answer.fitted else None
+    return Audit(content, extended, page, made, out or model.folder, out, seen, answer, residuals)
 
 
 def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:
@@ -344,7 +344,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
     simulator = build_simulator(spec)
     engine = str(simulator.description["engine"])
     commands = stack_commands([commands_of(simulator, recording)])
-    found = {}
+    reasons = {}
     for name in names:
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
         body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
@@ -353,8 +353,8 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:
-            found[name] = why
-    return found
+            reasons[name] = why
+    return reasons
 
 
 def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
@@ -384,15 +384,15 @@ def _lanes(
     if key not in workshop:
         slow = {m.name: m for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
         costly = [each.name for m in slow.values() for each in m.parameters]
-        found = Lanes(whole, markers, fields=fields, costly=costly)
+        lanes = Lanes(whole, markers, fields=fields, costly=costly)
         added = whole.mechanisms[len(spec.mechanisms) :]
         kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
         null = coordinates.nominal | coordinates.named(coordinates.null)
-        for fewer in [kept, []] if found.difference is not None else []:
+        for fewer in [kept, []] if lanes.difference is not None else []:
             if len(fewer) < len(names):
                 fast = build_simulator(spec.with_mechanisms(*fewer))
-                found = RoutedLanes(Lanes(fast, markers, fields=fields), found, null)
-        workshop[key] = found
+                lanes = RoutedLanes(Lanes(fast, markers, fields=fields), lanes, null)
+        workshop[key] = lanes
     return workshop[key]
 
 
@@ -419,10 +419,7 @@ def _finer(spec: ModelSpec, robot: Robot) -> ModelSpec:
 
 
 def _model(
-    spec: ModelSpec,
-    simulator: AnySimulator,
-    trajectories: Sequence[Trajectory],
-    fitted: int,
+    spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory], fitted: int
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and the number of its first parameters, those of the base model.
 
@@ -517,7 +514,7 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
     """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
     coordinates = answer.problem.coordinates
     factor = widening(answer.extended, coordinates)
-    found = {}
+    priors = {}
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
         if parameter.spec.name != parameter.physical:  # how far one group's value is off, of which no file has a prior
@@ -528,5 +525,5 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
                 table[key] += coordinates.space.specs[parameter.physical].nominal - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
-        found[parameter.spec.name] = table
-    return found
+        priors[parameter.spec.name] = table
+    return priors

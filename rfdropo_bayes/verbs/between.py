@@ -68,8 +68,8 @@ def groups_at_hand(patterns: Patterns, fitted: Sequence[Trajectory], tested: Seq
         fitted: fitted recordings; tested: unseen recordings.
     """
     names, own = [t.name for t in [*fitted, *tested]], {t.name for t in fitted}
-    found = gather_groups(names, patterns)
-    members = {group: each for group, each in found.items() if group in patterns and own & set(each)}
+    gathered = gather_groups(names, patterns)
+    members = {group: each for group, each in gathered.items() if group in patterns and own & set(each)}
     others = tuple(name for name in names if not any(name in each for each in members.values()))
     if len(members) < 2 and not (members and own & set(others)):
         return None
@@ -100,14 +100,14 @@ def _matching(
     chosen: list[str] = []
     for entry in [given] if isinstance(given, str | Trajectory) else given:
         pattern = entry.name if isinstance(entry, Trajectory) else entry
-        found = [name for name in names if name == pattern or fnmatchcase(whole(name), pattern)]
-        if not found:
+        matching = [name for name in names if name == pattern or fnmatchcase(whole(name), pattern)]
+        if not matching:
             raise InputError(
                 f"no recording of the group {group!r} is called {pattern!r}",
                 where=WHERE,
                 remedy=f"recordings: {', '.join(names)}",
             )
-        chosen += [name for name in found if name not in chosen]
+        chosen += [name for name in matching if name not in chosen]
     return tuple(chosen)
 
 
@@ -135,8 +135,8 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
             model["groups"] = _naming(own, model.get("groups", {}))
             model.setdefault("only_in", {})[name] = list(own)
             continue
-        spread = float(parameter.table["scale"]) * float(factor[index]) / np.sqrt(2.0)
-        model.setdefault("per_group", {})[name] = float(f"{spread:.3g}")
+        scale = float(parameter.table["scale"]) * float(factor[index]) / np.sqrt(2.0)
+        model.setdefault("per_group", {})[name] = float(f"{scale:.3g}")
         if name not in coordinates.names:
             model.setdefault("priors", {}).setdefault(name, {})
 

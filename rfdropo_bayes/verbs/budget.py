@@ -15,20 +15,14 @@ FIT, PREDICTIONS = 0.5, 0.2
 """Shares of the minutes: rollouts of the fit, and of predictions with its draws. The report and compiling take the
 rest."""
 FEWEST_ROLLOUTS = 50
-MOST_DRAWS, FEWEST_DRAWS = 200, 16
-"""Draws whose predictions are kept."""
+MOST_DRAWS, FEWEST_DRAWS = 200, 16  # draws whose predictions are kept
 
 
 class Budget(NamedTuple):
-    """Numbers of rollouts and draws for a time.
+    """Numbers of rollouts and draws for a time."""
 
-    Attributes:
-        rollouts: rollouts of the fit, in full-length rollouts of the fitted recordings.
-        draws: number of draws with stored predictions.
-    """
-
-    rollouts: int
-    draws: int
+    rollouts: int  # rollouts of the fit, in full-length rollouts of the fitted recordings
+    draws: int  # number of draws with stored predictions
 
 
 def budget_within(minutes: float, rollout_seconds: float, predicted: float) -> Budget:

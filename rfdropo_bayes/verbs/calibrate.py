@@ -28,7 +28,7 @@ from rfdropo_bayes.model.fitted_integrator import stated_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
-    HELD,
+    FIXED,
     DrawsByOwner,
     PosteriorRecord,
     ProductOfPowers,
@@ -36,7 +36,6 @@ from rfdropo_bayes.posteriors import (
     by_owner,
     central_interval,
 )
-from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, left_out_sentence, recorded_day_error
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
@@ -48,6 +47,12 @@ from rfdropo_bayes.prediction.predictive import (
     predicted_after_fit,
     thin,
     with_repeats_marked,
+)
+from rfdropo_bayes.prediction.session_error import (
+    SESSION_ERROR,
+    SessionError,
+    left_out_sentence,
+    recorded_session_error,
 )
 from rfdropo_bayes.report import (
     BaselineErrors,
@@ -68,16 +73,21 @@ from rfdropo_bayes.robots.plausibility import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.budget import MOST_DRAWS, budget_within, rollout_seconds
-from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
+from rfdropo_bayes.verbs.left_out_sessions import (
+    OPENINGS,
+    Sessions,
+    error_of_unseen_sessions,
+    of_unseen_sessions,
+    openings_of,
+)
 from rfdropo_bayes.verbs.recording_doubts import cautions_of_fit, recorded_doubts, with_doubts
 
 PRIOR_DRAWS = 2000
-LEAST_POSTERIOR = 200
-"""Draws of a posterior, if its budget is small."""
+LEAST_POSTERIOR = 200  # draws of a posterior, if its budget is small
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
 PAYLOAD = "payload_mass"  # which recordings may have for themselves
-CLIMBING = ("laplace", "bridge", "smc")  # smc if it starts at the optima
+OPTIMISING = ("laplace", "smc")  # smc if it starts at the optima
 
 
 def calibrate(
@@ -135,10 +145,10 @@ def calibrate(
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
     settings |= {"options": {"from": fit.folder if isinstance(fit, Calibration) else fit}, "texts": model.texts()}
     with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
-        found = work(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
+        calibration = work(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
         say_step("the fit is done: writing posterior.nc and summary.json, and drawing report.html", show=show)
-        found.save(folder)
-    return found
+        calibration.save(folder)
+    return calibration
 
 
 def _budgeted(config: Any, rollouts: int, resumed: Path | None) -> Any:
@@ -176,7 +186,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
         problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
-    problem = problem.holding(result.held)
+    problem = problem.holding(result.fixed)
     attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
@@ -195,11 +205,11 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner |
     """
     if fit is None:
         return None
-    if method not in CLIMBING:
+    if method not in OPTIMISING:
         raise InputError(
             f"method {method!r} does not optimise, so it needs no start",
             where="--from",
-            remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
+            remedy=f"leave it out, or use one of {', '.join(OPTIMISING)}",
         )
     if isinstance(fit, Calibration):
         record, content = fit.record, fit.content
@@ -243,13 +253,13 @@ def record_posterior(
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
     fitted, scopes = list(problem.model.recordings.names), problem.model.scopes
     lasting = result.details.get("lasting", {}).get(problem.model.markers.name)
-    left = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
-    slow = _unseen_days(asked, problem, result, predictions, left, jax.random.fold_in(key, 3), show=show)
+    residual = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
+    slow = _unseen_sessions(asked, problem, result, predictions, residual, jax.random.fold_in(key, 3), show=show)
     cautions: list[Caution] = []
     if tested:
         say_step(f"the fit is done: predicting the test recordings ({len(tested)})", show=show)
-        days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
-        unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
+        sessions, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
+        unseen = [] if slow is None else of_unseen_sessions(tested, model.spec.groups, sessions, openings)
         new, cautions = predicted_after_fit(
             lambda: predict_new(
                 problem.model,
@@ -258,7 +268,7 @@ def record_posterior(
                 test_key,
                 chunk=problem.chunk,
                 fitted=fitted,
-                model_error=left,
+                model_error=residual,
                 groups=model.spec.groups,
                 slow={} if slow is None else dict.fromkeys(unseen, slow),
             )
@@ -276,9 +286,9 @@ def record_posterior(
             **attributes,
             NOISE: problem.model.noise,
             FITTED: fitted,
-            HELD: [{"parameter": p.info.as_dict(), "value": result.held[p.name]} for p in scopes.known],
-            MODEL_ERROR: None if left is None else left._asdict(),
-            DAY_ERROR: None if slow is None else slow.as_dict(),
+            FIXED: [{"parameter": p.info.as_dict(), "value": result.fixed[p.name]} for p in scopes.known],
+            MODEL_ERROR: None if residual is None else residual._asdict(),
+            SESSION_ERROR: None if slow is None else slow.as_dict(),
             OPENINGS: openings_of(asked.runs),
             **known_noise(problem),
         },
@@ -286,26 +296,26 @@ def record_posterior(
     return with_ratios(record, scopes.names), cautions
 
 
-def _unseen_days(
+def _unseen_sessions(
     asked: Fitting,
     problem: CalibrationProblem,
     result: InferenceResult,
     predictions: Sequence[RecordingPrediction],
-    left: ModelError | None,
+    residual: ModelError | None,
     key: jax.Array,
     *,
     show: bool | None,
-) -> DayError | None:
+) -> SessionError | None:
     """The error of a day that the fit has not seen; None for a model without days, and for draws that are no
     posterior."""
-    if left is None or not method_named(result.method).posterior:
+    if residual is None or not method_named(result.method).posterior:
         return None
     draws = thin(result.draws, asked.draws)
     optimum = result.optimum or {}
     if set(draws) <= set(optimum):
         draws = {name: np.full(2, optimum[name]) for name in draws}
     start = by_owner(problem.model.scopes.infos, draws)
-    return error_of_unseen_days(Days(asked.model, asked.runs, start, predictions, left), key, show=show)
+    return error_of_unseen_sessions(Sessions(asked.model, asked.runs, start, predictions, residual), key, show=show)
 
 
 def row_log_likelihood(
@@ -338,18 +348,18 @@ def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecor
     Stiffness over mass, and each payload over both; a payload that is zero in some draw is skipped.
     """
     scales = [(name, unit) for name, unit in (("young_modulus", "kg/Pa"), ("trunk_mass", "-")) if name in names]
-    found = []
+    ratios = []
     if len(scales) == 2:
         powers = {"young_modulus": 1.0, "trunk_mass": -1.0}
         words = "stiffness over mass: determined by the motion of a trunk with length-driven cables"
-        found.append(ProductOfPowers("young_modulus_over_trunk_mass", "Pa/kg", powers, words))
+        ratios.append(ProductOfPowers("young_modulus_over_trunk_mass", "Pa/kg", powers, words))
     for payload in (info for info in record.free if info.name in names and info.parameter == PAYLOAD):
         for name, unit in scales:
             powers = {payload.name: 1.0, name: -1.0}
             words = f"payload over {name.replace('_', ' ')}: determined by motion, independent of the common scale"
-            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}", unit, powers, words, payload.scope.owner))
+            ratios.append(ProductOfPowers(f"{PAYLOAD}_over_{name}", unit, powers, words, payload.scope.owner))
     drawn = [draws for draws in (record.posterior, record.prior) if draws]
-    return record.with_derived([p for p in found if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
+    return record.with_derived([p for p in ratios if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
 
 
 def gather_facts(
@@ -374,7 +384,7 @@ def gather_facts(
     added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *scored])
-    slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
+    slow = recorded_session_error(record) if record.attrs.get(SESSION_ERROR) else None
     strange = recorded_doubts(record)
     if robot is not None:
         strange += robot.unstated(run.name for run in (*fitted, *scored))
@@ -411,7 +421,7 @@ def gather_facts(
         optimum=result.optimum,
         objects=score_objects(unseen, [*fitted, *scored]),
         versions=software_versions(),
-        unseen_days={} if slow is None else {**slow.as_dict(), "sentence": left_out_sentence(slow)},
+        unseen_sessions={} if slow is None else {**slow.as_dict(), "sentence": left_out_sentence(slow)},
         details=result.details,
         outline=None if robot is None else robot_shape(robot),
     )
@@ -420,8 +430,8 @@ def gather_facts(
 def implausible_fit(robot: Robot, fixed: Mapping[str, float], record: PosteriorRecord) -> list[Caution]:
     """A caution if 90 % of the draws, or a fixed value, are an implausible mass or stiffness."""
     drawn = {info.parameter: central_interval(record.flat(info.name)) for info in record.free}
-    found = implausible_values(robot, {**{name: (value, value) for name, value in fixed.items()}, **drawn})
-    return [] if found is None else [Caution(Code.IMPLAUSIBLE, found)]
+    sentence = implausible_values(robot, {**{name: (value, value) for name, value in fixed.items()}, **drawn})
+    return [] if sentence is None else [Caution(Code.IMPLAUSIBLE, sentence)]
 
 
 def known_noise(problem: CalibrationProblem) -> dict[str, Any]:

@@ -12,13 +12,7 @@ import jax
 import numpy as np
 
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import (
-    Trajectory,
-    check_channels,
-    load_recordings,
-    noise_floor,
-    shared_markers,
-)
+from rfdropo_bayes.data import Trajectory, check_channels, load_recordings, noise_floor, shared_markers
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.thinning import looked_at, thinning_note
@@ -53,32 +47,24 @@ from rfdropo_bayes.verbs.recording_doubts import asked_pulls, drives_beyond, rec
 from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
-LONG = 60.0
-"""Recordings of more seconds make whoever checks them wait for minutes."""
-IRREGULAR = 1.5
-"""Gaps longer than this multiple of the median sample time are reported."""
+LONG = 60.0  # recordings of more seconds make whoever checks them wait for minutes
+IRREGULAR = 1.5  # gaps longer than this multiple of the median sample time are reported
 
 Result = TypeVar("Result")
 
 
 @dataclass
 class Check:
-    """Result of `run_check`.
+    """Result of `run_check`."""
 
-    Attributes:
-        lines: facts, as pairs of a label and a text; an empty label continues the previous pair.
-        notes: valid facts worth knowing.
-        doubts: valid but suspicious facts: the recordings or their description look wrong.
-        problems: faults that keep the experiment from running.
-        files: pictures, one per recording.
-        ahead: combinations that a fit can determine; None if not requested, or if nothing can be fitted.
-    """
-
+    # facts, as pairs of a label and a text; an empty label continues the previous pair
     lines: list[tuple[str, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # valid facts worth knowing
+    # valid but suspicious facts: the recordings or their description look wrong
     doubts: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    files: list[Path] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)  # faults that keep the experiment from running
+    files: list[Path] = field(default_factory=list)  # pictures, one per recording
+    # combinations that a fit can determine; None if not requested, or if nothing can be fitted
     ahead: Preflight | None = None
 
 
@@ -119,59 +105,59 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     experiment, _ = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
     robot = find_robot(experiment.robot, folder, experiment.adapter)
-    found = Check()
+    report = Check()
     if isinstance(robot, Robot):
-        robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
-    _say_robot(found, robot)
-    recordings = {role: _read(found, experiment, folder, role) for role in ("fit", "test")}
+        robot = _try(report, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
+    _say_robot(report, robot)
+    recordings = {role: _read(report, experiment, folder, role) for role in ("fit", "test")}
     first: list[tuple[str, str]] = []
     for role, trajectories in recordings.items():
         for trajectory in trajectories:
-            own = _of_recording(found, trajectory, role, robot)
-            found.lines += _unlike(own, first)
+            own = _of_recording(report, trajectory, role, robot)
+            report.lines += _unlike(own, first)
             first = first or own
     named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
     columns = None if experiment.data is None else experiment.data.columns
     cautions = recording_cautions(robot, [*recordings["fit"], *recordings["test"]], columns)
-    found.doubts += [caution.sentence for caution in cautions]
+    report.doubts += [caution.sentence for caution in cautions]
     if isinstance(robot, Robot):
-        found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
-    _say_repeats(found, [*recordings["fit"], *recordings["test"]])
+        report.notes += [caution.sentence for caution in _try(report, partial(robot.unstated, named)) or []]
+    _say_repeats(report, [*recordings["fit"], *recordings["test"]])
     if experiment.data is not None and experiment.data.fit and not experiment.data.test:
-        found.notes.append(
+        report.notes.append(
             "no recording is kept for a test: predictions of unseen motions will not be scored; name one "
             "under test in [data]"
         )
-    found.doubts += [
+    report.doubts += [
         f"[model.groups] {group}: {entry!r} matches no recording; the recordings are {shortened(named)}"
         for group, entry in unmatched(named, experiment.model.groups)
         if named
     ]
-    _say_model(found, experiment, folder, recordings["fit"])
+    _say_model(report, experiment, folder, recordings["fit"])
     notes = [thinning_note(trajectory) for trajectory in (*recordings["fit"], *recordings["test"])]
-    found.notes += [note for note in notes if note is not None]
-    if ahead and recordings["fit"] and not found.problems:
+    report.notes += [note for note in notes if note is not None]
+    if ahead and recordings["fit"] and not report.problems:
         rests = experiment.simulator.motion == QUASI_STATIC
         fewer = recordings["fit"] if rests else [looked_at(trajectory) for trajectory in recordings["fit"]]
         if isinstance(robot, Robot):
-            _say_motion(found, experiment, folder, recordings, fewer, output_folder(out))
-        _say_ahead(found, experiment, folder, fewer)
+            _say_motion(report, experiment, folder, recordings, fewer, output_folder(out))
+        _say_ahead(report, experiment, folder, fewer)
     if any(recordings.values()):
         out = output_folder(out)
     rest = robot_shape(robot) if isinstance(robot, Robot) else None
     for trajectory in (*recordings["fit"], *recordings["test"]):
         file = out / f"{trajectory.name.replace('/', '_')}.png"
         save_recording(trajectory, rest, file)
-        found.files.append(file)
-    if found.files:
-        content = {key: getattr(found, key) for key in ("lines", "notes", "doubts", "problems")}
-        told = None if found.ahead is None else found.ahead.as_dict()
-        write_json(out / "check.json", {**content, "preflight": told})
-    return found
+        report.files.append(file)
+    if report.files:
+        content = {key: getattr(report, key) for key in ("lines", "notes", "doubts", "problems")}
+        ahead_of_fit = None if report.ahead is None else report.ahead.as_dict()
+        write_json(out / "check.json", {**content, "preflight": ahead_of_fit})
+    return report
 
 
 def _say_motion(
-    found: Check,
+    report: Check,
     experiment: Experiment,
     folder: Path,
     recordings: Mapping[str, Sequence[Trajectory]],
@@ -184,73 +170,73 @@ def _say_motion(
     """
     say_step(f"simulating {fewer[0].name} with a finer time step, more elements, and the other kind of motion")
     spec, runs = spec_of(experiment, folder), recordings["fit"]
-    found.lines += _try(found, partial(numerical_error_lines, spec, fewer[0])) or []
+    report.lines += _try(report, partial(numerical_error_lines, spec, fewer[0])) or []
     columns = None if experiment.data is None else experiment.data.columns
     rests = spec.simulator.motion == QUASI_STATIC
     if rests:
         lag = lag_words(runs, columns)
-        found.lines.append(("row and pose", lag.words))
-        found.doubts += [] if lag.doubt is None else [lag.doubt]
-    compared = _try(found, partial(measure_motion, spec, runs, columns))
+        report.lines.append(("row and pose", lag.words))
+        report.doubts += [] if lag.doubt is None else [lag.doubt]
+    compared = _try(report, partial(measure_motion, spec, runs, columns))
     if compared is None:
         return
-    found.lines.append(("motion", compared.words))
-    found.doubts += [caution.sentence for caution in compared.cautions]
+    report.lines.append(("motion", compared.words))
+    report.doubts += [caution.sentence for caution in compared.cautions]
     if compared.arrangement is not None:
         shown = (runs, recordings["test"]) if rests else (fewer, [looked_at(run) for run in recordings["test"]])
-        fit = _try(found, partial(first_answer, spec, *shown, compared.arrangement))
+        fit = _try(report, partial(first_answer, spec, *shown, compared.arrangement))
         if fit is not None:
-            found.lines += rest_lines(fit)
-            found.notes += rest_notes(fit) if rests else []
-            found.files.append(out / "at_rest.png")
-            rest_figure(fit).savefig(found.files[-1])
+            report.lines += rest_lines(fit)
+            report.notes += rest_notes(fit) if rests else []
+            report.files.append(out / "at_rest.png")
+            rest_figure(fit).savefig(report.files[-1])
 
 
-def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
+def _say_ahead(report: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
     """Report on combinations that a fit can determine; a failed simulation is not counted as a problem."""
     seconds = sum(float(run.time[-1]) for run in runs)
     moves = experiment.simulator.motion != QUASI_STATIC
     patience = "; this takes minutes, and --quick leaves it out" if moves and seconds > LONG else ""
     say_step(f"simulating {seconds:.3g} s under draws of the prior, to estimate the result of a fit{patience}")
     try:
-        found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
+        report.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
     except InputError as error:
-        found.doubts.append(str(error))
+        report.doubts.append(str(error))
         return
-    found.lines += found.ahead.lines()
+    report.lines += report.ahead.lines()
 
 
-def _try(found: Check, action: Callable[[], Result]) -> Result | None:
+def _try(report: Check, action: Callable[[], Result]) -> Result | None:
     """Result of an action; its InputError is added to the problems."""
     try:
         return action()
     except InputError as error:
-        if str(error) not in found.problems:
-            found.problems.append(str(error))
+        if str(error) not in report.problems:
+            report.problems.append(str(error))
         return None
 
 
-def _say_robot(found: Check, robot: Workpiece) -> None:
+def _say_robot(report: Check, robot: Workpiece) -> None:
     facts = robot_facts(robot) if isinstance(robot, Robot) else simulator_facts(robot)
     for label in ("robot", "body", "gravity", "starts", "engine", "commands", "cables", "markers", "candidates"):
         if label in facts:
-            found.lines.append((label, facts[label]))
+            report.lines.append((label, facts[label]))
 
 
-def _read(found: Check, experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
+def _read(report: Check, experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
     """The recordings of one role; if some are faulty, only the others."""
     spec = experiment.data
     if spec is None:
         if role == "fit":
-            found.lines.append(("recordings", "none: the experiment has no [data], and can only be simulated"))
+            report.lines.append(("recordings", "none: the experiment has no [data], and can only be simulated"))
         return []
-    together = _try(found, partial(load_recordings, spec, folder, role=role))
+    together = _try(report, partial(load_recordings, spec, folder, role=role))
     if together is not None:
         return together
     readable: dict[str, Trajectory] = {}
     for entry in spec.fit if role == "fit" else spec.test:
         alone = changed(spec, where="[data]", fit=[entry], test=[])
-        for recording in _try(found, partial(load_recordings, alone, folder)) or []:
+        for recording in _try(report, partial(load_recordings, alone, folder)) or []:
             readable.setdefault(recording.name, recording)
     return list(readable.values())
 
@@ -264,7 +250,7 @@ def _unlike(lines: list[tuple[str, str]], first: list[tuple[str, str]]) -> list[
     return own if len(own) == len(lines) else [*own, ("", f"all else as {first[0][0].partition(': ')[2]}")]
 
 
-def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> list[tuple[str, str]]:
+def _of_recording(report: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> list[tuple[str, str]]:
     """Lines of one recording: rows, markers, masks and commands, compared with the robot's."""
     gaps = np.diff(trajectory.time)
     step = sample_time(trajectory.time)
@@ -272,7 +258,7 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
     if gaps.max() > IRREGULAR * step:
         rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
     lines = [(f"{role}: {trajectory.name}", rows)]
-    lines += [("", text) for text in (*_markers(found, trajectory, robot), *_commands(found, trajectory, robot))]
+    lines += [("", text) for text in (*_markers(report, trajectory, robot), *_commands(report, trajectory, robot))]
     further = [
         word
         for word, values in (
@@ -290,8 +276,8 @@ def _of_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpi
     return lines
 
 
-def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
-    shared = _try(found, lambda: shared_markers([trajectory], robot.marker_names))
+def _markers(report: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
+    shared = _try(report, lambda: shared_markers([trajectory], robot.marker_names))
     if shared is None:
         yield f"markers {shortened(trajectory.marker_names)}: NONE is the robot's"
         return
@@ -328,27 +314,27 @@ def _masks(trajectory: Trajectory) -> str:
     return f"{masked} of {every} positions are masked" + (f" (in the whole file: {kinds})" if kinds else "")
 
 
-def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
+def _commands(report: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
     names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
     yield f"{len(names)} commands in {unit}: {shortened(names)}; from {command.min():.4g} to {command.max():.4g}"
     yield f"command before the first row: {trajectory.first_command}"
-    problems = len(found.problems)
-    _try(found, lambda: check_channels(trajectory, robot.channel_names, robot.command_unit))
-    if len(found.problems) > problems:
+    problems = len(report.problems)
+    _try(report, lambda: check_channels(trajectory, robot.channel_names, robot.command_unit))
+    if len(report.problems) > problems:
         return
     if tuple(names) != robot.channel_names:
         yield f"the robot calls them {shortened(robot.channel_names)}, in this order"
     if not isinstance(robot, Robot):
         return
-    travel = _try(found, partial(robot.travel, trajectory.name, trajectory.initial_command))
+    travel = _try(report, partial(robot.travel, trajectory.name, trajectory.initial_command))
     if travel is not None:
         yield from _travel(travel, robot)
     asked = asked_pulls(robot, trajectory)
     doubted = asked is None or (not robot.held_by_force and asked.max() > robot.length)
     beyond = "" if asked is None or doubted else drives_beyond(robot, asked)
     if beyond:
-        held = "drives are held at the limits of the robot file if commands ask for more"
-        found.notes.append(f"{trajectory.name}: {held}: {beyond}")
+        limits = "drives are held at the limits of the robot file if commands ask for more"
+        report.notes.append(f"{trajectory.name}: {limits}: {beyond}")
 
 
 def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
@@ -362,16 +348,16 @@ def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
         yield f"drives of {shortened(names)}: {text}"
 
 
-def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
+def _say_repeats(report: Check, trajectories: Sequence[Trajectory]) -> None:
     groups = [group for group in group_repeats(trajectories) if len(group) > 1]
     for group in groups:
-        found.lines.append(("repeats", shortened([trajectories[index].name for index in group])))
-    floor = _try(found, lambda: noise_floor(trajectories)) if groups else None
+        report.lines.append(("repeats", shortened([trajectories[index].name for index in group])))
+    floor = _try(report, lambda: noise_floor(trajectories)) if groups else None
     if floor:
         words = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in floor.items())
-        found.lines.append(("noise", f"spread of the repeats in mm: {words}"))
+        report.lines.append(("noise", f"spread of the repeats in mm: {words}"))
     elif trajectories:
-        found.notes.append("no recording was repeated: noise cannot be distinguished from errors of the simulator")
+        report.notes.append("no recording was repeated: noise cannot be distinguished from errors of the simulator")
 
 
 def _budget(table: InferenceTable) -> str:
@@ -381,32 +367,32 @@ def _budget(table: InferenceTable) -> str:
     return f"{table.rollouts or ROLLOUTS} rollouts"
 
 
-def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
+def _say_model(report: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
     """Report on inferred parameters and method; a model that cannot be built is a problem."""
     method, named = experiment.inference.method, experiment.model.mechanisms
-    _try(found, lambda: make_config(method, inference_options(experiment.inference)))
-    found.lines.append(("method", f"{method}, {_budget(experiment.inference)}, seed {experiment.seed}"))
-    found.lines.append(("mechanisms", ", ".join(named) or "none"))
-    spec = _try(found, lambda: spec_of(experiment, folder))
+    _try(report, lambda: make_config(method, inference_options(experiment.inference)))
+    report.lines.append(("method", f"{method}, {_budget(experiment.inference)}, seed {experiment.seed}"))
+    report.lines.append(("mechanisms", ", ".join(named) or "none"))
+    spec = _try(report, lambda: spec_of(experiment, folder))
     if spec is not None:
-        _try(found, partial(_see_candidates, spec, experiment.audit))
-    simulator = None if spec is None else _try(found, partial(build_simulator, spec))
+        _try(report, partial(_see_candidates, spec, experiment.audit))
+    simulator = None if spec is None else _try(report, partial(build_simulator, spec))
     if spec is None or simulator is None or not fitted:
         return
     if simulator.integrator == QUASI_STATIC:
-        found.lines.append(("motion", "quasi-static: every row is an equilibrium, without time step and damping"))
+        report.lines.append(("motion", "quasi-static: every row is an equilibrium, without time step and damping"))
     else:
         step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
-        found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
-    model = _try(found, lambda: build_model(spec, simulator, fitted))
+        report.lines.append(("time step", f"{1e3 * step:.4g} ms"))
+    model = _try(report, lambda: build_model(spec, simulator, fitted))
     if model is not None:
         for index, parameter in enumerate(model.scopes.parameters):
             table = parameter.table
             words = ", ".join(f"{k} {v:g}" for k, v in table.items() if k != "distribution")
             text = f"{parameter.name} [{parameter.spec.unit}] ~ {table.get('distribution')}({words})"
-            found.lines.append(("inferred" if index == 0 else "", text))
+            report.lines.append(("inferred" if index == 0 else "", text))
         doubt = implausible_values(spec.robot, _ranges(model)) if isinstance(spec.robot, Robot) else None
-        found.doubts += [] if doubt is None else [doubt]
+        report.doubts += [] if doubt is None else [doubt]
     recorded = {
         "tension": any(t.tension is not None for t in fitted),
         "motor_angle": any(t.motor_angle is not None for t in fitted),
@@ -416,7 +402,7 @@ def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[
     for key, there in recorded.items():
         if there and not asdict(spec.channels)[key]:
             words = key.replace("_", " ")
-            found.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
+            report.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
 
 
 def _ranges(model: TrajectoryModel) -> dict[str, tuple[float, float]]:

@@ -27,8 +27,8 @@ from rfdropo_bayes.verbs.column_units import (
     command_unit,
     length_unit,
     time_unit,
-    told_time_units,
-    told_unit,
+    time_units_in_names,
+    unit_in_names,
 )
 
 TIME = re.compile(
@@ -39,8 +39,7 @@ FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
 MEASURED = re.compile(
     r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
 )
-SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)
-"""If any columns match, only they are commands."""
+SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)  # if any columns match, only they are commands
 COMMAND = re.compile(
     r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
     re.IGNORECASE,
@@ -64,66 +63,50 @@ DERIVED = re.compile(r"(?<![a-z])[vwq][_. ]?\*", re.IGNORECASE)
 RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
 BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
 """Solved poses of bodies: if there are any, the underlying markers are not used."""
-MARKER = re.compile(r"^Marker\.(?!Unlabeled)", re.IGNORECASE)
-"""Markers that Motive measured and somebody named."""
+MARKER = re.compile(r"^Marker\.(?!Unlabeled)", re.IGNORECASE)  # markers that Motive measured and somebody named
 STRUCTURE = re.compile(
     r"(rigid|body|bodies|rigidbodies|markers?|position|poses?|point|transforms?|translation|tf|static|mocap|vrpn|"
     r"optitrack|vicon|qualisys|natnet|observation|state)"
 )
 """Words that formats put around the name of a marker."""
-LOOKED_AT = 2000
-"""Rows that sizes are taken from."""
-MOST_SHOWN = 12
-"""Columns that an error names; and rows from which a pattern of values is told."""
-UNIT_LENGTH = 1e-3
-"""By how much the length of a quaternion may differ from one."""
+LOOKED_AT = 2000  # rows that sizes are taken from
+MOST_SHOWN = 12  # columns that an error names; and rows from which a pattern of values is told
+UNIT_LENGTH = 1e-3  # by how much the length of a quaternion may differ from one
 
 
 class Guess(NamedTuple):
-    """Columns of a file, by their part.
+    """Columns of a file, by their part."""
 
-    Attributes:
-        time, time_unit: column and unit of times, "s" for dates; None without times.
-        commands, command_unit: columns and unit of the commands.
-        positions, position_unit: columns of x, y and z of each marker, and their unit.
-        markers: a name for each marker, made of its columns'; numbered if the columns have no names.
-        tensions, motor_angles: columns of measured forces and angles, one per command; else empty.
-        motor_angle_unit: unit of motor angles.
-        counts_per_turn: counts per turn of the spool, if a unit is "counts".
-        left: other columns.
-        format: format of the file, one of `mapped_formats.MAPPED`.
-        command_time, command_time_unit: column and unit of the commands' own times; None without them.
-        units: units of columns other than command_unit or position_unit.
-        names, command_names: given names of all columns, for files without names.
-        sample_time: given time from row to row [s]; None for rows with times, or without any.
-        evidence: why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file.
-        start: first seen position of each marker, in the file's frame and unit.
-        sent: commands of the first rows; seen: marker positions in the first rows, both in the file's units.
-    """
-
+    # time, time_unit: column and unit of times, "s" for dates; None without times
     time: str | None
     time_unit: str
+    # commands, command_unit: columns and unit of the commands
     commands: list[str]
     command_unit: str
+    # positions, position_unit: columns of x, y and z of each marker, and their unit
     positions: list[list[str]]
     position_unit: str
-    markers: list[str]
+    markers: list[str]  # a name for each marker, made of its columns'; numbered if the columns have no names
+    # tensions, motor_angles: columns of measured forces and angles, one per command; else empty
     tensions: list[str]
     motor_angles: list[str]
-    motor_angle_unit: str
-    left: list[str]
-    format: str
+    motor_angle_unit: str  # unit of motor angles
+    unused: list[str]  # other columns
+    format: str  # format of the file, one of `mapped_formats.MAPPED`
+    # command_time, command_time_unit: column and unit of the commands' own times; None without them
     command_time: str | None
     command_time_unit: str
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # units of columns other than command_unit or position_unit
+    # names, command_names: given names of all columns, for files without names
     names: list[str] | None
     command_names: list[str] | None
+    # why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file
     evidence: Mapping[str, str]
-    start: Float[np.ndarray, "marker 3"]
-    sent: Float[np.ndarray, "command channel"]
-    seen: Float[np.ndarray, "row marker 3"]
-    counts_per_turn: float | None = None
-    sample_time: float | None = None
+    start: Float[np.ndarray, "marker 3"]  # first seen position of each marker, in the file's frame and unit
+    sent: Float[np.ndarray, "command channel"]  # commands of the first rows
+    seen: Float[np.ndarray, "row marker 3"]  # marker positions in the first rows, both in the file's units
+    counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
+    sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
 
     @property
     def counts(self) -> bool:
@@ -132,10 +115,7 @@ class Guess(NamedTuple):
 
 
 def guess_columns(
-    path: Path,
-    sent: Path | None = None,
-    names: Sequence[str] | None = None,
-    command_names: Sequence[str] | None = None,
+    path: Path, sent: Path | None = None, names: Sequence[str] | None = None, command_names: Sequence[str] | None = None
 ) -> Guess:
     """Guess the meaning of a recording's columns.
 
@@ -161,11 +141,11 @@ def guess_columns(
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
     commands = _commands(source, free, any_name=own or sent is not None)
-    _check_found(path, format, columns, positions, commands)
+    _check_columns(path, format, columns, positions, commands)
     tensions = tensions if len(tensions) == len(commands) else []
     units = {
         "command_unit": command_unit(sending, source, commands),
-        "position_unit": (Unit(unit) if unit else told_unit(whole, names_of(positions), named_columns.METRES))
+        "position_unit": (Unit(unit) if unit else unit_in_names(whole, names_of(positions), named_columns.METRES))
         or length_unit(table[names_of(positions)]),
         "time_unit": Unit("s")
         if format == rosbag.FORMAT
@@ -183,7 +163,7 @@ def guess_columns(
         markers=_marker_names(list(triples), None if own else STRUCTURE),
         tensions=tensions,
         motor_angles=angles,
-        left=[name for name in columns if name not in used],
+        unused=[name for name in columns if name not in used],
         format=format,
         command_time=clock,
         units={**units["command_unit"].others, **units["position_unit"].others},
@@ -210,9 +190,11 @@ def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[
     return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *angles)]
 
 
-def _check_found(path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]) -> None:
-    for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
-        if not found:
+def _check_columns(
+    path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]
+) -> None:
+    for what, names in (("positions (columns in x, y and z)", positions), ("commands", commands)):
+        if not names:
             shown = ", ".join(columns[:MOST_SHOWN]) + (", ..." if len(columns) > MOST_SHOWN else "")
             raise InputError(
                 f"found no {what} among the columns {shown}",
@@ -227,7 +209,7 @@ def _measured_angles(whole: CsvTable, table: pd.DataFrame, angles: list[str], se
     """Columns of measured angles that are of use beside commands in the unit ``sent``, and their unit."""
     if not angles:
         return [], Unit("rad")
-    unit = told_unit(whole, angles, ANGLES) or angle_unit(table, angles)
+    unit = unit_in_names(whole, angles, ANGLES) or angle_unit(table, angles)
     if unit.others or (unit.unit == named_columns.COUNTS and sent not in ANGLES):
         return [], Unit("rad")  # nothing would use them, and their size is not known
     return angles, unit
@@ -284,7 +266,7 @@ def _clock_of(table: CsvTable) -> str | None:
     """The first column that is called a time and holds times; else the first in a unit of time that always rises."""
     names = [str(name) for name in table.frame.columns]
     called = next((name for name in names if TIME.search(name) and _holds_times(table, name)), None)
-    return called or next((name for name in names if told_time_units(table, name) and _rises(table, name)), None)
+    return called or next((name for name in names if time_units_in_names(table, name) and _rises(table, name)), None)
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
@@ -293,16 +275,16 @@ def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
         common: names for common, names in triples.items() if not (NO_PLACE.search(common) or SENT.search(common))
     }
     for chosen in (BODY, MARKER):
-        found = {common: names for common, names in places.items() if chosen.search(common)}
-        if found:
-            return found
+        chosen_places = {common: names for common, names in places.items() if chosen.search(common)}
+        if chosen_places:
+            return chosen_places
     return {common: names for common, names in places.items() if not DERIVED.search(common)} or places
 
 
 def _commands(table: pd.DataFrame, names: list[str], *, any_name: bool) -> list[str]:
     """Columns of commands; if no name matches, all columns in files of a user's own format."""
-    told = [name for name in names if SENT.search(name)]
-    names = told or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
+    sent = [name for name in names if SENT.search(name)]
+    names = sent or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
     turns = {name for four in _quaternions(table, names) for name in four}
     names = [name for name in names if name not in turns]
     called = [name for name in names if COMMAND.search(name)]
@@ -321,14 +303,14 @@ def _counts_rows(values: pd.Series) -> bool:
 
 def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
     """Four columns side by side that are of unit length in all rows, and not at rest on an axis."""
-    found = []
+    quaternions = []
     for first in range(len(names) - 3):
         four = names[first : first + 4]
         values = table[four].to_numpy(dtype=float)
         seen = values[np.isfinite(values).all(axis=1)]
         if len(seen) > MOST_SHOWN and np.all(np.abs(np.linalg.norm(seen, axis=1) - 1.0) < UNIT_LENGTH):
-            found += [four] if (np.abs(seen).max(axis=1) < 1.0).any() else []
-    return found
+            quaternions += [four] if (np.abs(seen).max(axis=1) < 1.0).any() else []
+    return quaternions
 
 
 def names_of(positions: list[list[str]]) -> list[str]:
@@ -338,12 +320,12 @@ def names_of(positions: list[list[str]]) -> list[str]:
 
 def _triples(names: list[str]) -> dict[str, list[str]]:
     """Columns that differ in one letter, x, y or z: their common name, and the three in this order."""
-    found: dict[str, dict[str, str]] = {}
+    triples: dict[str, dict[str, str]] = {}
     for name in names:
         for match in AXIS.finditer(name):
             common = f"{name[: match.start()]}*{name[match.end() :]}".lower()
-            found.setdefault(common, {})[match[0].lower()] = name
-    return {common: [axes[a] for a in "xyz"] for common, axes in found.items() if set(axes) == set("xyz")}
+            triples.setdefault(common, {})[match[0].lower()] = name
+    return {common: [axes[a] for a in "xyz"] for common, axes in triples.items() if set(axes) == set("xyz")}
 
 
 def _array_triples(names: list[str]) -> dict[str, list[str]]:
@@ -351,14 +333,14 @@ def _array_triples(names: list[str]) -> dict[str, list[str]]:
     arrays: dict[str, list[str]] = {}
     for name in names:
         arrays.setdefault(name.partition("[")[0], []).append(name)
-    found = _triples(names)
+    triples = _triples(names)
     for array, columns in arrays.items():
         other = any(pattern.search(f"{array}[") for pattern in (COMMAND, SENT, FORCE, MEASURED, NO_COMMAND))
-        if len(columns) % 3 or other or any(name in triple for triple in found.values() for name in columns):
+        if len(columns) % 3 or other or any(name in triple for triple in triples.values() for name in columns):
             continue
         for k in range(0, len(columns), 3):
-            found[f"{array}[{k // 3}]*" if len(columns) > 3 else f"{array}*".lower()] = columns[k : k + 3]
-    return found
+            triples[f"{array}[{k // 3}]*" if len(columns) > 3 else f"{array}*".lower()] = columns[k : k + 3]
+    return triples
 
 
 def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list[str]:

@@ -34,8 +34,7 @@ FOREIGN = {
 }
 """Units of commands that are neither a length of cable nor an angle of a motor."""
 PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
-PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0
-"""Largest pressures in chambers of soft robots in kPa, and in bar."""
+PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0  # largest pressures in chambers of soft robots in kPa, and in bar
 ANGLES = ("rad", "deg", named_columns.COUNTS)
 ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
 TIME_UNITS = {
@@ -45,22 +44,18 @@ TIME_UNITS = {
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
 }
 """Words in the name of a column of times, and their unit."""
-SINCE_1970 = (0.9e9, 4.2e9)
-"""Seconds since 1970 in the years 1998 to 2103: stamps between them have a known unit."""
+SINCE_1970 = (0.9e9, 4.2e9)  # seconds since 1970 in the years 1998 to 2103: stamps between them have a known unit
 LONGEST_STEP = 100.0
 """Longest time between rows [s] with which such stamps are believed: a counter may run through the same numbers."""
 USUAL_STEP, USUAL_RATE = 0.02, 0.5
 """Times between rows [s] and rates of motion [Hz] that recordings of soft robots have, to within decades."""
-FASTEST_MOTION = 20.0
-"""Rate of motion [Hz] that no soft robot has: the mean rate, by its speed over its spread."""
+FASTEST_MOTION = 20.0  # rate of motion [Hz] that no soft robot has: the mean rate, by its speed over its spread
 NOT_TOLD, NOT_WHOLE = 2.0, 4.0
 """How much speaks for seconds that no name tells another unit, and that stamps have decimals, in squared decades."""
-RESTING = 3e-3
-"""Share of the largest coordinate: markers that spread by less rest, and show the rate of noise."""
+RESTING = 3e-3  # share of the largest coordinate: markers that spread by less rest, and show the rate of noise
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
-METRES_UP_TO = 0.2
-"""Largest plausible pull of a cable of a soft arm [m]."""
+METRES_UP_TO = 0.2  # largest plausible pull of a cable of a soft arm [m]
 
 
 BENT, UPRIGHT = 2.0, 1.1
@@ -69,20 +64,16 @@ from its height: its origin need not be the base."""
 
 
 class Unit(NamedTuple):
-    """A unit of columns.
+    """A unit of columns."""
 
-    Attributes:
-        unit: unit of most of them.
-        others: columns in other units, which convert to it.
-        evidence: why it was guessed; empty if the names or a line of units have it.
-    """
-
-    unit: str
-    others: Mapping[str, str] = {}
-    evidence: str = ""
+    unit: str  # unit of most of them
+    others: Mapping[str, str] = {}  # columns in other units, which convert to it
+    evidence: str = ""  # why it was guessed; empty if the names or a line of units have it
 
 
-def told_unit(table: CsvTable, names: Sequence[str], known: Collection[str] = frozenset(UNITS.values())) -> Unit | None:
+def unit_in_names(
+    table: CsvTable, names: Sequence[str], known: Collection[str] = frozenset(UNITS.values())
+) -> Unit | None:
     """The unit, one of ``known``, that columns carry in their names, as ``x1_mm``, or in a line of units below them.
 
     None if no column has a unit.
@@ -90,27 +81,27 @@ def told_unit(table: CsvTable, names: Sequence[str], known: Collection[str] = fr
     Raises:
         InputError: units of several kinds, such as a length and an angle.
     """
-    found = {name: unit for name in names if (unit := _of_column(table, name, known)) is not None}
-    if not found:
+    units = {name: unit for name in names if (unit := _of_column(table, name, known)) is not None}
+    if not units:
         return None
-    common = Counter(found.values()).most_common(1)[0][0]
-    kinds = {_kind(unit): name for name, unit in found.items()}
+    common = Counter(units.values()).most_common(1)[0][0]
+    kinds = {_kind(unit): name for name, unit in units.items()}
     if len(kinds) > 1:
         one, other = list(kinds.values())[:2]
         raise InputError(
-            f"columns of one kind are in several units: {one} in {found[one]}, {other} in {found[other]}",
+            f"columns of one kind are in several units: {one} in {units[one]}, {other} in {units[other]}",
             where=str(table.path),
             remedy="bring all to lengths of cable or to angles of motors, or write [data.columns] for some of them",
         )
-    silent = [name for name in names if name not in found]
-    evidence = f"{next(iter(found))} tells it, and {silent[0]} tells none" if silent else ""
-    return Unit(common, {name: unit for name, unit in found.items() if unit != common}, evidence)
+    silent = [name for name in names if name not in units]
+    evidence = f"{next(iter(units))} tells it, and {silent[0]} tells none" if silent else ""
+    return Unit(common, {name: unit for name, unit in units.items() if unit != common}, evidence)
 
 
 def _of_column(table: CsvTable, name: str, known: Collection[str]) -> str | None:
     below = {UNITS[word] for word in WORD.findall(table.units.get(name, "").lower()) if UNITS.get(word) in known}
-    told = below or {UNITS[word] for word in WORD.findall(name.lower()) if UNITS.get(word) in known}
-    return told.pop() if len(told) == 1 else None
+    units = below or {UNITS[word] for word in WORD.findall(name.lower()) if UNITS.get(word) in known}
+    return units.pop() if len(units) == 1 else None
 
 
 def _kind(unit: str) -> str:
@@ -143,22 +134,22 @@ def unit_of_places(start: Float[np.ndarray, "marker 3"], heights: Mapping[str, f
     names, height = list(heights), np.array(list(heights.values()))
     i, j = int(np.argmin(height)), int(np.argmax(height))
     single = i == j
-    found = float(np.linalg.norm(start[j] - (0.0 if single else start[i])))
+    distance = float(np.linalg.norm(start[j] - (0.0 if single else start[i])))
     known = float(height[j] - (0.0 if single else height[i]))
-    if not (np.isfinite(found) and found > 0.0 and known > 0.0):
+    if not (np.isfinite(distance) and distance > 0.0 and known > 0.0):
         return None
-    unit = min(METRES, key=lambda unit: abs(np.log(found * METRES[unit] / known)))
-    if abs(np.log(found * METRES[unit] / known)) > np.log(BENT if not single else UPRIGHT):
+    unit = min(METRES, key=lambda unit: abs(np.log(distance * METRES[unit] / known)))
+    if abs(np.log(distance * METRES[unit] / known)) > np.log(BENT if not single else UPRIGHT):
         return None
-    words = f"{names[j]} is {found:.3g} from " + ("the origin" if single else names[i])
+    words = f"{names[j]} is {distance:.3g} from " + ("the origin" if single else names[i])
     return Unit(unit, evidence=f"{words}, and {1e3 * known:.4g} mm on the robot")
 
 
 def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) -> Unit:
     """The unit of commands by their names, or else by their size."""
-    told = told_unit(table, names)
-    if told is not None or not names:
-        return told or Unit("mm")
+    named = unit_in_names(table, names)
+    if named is not None or not names:
+        return named or Unit("mm")
     foreign = foreign_unit(table, names)
     if foreign is not None:
         return Unit(foreign)
@@ -183,7 +174,7 @@ def _span(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
 
-def told_time_units(table: CsvTable, name: str) -> set[str]:
+def time_units_in_names(table: CsvTable, name: str) -> set[str]:
     """Units of time by the words in a column's name, or by the line of units below it."""
     words = re.findall(r"[^\W_]+", f"{table.units.get(name, '')}".lower()) or re.findall(r"[^\W_]+", name.lower())
     return {TIME_UNITS[word] for word in words if word in TIME_UNITS}
@@ -200,9 +191,9 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
     if time is None or len(table) < 2:
         return Unit("s")
     stamps = table.stamps(time, "s")
-    told = told_time_units(table, time)
-    if stamps.dated or len(told) == 1:
-        return Unit("s" if stamps.dated else told.pop())
+    units = time_units_in_names(table, time)
+    if stamps.dated or len(units) == 1:
+        return Unit("s" if stamps.dated else units.pop())
     interval, first = row_interval(stamps.since(stamps, str(table.path))), float(stamps.ticks[0])
     count = float(stamps.ticks[-1] - stamps.ticks[0])
     since = [
@@ -219,9 +210,9 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
 
 def command_time_unit(table: CsvTable, time: str | None, duration: float) -> Unit:
     """The unit of the commands' own times: as given, or the unit in which they last as long as the recording [s]."""
-    found = time_unit(table, time)
-    if time is None or not found.evidence or duration <= 0.0 or "1970" in found.evidence:
-        return found
+    guess = time_unit(table, time)
+    if time is None or not guess.evidence or duration <= 0.0 or "1970" in guess.evidence:
+        return guess
     stamps = table.stamps(time, "s")
     count = float(stamps.ticks[-1] - stamps.ticks[0])
     unit = min(PER_SECOND, key=lambda unit: abs(np.log10(max(count, 1e-9) / PER_SECOND[unit] / duration)))
@@ -232,8 +223,8 @@ def _rate(places: np.ndarray | None) -> float:
     """Mean rate of motion, in turns a row: the speed of the markers over their spread; zero if they rest."""
     if places is None or len(places) < 3:
         return 0.0
-    step, spread = np.sqrt(np.nanmean(np.diff(places, axis=0) ** 2)), np.sqrt(np.nanmean(np.nanvar(places, axis=0)))
-    return float(step / (2.0 * np.pi * spread)) if spread > RESTING * np.nanmax(np.abs(places)) else 0.0
+    step, extent = np.sqrt(np.nanmean(np.diff(places, axis=0) ** 2)), np.sqrt(np.nanmean(np.nanvar(places, axis=0)))
+    return float(step / (2.0 * np.pi * extent)) if extent > RESTING * np.nanmax(np.abs(places)) else 0.0
 
 
 def _likeliest(interval: float, decimals: bool, rate: float) -> str:

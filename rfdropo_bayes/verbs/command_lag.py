@@ -14,43 +14,34 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.sample_times import sample_time
 
-DELAYS = (0.0, 0.1, 0.2, 0.4)
-"""Tried delays of the motion behind its commands [s]."""
-MOST_ROWS = 2000
-"""Rows of a recording that are used."""
-JUST_BEFORE = 1e-6
-"""[s] before a row: a command that is sent in it does not act yet."""
-RIDGE = 1e-6
-"""Ridge penalty of the maps, as a share of the mean square of their features."""
-CLEARLY = 0.9
-"""Ratio of the root mean square residuals of two maps below which the better map is reported."""
+DELAYS = (0.0, 0.1, 0.2, 0.4)  # tried delays of the motion behind its commands [s]
+MOST_ROWS = 2000  # rows of a recording that are used
+JUST_BEFORE = 1e-6  # [s] before a row: a command that is sent in it does not act yet
+RIDGE = 1e-6  # ridge penalty of the maps, as a share of the mean square of their features
+CLEARLY = 0.9  # ratio of the root mean square residuals of two maps below which the better map is reported
 
 
-class Left(NamedTuple):
-    """Residual of the markers' motion after a quadratic map of the commands.
+class LagError(NamedTuple):
+    """Residual of the markers' motion after a quadratic map of the commands."""
 
-    Attributes:
-        rows: rows by which the commands precede the markers; 0 is the same row.
-        error: root mean square residual [m].
-    """
-
-    rows: int
-    error: float
+    rows: int  # rows by which the commands precede the markers; 0 is the same row
+    error: float  # root mean square residual [m]
 
 
-def left_by_rows(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)) -> list[Left]:
+def errors_by_row(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)) -> list[LagError]:
     """Residuals if each row shows the effect of the command some rows before, for each lag."""
-    return [Left(lag, _left([(own, _shifted(sent, lag)) for own, sent in _series(runs)])) for lag in lags]
+    return [LagError(lag, _map_error([(own, _shifted(sent, lag)) for own, sent in _series(runs)])) for lag in lags]
 
 
 def best_delay(runs: Sequence[Trajectory]) -> float:
     """Delay [s] of the markers behind the commands at which a quadratic map fits best."""
     step = sample_time(*(run.time for run in runs))
     delays = sorted({*DELAYS, step})
-    left = [
-        _left([(_positions(run)[:MOST_ROWS], run.command_at(run.time - d)[:MOST_ROWS]) for run in runs]) for d in delays
+    errors = [
+        _map_error([(_positions(run)[:MOST_ROWS], run.command_at(run.time - d)[:MOST_ROWS]) for run in runs])
+        for d in delays
     ]
-    return delays[int(np.argmin(left))]
+    return delays[int(np.argmin(errors))]
 
 
 def _series(runs: Sequence[Trajectory]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -71,7 +62,7 @@ def _shifted(command: Float[np.ndarray, "row channel"], lag: int) -> Float[np.nd
     return moved
 
 
-def _left(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+def _map_error(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
     """Residual of a single map for all recordings, with a separate mean per recording."""
     parts = []
     for position, command in series:
@@ -114,17 +105,17 @@ NAMES = {-1: "the next row", 0: "its own row", 1: "the row before", 2: "two rows
 
 def lag_words(runs: Sequence[Trajectory], columns: CsvColumns | None) -> LagWords:
     """Find the row of the command that poses at rest show."""
-    left = {each.rows: each.error for each in left_by_rows(runs)}
-    best = min(left, key=lambda rows: left[rows])
+    errors = {each.rows: each.error for each in errors_by_row(runs)}
+    best = min(errors, key=lambda rows: errors[rows])
     own = all(np.array_equal(run.command_at(run.time - JUST_BEFORE), run.command_at(run.time)) for run in runs)
     taken, shared = 0 if own else 1, columns is not None and columns.command_time is None
-    told = ", ".join(f"{NAMES[rows]} {1e3 * error:.3g}" for rows, error in left.items())
+    listed = ", ".join(f"{NAMES[rows]} {1e3 * error:.3g}" for rows, error in errors.items())
     words = (
         f"a pose follows the command of {NAMES[best]} best; the simulation takes that of {NAMES[taken]} (a quadratic "
-        f"map of the command leaves, in mm: {told})"
+        f"map of the command leaves, in mm: {listed})"
     )
-    if left[best] >= CLEARLY * left[taken]:
+    if errors[best] >= CLEARLY * errors[taken]:
         return LagWords(words, None)
-    shares = f"{1e3 * left[best]:.3g} mm are left, by {NAMES[taken]} {1e3 * left[taken]:.3g} mm"
+    shares = f"{1e3 * errors[best]:.3g} mm are left, by {NAMES[taken]} {1e3 * errors[taken]:.3g} mm"
     remedy = REMEDIES.get(best, CLOCKS) if shared else CLOCKS
     return LagWords(words, f"a pose follows the command of {NAMES[best]} ({shares}): {remedy}")

@@ -111,9 +111,9 @@ def design(
         "texts": model.texts(),
     }
     with run_folder(Path(out), "design", **settings, overwrite=overwrite) as folder:
-        found = work()
-        found.save(folder)
-    return found
+        designed = work()
+        designed.save(folder)
+    return designed
 
 
 def _design(
@@ -133,13 +133,13 @@ def _design(
     target, fitted = base_model(problem, problem.seed, report=report, deadline=clock)
     report("base model fitted")
     search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed)
-    found: Screen | None = None
+    scores: Screen | None = None
     with clock.part(SCREENED_BY, SCREENING):
-        found = search.screened(fitted)
-    hypotheses = [] if found is None else _hypotheses(search, found, clock, report)
-    wrong = found is not None and found.omnibus.p <= problem.rules.base_passes
-    if wrong and (rivals := _rivals(problem, target, fitted, clock, report)):
-        target, fitted, hypotheses = _with_laws(problem, target, fitted, hypotheses, rivals)
+        scores = search.screened(fitted)
+    hypotheses = [] if scores is None else _hypotheses(search, scores, clock, report)
+    wrong = scores is not None and scores.omnibus.p <= problem.rules.base_passes
+    if wrong and (alternatives := _alternatives(problem, target, fitted, clock, report)):
+        target, fitted, hypotheses = _with_laws(problem, target, fitted, hypotheses, alternatives)
     tried = list(proposals(runs[0], runs, rng))
     outlook = _outlooks(problem, target, fitted, hypotheses, runs[0], tried, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
@@ -147,7 +147,7 @@ def _design(
     now = at_hand(target, hypotheses)
     content = {
         "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed)
-        + units_said(settings.data)
+        + stated_units(settings.data)
         + _unfinished(clock),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
@@ -168,21 +168,21 @@ def _design(
 
 
 def _hypotheses(
-    search: ExtensionSearch, found: Screen, clock: Clock, report: Callable[[str], None]
+    search: ExtensionSearch, scores: Screen, clock: Clock, report: Callable[[str], None]
 ) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
-    rows = [row for row in found.rows if row.adjusted_p <= search.rules.family and row.name != DISCRETISATION]
+    rows = [row for row in scores.rows if row.adjusted_p <= search.rules.family and row.name != DISCRETISATION]
     report(f"{len(rows)} candidates are significant")
     hypotheses = []
     for row in rows[: 2 * HYPOTHESES]:
         with clock.part(REFITTED_BY, f"refit with {row.name}"):
-            hypotheses.append(Hypothesis(row.name, search.refit(found.fit, row)))
+            hypotheses.append(Hypothesis(row.name, search.refit(scores.fit, row)))
             report(f"hypothesis {row.name}")
     hypotheses.sort(key=lambda h: -h.fit.log_evidence)
     return hypotheses[:HYPOTHESES]
 
 
-def _rivals(
+def _alternatives(
     problem: AuditProblem, target: FitTarget, base: Fit, clock: Clock, report: Callable[[str], None]
 ) -> list[Refit]:
     """The leading law at a port without a name in the library, and laws that the recordings cannot distinguish from
@@ -193,28 +193,28 @@ def _rivals(
     simulator: Any = problem.lanes.simulator
     names, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
     options = (problem.ports, names, unit, problem.seed, problem.rules.family, report)
-    rivals: list[Refit] = []
+    alternatives: list[Refit] = []
     with clock.part(LAWS_BY, "laws at ports"):
         search = replace(law_search(target, *options), most=1)
-        rivals = search.find(target, base).rivals
-    return rivals
+        alternatives = search.find(target, base).rivals
+    return alternatives
 
 
 def _with_laws(
-    problem: AuditProblem, target: FitTarget, base: Fit, hypotheses: Sequence[Hypothesis], rivals: Sequence[Refit]
+    problem: AuditProblem, target: FitTarget, base: Fit, hypotheses: Sequence[Hypothesis], alternatives: Sequence[Refit]
 ) -> tuple[FitTarget, Fit, list[Hypothesis]]:
     """Target, base fit and hypotheses with laws before them, all under the same noise, which is fitted to the model
     with the leading law. A misspecified model would be overconfident under the measurement noise.
     """
     simulator: Any = problem.lanes.simulator
-    names, judge = tuple(simulator.channel_names), rivals[0].target.on(target.forward)
+    names, judge = tuple(simulator.channel_names), alternatives[0].target.on(target.forward)
     laws = [
         Hypothesis(
             f"{refit.feature.formula(names)} at {refit.term.port.words}",
             seen_under(refit.target, judge, refit.fit),
             refit.target.forward,
         )
-        for refit in rivals
+        for refit in alternatives
     ]
     own = [replace(h, fit=seen_under(target, judge, h.fit)) for h in hypotheses]
     return judge, seen_under(target, judge, base), [*laws, *own][:HYPOTHESES]
@@ -256,7 +256,7 @@ def command_table(
     return pd.DataFrame({"time_s": time, **channels})
 
 
-def units_said(data: DataSpec | None) -> str:
+def stated_units(data: DataSpec | None) -> str:
     """Sentence on the units of `command_table`, if its column names do not state them."""
     if data is not None and data.format == ASL:
         return " Columns u1 to u6 are in degrees, a row every 10 ms, as that format has them."
@@ -286,7 +286,7 @@ def proposals(
     high = np.max([np.max(t.command, axis=0) for t in fitted], axis=0)
     low, high = np.minimum(low, first.initial_command), np.maximum(high, first.initial_command)
     duration, channels = float(first.time[-1]), len(low)
-    found = []
+    proposed = []
     for index in range(SEQUENCES):
         kind = ("random walk", "holds", "slow loop", "chirp")[index % 4]
         if kind in ("random walk", "holds"):
@@ -294,7 +294,7 @@ def proposals(
             time = interval * np.arange(int(duration / interval))
             level = rng.uniform(low, high, (len(time), channels))
             moved = rng.uniform(size=level.shape) < (0.3 if kind == "random walk" else 0.6)
-            value = _held(level, moved, first.initial_command)
+            value = _constant(level, moved, first.initial_command)
         else:
             time = np.arange(0.0, duration, duration / 100)
             turns = rng.integers(1, 4)
@@ -302,11 +302,11 @@ def proposals(
             swing = 0.5 - 0.5 * np.cos(2 * np.pi * phase)
             weight = rng.dirichlet(np.ones(channels)) ** 0.5
             value = first.initial_command + np.outer(swing, weight * (high - first.initial_command))
-        found.append((kind, time, np.clip(value, low, high)))
-    return found
+        proposed.append((kind, time, np.clip(value, low, high)))
+    return proposed
 
 
-def _held(level: np.ndarray, moved: np.ndarray, initial: np.ndarray) -> np.ndarray:
+def _constant(level: np.ndarray, moved: np.ndarray, initial: np.ndarray) -> np.ndarray:
     """Channels that keep their command until they are moved."""
     value, last = np.empty_like(level), np.array(initial, dtype=float)
     for row in range(len(level)):
@@ -326,9 +326,9 @@ def _unfinished(clock: Clock) -> str:
 
 def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], float], screened: bool) -> str:
     if not outlook.pairs:
-        found = "No candidate is significant." if screened else "There was no time for the candidates."
+        outcome = "No candidate is significant." if screened else "There was no time for the candidates."
         return (
-            f"{found} The {kind} in {COMMANDS} would tell most about the base parameters: "
+            f"{outcome} The {kind} in {COMMANDS} would tell most about the base parameters: "
             f"{outlook.information:.1f} nats."
         )
     pair = min(outlook.pairs, key=lambda p: outlook.pairs[p])

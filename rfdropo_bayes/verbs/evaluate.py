@@ -31,9 +31,7 @@ from rfdropo_bayes.policies.evaluation import (
 )
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
 from rfdropo_bayes.policies.policy_figures import save_animation, success_figure
-from rfdropo_bayes.policies.randomisation import (
-    Randomisation,
-)
+from rfdropo_bayes.policies.randomisation import Randomisation
 from rfdropo_bayes.policies.rendering import frames_of
 from rfdropo_bayes.policies.tasks import Task, observed_of
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
@@ -105,19 +103,19 @@ def evaluate(
     }
     with run_folder(Path(out), "evaluate", **record, overwrite=overwrite) as out:
         cases: list[Case] = []
-        found: dict[str, list[Episode]] = {}
+        played: dict[str, list[Episode]] = {}
         for name, policy in loaded.items():
             batch = _episodes_for(policy.layout, simulator, task, min(lanes, episodes), randomisation, table, name)
             venv = TrunkVecEnv(batch)
             cases = cases or draw_cases(venv, episodes, EVALUATION_SEED + seed)
-            found[name] = play(policy.act, venv, cases, seed)
+            played[name] = play(policy.act, venv, cases, seed)
             if film:
-                _film(batch, found[name], cases, out / f"{name}.gif")
-        content = _judged(found, cases, seed) | {"tension_limit_n": table.tension_limit}
+                _film(batch, played[name], cases, out / f"{name}.gif")
+        content = _rated(played, cases, seed) | {"tension_limit_n": table.tension_limit}
         content["otherwise_trained"] = [*_otherwise_trained(loaded, steps_of(simulator)), *unwatched]
         with whole(out / CSV) as partial:
-            episode_table(found, cases).to_csv(partial, index=False)
-        success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
+            episode_table(played, cases).to_csv(partial, index=False)
+        success_figure(played, THRESHOLDS).savefig(out / FIGURE, dpi=150)
         write_text(out / TABLE, evaluation_table(content))
         write_json(out / EVALUATION, content, finite=True)
     return content
@@ -193,9 +191,9 @@ def _film(batch: Episodes, episodes: Sequence[Episode], cases: Sequence[Case], p
     save_animation(frames, path, batch.layout.period_s)
 
 
-def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed: int) -> dict[str, Any]:
+def _rated(played: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed: int) -> dict[str, Any]:
     policies = {}
-    for name, episodes in found.items():
+    for name, episodes in played.items():
         middle = interquartile_mean([episodes], seed)
         rates = {f"{1e3 * t:g}": success(episodes, t) for t in THRESHOLDS}
         policies[name] = {

@@ -99,8 +99,8 @@ def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = Fal
     known = {spec.name: spec for spec in model.robot.specs} if isinstance(model.robot, BlackBox) else {}
     draws = {info.name: record.flat(info.name) for info in record.free if info.name in known}
     values = {name: float(own.mean()) for name, own in draws.items()}
-    held = physical_values(model.spec, model.simulator) | {info.name: value for info, value in record.held}
-    values |= {name: value for name, value in held.items() if name in known}
+    fixed = physical_values(model.spec, model.simulator) | {info.name: value for info, value in record.fixed}
+    values |= {name: value for name, value in fixed.items() if name in known}
     lines = ["Calibrated by rfdropo_bayes: posterior means; in brackets the 90 % range to randomise over."]
     for name, value in values.items():
         low, high = np.quantile(draws[name], [0.05, 0.95]) if name in draws else (value, value)
@@ -132,13 +132,13 @@ def _rows(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[dict[str,
     for info in record.free:
         if phi:
             entry = phi[info.name]
-            found = {key: float(entry[key]) for key in ("mean", "std", "low", "high")}
+            statistics = {key: float(entry[key]) for key in ("mean", "std", "low", "high")}
         else:
             draws = record.flat(info.name)
             low, high = np.quantile(draws, [0.005, 0.995])
-            found = {"mean": draws.mean(), "std": draws.std(), "low": low, "high": high}
+            statistics = {"mean": draws.mean(), "std": draws.std(), "low": low, "high": high}
         factor = millimetre_factor(info.unit)
-        values = {key: float(value) for key, value in found.items()}
+        values = {key: float(value) for key, value in statistics.items()}
         in_millimetres = {f"{key}_mm_kg_s": value * factor for key, value in values.items()}
         rows.append({"parameter": info.name, "unit": info.unit, **values, **in_millimetres})
     return rows
@@ -146,8 +146,8 @@ def _rows(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[dict[str,
 
 def _correlation(names: list[str], stack: np.ndarray) -> dict[str, dict[str, float]]:
     """Correlations of the draws; a constant parameter correlates with itself only."""
-    spread = stack.std(axis=1)
-    scaled = (stack - stack.mean(axis=1, keepdims=True)) / np.where(spread > 0.0, spread, 1.0)[:, None]
+    deviation = stack.std(axis=1)
+    scaled = (stack - stack.mean(axis=1, keepdims=True)) / np.where(deviation > 0.0, deviation, 1.0)[:, None]
     matrix = scaled @ scaled.T / stack.shape[1]
     np.fill_diagonal(matrix, 1.0)
     return {a: dict(zip(names, matrix[i].tolist(), strict=True)) for i, a in enumerate(names)}

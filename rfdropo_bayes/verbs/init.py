@@ -24,7 +24,7 @@ from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_te
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
-from rfdropo_bayes.verbs.command_lag import left_by_rows
+from rfdropo_bayes.verbs.command_lag import errors_by_row
 from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, parts_of
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
@@ -33,10 +33,8 @@ from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
-CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
-"""Formats that come from motion capture, which loses markers now and then."""
-FAR_ORIGIN = 0.1
-"""Share of the body's length: a frame whose origin lies farther from the base is moved there."""
+CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion capture, which loses markers now and then
+FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
 
@@ -57,10 +55,10 @@ def matching_recordings(patterns: list[str]) -> list[Path]:
         named = Path(pattern)
         anchor = Path(named.anchor)
         below = named.relative_to(anchor) if named.is_absolute() else named
-        found = matching_files(anchor, below)
-        if not found:
+        matching = matching_files(anchor, below)
+        if not matching:
             raise InputError("matches no file", where=pattern, remedy="give the path of a recording; quote patterns")
-        files += [file for file in found if file not in files]
+        files += [file for file in matching if file not in files]
     formats = {recognised_format(file): file for file in files}
     if len(formats) > 1:
         said = ", ".join(f"{format} ({file.name})" for format, file in formats.items())
@@ -94,8 +92,8 @@ def with_given(guess: Guess, **given: Any) -> Guess:
     return guess._replace(**given, evidence=evidence, units=units)
 
 
-def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
-    """A guess with the counts of one turn; whoever gives them, and no unit (``told``), has commands in counts.
+def with_counts(guess: Guess, counts: float | None, unit_given: bool) -> Guess:
+    """A guess with the counts of one turn; whoever gives them, and no unit (``unit_given``), has commands in counts.
 
     Raises:
         InputError: counts of one turn that are not positive, or are given for commands in another unit.
@@ -104,7 +102,7 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
         return guess
     if counts <= 0.0:
         raise InputError(f"{counts:g} counts in one turn", where="--counts-per-turn", remedy="give a positive number")
-    if not guess.counts and told:
+    if not guess.counts and unit_given:
         remedy = "leave it out, or give --command-unit counts"
         raise InputError(f"commands are in {guess.command_unit}", where="--counts-per-turn", remedy=remedy)
     unit = guess.command_unit if guess.counts else COUNTS
@@ -114,7 +112,7 @@ def with_counts(guess: Guess, counts: float | None, told: bool) -> Guess:
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
     """A guess with units that suit the robot, and without tensions of motors with two cables."""
     if outline.pairs and guess.tensions:
-        guess = guess._replace(tensions=[], left=[*guess.left, *guess.tensions])
+        guess = guess._replace(tensions=[], unused=[*guess.unused, *guess.tensions])
     if "markers" in outline.assumed:
         return guess
     unit = unit_of_places(guess.start, outline.markers) if "position_unit" in guess.evidence else None
@@ -199,34 +197,36 @@ def write_first_files(
     if seen is None or columns is None or not usual:
         return robot, experiment
     bends = outline.sets_bend is not None
-    found = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed, bends=bends)
+    registration = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed, bends=bends)
     ordered, order = guess, None
-    if found.arrangement is not None:
-        turns = np.degrees(found.arrangement.turns)
+    if registration.arrangement is not None:
+        turns = np.degrees(registration.arrangement.turns)
         azimuths = tuple(round(float(a + t), 1) % 360.0 for a, t in zip(outline.first_azimuths(), turns, strict=True))
-        evidence = found.evidence if any(found.arrangement.turns) else ""
+        evidence = registration.evidence if any(registration.arrangement.turns) else ""
         outline = replace(outline, segment_azimuths=azimuths, azimuth_evidence=evidence)
         beside: dict[str, Any] = {
-            key: [names[column] for column in found.arrangement.columns]
+            key: [names[column] for column in registration.arrangement.columns]
             for key in ("commands", "tensions", "motor_angles")
             if (names := getattr(guess, key))
         }
         ordered = guess._replace(**beside)
-        order = found.evidence if ordered.commands != guess.commands else None
+        order = registration.evidence if ordered.commands != guess.commands else None
     explained = (
-        None if found.frame is None else f"a rod at rest explains {100 * found.frame.explained:.3g} % of the motion"
+        None
+        if registration.frame is None
+        else f"a rod at rest explains {100 * registration.frame.explained:.3g} % of the motion"
     )
-    if found.frame is not None and (found.frame.scale, found.bend) != (1.0, 1.0):
-        outline = outline.resized(found.frame.scale, found.bend, f"{explained} with them")
+    if registration.frame is not None and (registration.frame.scale, registration.bend) != (1.0, 1.0):
+        outline = outline.resized(registration.frame.scale, registration.bend, f"{explained} with them")
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
-    if found.frame is not None:
-        turned = found.frame.quarter.T
-        if not np.allclose(turned, np.eye(3)) or np.linalg.norm(found.frame.shift) > FAR_ORIGIN * made.length:
-            lines = moved_frame(columns, turned, -turned @ found.frame.shift)
+    if registration.frame is not None:
+        turned = registration.frame.quarter.T
+        if not np.allclose(turned, np.eye(3)) or np.linalg.norm(registration.frame.shift) > FAR_ORIGIN * made.length:
+            lines = moved_frame(columns, turned, -turned @ registration.frame.shift)
             frame = [f"{line}  # ASSUMED: {explained} in this frame" for line in lines]
-            found = found._replace(frame=found.frame._replace(shift=np.zeros(3)))
-    write(tables(guess=ordered, frame=frame, order=order), slow, first, found.frame)
+            registration = registration._replace(frame=registration.frame._replace(shift=np.zeros(3)))
+    write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame)
     return robot, experiment
 
 
@@ -234,7 +234,7 @@ def _of_poses(first: Trajectory, timed: bool) -> str | None:
     """Reason to take the command of a row for the command of its pose; None if the pose follows the row before."""
     if not timed:
         return NO_MOTION
-    own, before = left_by_rows([first], (0, 1))
+    own, before = errors_by_row([first], (0, 1))
     if own.error > before.error:
         return None
     errors = f"{1e3 * own.error:.3g} mm, of the row before {1e3 * before.error:.3g} mm"
@@ -259,9 +259,9 @@ def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
     if experiment.data is None or experiment.data.columns is None:
         return []
     columns = experiment.data.columns
-    found = frame_lines(robot, guess.start, columns)
-    turned = found and found[0] != f"axes = {quoted(columns.axes)}"
-    return [] if turned and guess.format == motive_csv.FORMAT else found
+    lines = frame_lines(robot, guess.start, columns)
+    turned = lines and lines[0] != f"axes = {quoted(columns.axes)}"
+    return [] if turned and guess.format == motive_csv.FORMAT else lines
 
 
 def _head(name: str) -> list[str]:
@@ -303,8 +303,8 @@ def assumed_of_columns(guess: Guess) -> list[str]:
         said.append(f'time = "{ROWS}": {NO_TIMES}')
     if guess.command_time is not None:
         said.append("command_offset = 0.0: the clocks of commands and observations begin together")
-    if guess.left:
-        said.append(f"columns that are not used: {', '.join(guess.left)}")
+    if guess.unused:
+        said.append(f"columns that are not used: {', '.join(guess.unused)}")
     return said
 
 
@@ -342,7 +342,7 @@ def data_tables(
     if guess.motor_angles:
         optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
-    left = [f"# not used: {', '.join(guess.left)}"] if guess.left else []
+    unused = [f"# not used: {', '.join(guess.unused)}"] if guess.unused else []
     return [
         "[data]",
         f'format = "{guess.format}"',
@@ -370,7 +370,7 @@ def data_tables(
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
         *(frame or [f"axes = {quoted(axes)}{assumed}"]),
         *optional,
-        *left,
+        *unused,
         "",
     ]
 
@@ -384,8 +384,8 @@ def _unit_line(guess: Guess, key: str) -> str:
 def _other_units(guess: Guess) -> list[str]:
     if not guess.units:
         return []
-    told = ", ".join(f"{quoted(name)} = {quoted(unit)}" for name, unit in guess.units.items())
-    return [f"units = {{{told}}}  # of columns in other units than command_unit or position_unit"]
+    listed = ", ".join(f"{quoted(name)} = {quoted(unit)}" for name, unit in guess.units.items())
+    return [f"units = {{{listed}}}  # of columns in other units than command_unit or position_unit"]
 
 
 def _clock(guess: Guess) -> list[str]:

@@ -21,8 +21,7 @@ from rfdropo_bayes.verbs.column_names import Guess
 from rfdropo_bayes.verbs.column_units import ANGLES
 from rfdropo_bayes.verbs.init import data_tables, quoted, with_given
 
-OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}
-"""Units of commands in recordings, for each unit of a simulator."""
+OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}  # units of commands in recordings, for each unit of a simulator
 
 
 def write_model_experiment(

@@ -20,17 +20,13 @@ from rfdropo_bayes.verbs.registration import Frame
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
 1.5 mm, and a slack of 2 mm on another day."""
-ORIGIN = 0.05
-"""Standard deviation of the frame's origin over the body's length."""
+ORIGIN = 0.05  # standard deviation of the frame's origin over the body's length
 TILT, TURN = 0.1, 0.5
 """Standard deviations of the frame's tilt, and of its turn about the body's axis [rad]. That arm's frame was turned by
 0.3 rad."""
-GAIN = 0.1
-"""Standard deviation of the relative error of a command in metres of cable."""
-UNKNOWN = 0.5
-"""The same of a robot whose cables' distance from the axis, or whose length, was not given."""
-FEWEST_ROWS = 60
-"""Rows of a recording whose last third, 20 rows, is worth a test."""
+GAIN = 0.1  # standard deviation of the relative error of a command in metres of cable
+UNKNOWN = 0.5  # the same of a robot whose cables' distance from the axis, or whose length, was not given
+FEWEST_ROWS = 60  # rows of a recording whose last third, 20 rows, is worth a test
 ROWS_AT_REST = 200
 """Rows at rest that a fit takes, seven for each parameter of a robot with nine cables. There 405 of 1,620 rows left the
 error on unseen rows as it was; with 203 the minutes hold twice the rollouts."""
@@ -77,13 +73,13 @@ def installed_priors(
         pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording)
         if pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
-    turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.left_over, frame.shift)
-    found = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.3g} % of the motion there"
+    turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.remaining_turn, frame.shift)
+    explained = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.3g} % of the motion there"
     for axis, place in zip("xyz", shift, strict=True):
         words = f"origin of the measuring frame: {ORIGIN:g} of the body's length"
         normal(f"offset_{axis}", ORIGIN * robot.length, words, place)
     for axis, angle, wide in zip("xyz", turn, (TILT, TILT, TURN), strict=True):
-        normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{found}", angle)
+        normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{explained}", angle)
     if robot.command_unit == "m":
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")

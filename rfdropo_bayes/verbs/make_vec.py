@@ -22,11 +22,11 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.randomisation import (
-    Days,
     Draws,
     Layers,
     Point,
     Randomisation,
+    Sessions,
     Uniform,
     drawn_rows,
     read_phi,
@@ -37,7 +37,7 @@ from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.prediction.day_spread import day_deviations
+from rfdropo_bayes.prediction.session_deviation import session_deviations
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot
@@ -146,10 +146,7 @@ def steps_of(simulator: AnySimulator) -> str:
 
 
 def randomisation_of(
-    table: TrainingTable,
-    spec: ModelSpec,
-    simulator: AnySimulator,
-    fit: Calibration | Path | None = None,
+    table: TrainingTable, spec: ModelSpec, simulator: AnySimulator, fit: Calibration | Path | None = None
 ) -> Randomisation:
     """Sources of parameters: fixed values, randomised parameters, and parameters that differ between episodes.
 
@@ -167,14 +164,14 @@ def randomisation_of(
             remedy='leave one of them out, or set randomisation = "posterior"',
         )
     absent = () if "cube_mass" in {spec.name for spec in simulator.parameters} else OBJECT
-    held = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
-    parts: list[Randomisation] = [Point(physical_values(held, simulator))]
+    fixed = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
+    parts: list[Randomisation] = [Point(physical_values(fixed, simulator))]
     if isinstance(fit, Calibration):
         fitted = fitted_integrator(fit.record.attrs, fit.folder)
         check_fitted_integrator(fitted, simulator.integrator, where="fit")
         rows = drawn_rows(fit.record, simulator.parameters, robot=simulator.robot)
         _check_parameters(fit.record, simulator, where="fit")
-        parts.append(_beside_held(_on_its_day(rows, fit.record, simulator), fit.record, simulator))
+        parts.append(_with_fixed(_in_its_session(rows, fit.record, simulator), fit.record, simulator))
     elif fit is not None:
         parts.append(_of_run(Path(fit), simulator))
     elif table.randomisation != "none":
@@ -224,20 +221,20 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     """
     folder = source if source.is_dir() else source.parent
     file = source if source.is_file() and not phi else folder / POSTERIOR
-    found: Randomisation
+    randomisation: Randomisation
     record: PosteriorRecord | None
     if phi:
-        found = read_phi(source, simulator.parameters, simulator.robot)
+        randomisation = read_phi(source, simulator.parameters, simulator.robot)
         record = PosteriorRecord.load(file) if file.is_file() else None
     else:
         rows, record = read_posterior(source, simulator.parameters, simulator.robot), PosteriorRecord.load(file)
-        found = _on_its_day(rows, record, simulator)
+        randomisation = _in_its_session(rows, record, simulator)
     if record is not None:
         _check_parameters(record, simulator, where=str(source))
     attributes = {} if record is None else record.attrs
     fitted = fitted_integrator(attributes, folder)
     check_fitted_integrator(fitted, simulator.integrator, where=str(source))
-    return _beside_held(found, record, simulator)
+    return _with_fixed(randomisation, record, simulator)
 
 
 def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where: str) -> None:
@@ -258,13 +255,14 @@ def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where
         )
 
 
-def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -> Randomisation:
-    """A posterior's rows on the day it was adapted to, else each on a day that no fit has seen, as predictions are.
+def _in_its_session(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -> Randomisation:
+    """A posterior's rows on the session it was adapted to, else each on a session that no fit has seen, as predictions
+    are.
 
-    Policies meet neither the mean of the fitted days nor one of them, but the next day. The sum of a shared value and a
-    day's deviation ends at the hard bounds, as in the fit.
+    Policies meet neither the mean of the fitted sessions nor one of them, but the next session. The sum of a shared
+    value and a session's deviation ends at the hard bounds, as in the fit.
     """
-    own = {name: each for name, each in day_deviations(record, simulator.parameters).items() if name in rows.names}
+    own = {name: each for name, each in session_deviations(record, simulator.parameters).items() if name in rows.names}
     if not own:
         return rows
     shifts = np.stack([own[name].shift if name in own else np.zeros(len(rows.rows)) for name in rows.names], axis=1)
@@ -272,11 +270,11 @@ def _on_its_day(rows: Draws, record: PosteriorRecord, simulator: AnySimulator) -
     low, high = np.transpose([ends.get(name, (-np.inf, np.inf)) for name in rows.names])
     moved = replace(rows, rows=np.clip(rows.rows + shifts, low, high))
     spreads = {name: each.spread for name, each in own.items() if each.spread.any()}
-    return Days(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
+    return Sessions(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
 
 
-def _beside_held(found: Randomisation, record: PosteriorRecord | None, simulator: AnySimulator) -> Randomisation:
+def _with_fixed(randomisation: Randomisation, record: PosteriorRecord | None, simulator: AnySimulator) -> Randomisation:
     """A run's posterior, together with its fixed values of the simulator's parameters."""
     known = {spec.name for spec in simulator.parameters}
-    held = {} if record is None else {info.name: value for info, value in record.held if info.name in known}
-    return Layers((Point(held), found), found.kind) if held else found
+    fixed = {} if record is None else {info.name: value for info, value in record.fixed if info.name in known}
+    return Layers((Point(fixed), randomisation), randomisation.kind) if fixed else randomisation

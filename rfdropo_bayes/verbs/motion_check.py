@@ -36,14 +36,12 @@ from rfdropo_bayes.verbs.motion_size import (
 )
 from rfdropo_bayes.verbs.order_finder import ROWS, Finding, arranged, find_arrangement, order_lines
 
-MOST = 5
-"""Recordings that count."""
-LEFT = 0.4
+MOST = 5  # recordings that count
+UNEXPLAINED = 0.4
 """Another arrangement is named if it leaves at most this share of the motion that the present one leaves."""
 LITTLE, SEEN = 0.4, 1e-3
 """Agreement below which markers do not follow the commands, and the least nominal motion [m] for this statement."""
-SOLVED = 0.5
-"""Least share of the rows in which the rod must have an equilibrium for a comparison."""
+SOLVED = 0.5  # least share of the rows in which the rod must have an equilibrium for a comparison
 
 
 class Proposal(NamedTuple):
@@ -51,22 +49,19 @@ class Proposal(NamedTuple):
 
     agreement: float
     lines: tuple[str, ...]
-    rivals: tuple[str, ...] = ()
+    alternatives: tuple[str, ...] = ()
     mirrored: bool = False
 
 
 class Motion(NamedTuple):
-    """Recordings beside the nominal model.
+    """Recordings beside the nominal model."""
 
-    Attributes:
-        direction, size: direction and size of the motion.
-        proposal: another arrangement of the commands that explains the motion much better; None without.
-        unit: another unit of the commands and the size of the motion under it; None without.
-    """
-
+    # direction, size: direction and size of the motion
     direction: Direction
     size: Size
+    # another arrangement of the commands that explains the motion much better; None without
     proposal: Proposal | None = None
+    # another unit of the commands and the size of the motion under it; None without
     unit: tuple[Unit, Size] | None = None
 
 
@@ -80,51 +75,45 @@ def motion_cautions(motion: Motion, columns: CsvColumns | None, command_unit: st
     """
     direction, size, proposal, unit = motion
     axes = None if columns is None else columns.axes
-    found = []
+    cautions = []
     if proposal is not None:
-        found.append(_proposed(direction, proposal, axes))
+        cautions.append(_proposed(direction, proposal, axes))
     elif (said := direction_doubt(direction, axes)) is not None:
-        found.append(Caution(Code.FRAME_DOUBTFUL, said))
+        cautions.append(Caution(Code.FRAME_DOUBTFUL, said))
     agreement = max(direction.agreement, direction.mirrored, 0.0 if proposal is None else proposal.agreement)
     if agreement >= AGREEING and not size.within(limit_of(command_unit)):
-        found.append(Caution(Code.UNIT_DOUBTFUL, size_sentence(size, columns, unit)))
+        cautions.append(Caution(Code.UNIT_DOUBTFUL, size_sentence(size, columns, unit)))
     if agreement < LITTLE and size.nominal > SEEN:
         sentence = (
             f"the markers do not move as the commands ask (agreement {agreement:.2f}, in whatever frame and order): "
             "look at the columns of the commands and of the positions, at the unit of the commands, and at the clocks "
             "of both"
         )
-        found.append(Caution(Code.RECORDING_DOUBTFUL, sentence))
-    return found
+        cautions.append(Caution(Code.RECORDING_DOUBTFUL, sentence))
+    return cautions
 
 
 def _proposed(direction: Direction, proposal: Proposal, axes: tuple[str, str, str] | None) -> Caution:
     """Another arrangement in words, with alternatives that explain the motion equally well."""
     lines = "; ".join(proposal.lines)
-    others = list(proposal.rivals)
+    others = list(proposal.alternatives)
     if proposal.mirrored:
         others.append(f"a left-handed frame: {axes_of_mirror(direction.mirror_turn, axes)}")
     better = f"explains the motion better (agreement {proposal.agreement:.2f}, as they are {direction.straight:.2f})"
     if not others:
         sentence = f"another arrangement of the commands {better}: {lines}"
         return Caution(Code.ORDER_DOUBTFUL, sentence)
-    told = "; or ".join([lines, *others])
-    sentence = f"more than one arrangement {better}, and these recordings do not distinguish them: {told}"
+    alternatives = "; or ".join([lines, *others])
+    sentence = f"more than one arrangement {better}, and these recordings do not distinguish them: {alternatives}"
     return Caution(Code.FRAME_DOUBTFUL if proposal.mirrored else Code.ORDER_DOUBTFUL, sentence)
 
 
 class Compared(NamedTuple):
-    """Comparison with the robot at rest.
+    """Comparison with the robot at rest."""
 
-    Attributes:
-        words: summary.
-        cautions: cautions on frame, order and unit of the commands.
-        arrangement: best arrangement of the commands; None without equilibria under them.
-    """
-
-    words: str
-    cautions: list[Caution]
-    arrangement: Arrangement | None
+    words: str  # summary
+    cautions: list[Caution]  # cautions on frame, order and unit of the commands
+    arrangement: Arrangement | None  # best arrangement of the commands; None without equilibria under them
 
 
 def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: CsvColumns | None) -> Compared:
@@ -151,22 +140,22 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
         said = "the robot has no equilibrium under most of the commands as they were read"
         words = f"{said}, and the markers moved by {1e3 * measured:.3g} mm; {unit_words(columns, smaller)}"
         return Compared(said, [Caution(Code.UNIT_DOUBTFUL, words)], None)
-    direction, found = direction_of([here]), find_arrangement(robot, rows)
-    proposal = _proposal(found, robot.simulator.robot, columns, runs[0].cable_names)
+    direction, finding = direction_of([here]), find_arrangement(robot, rows)
+    proposal = _proposal(finding, robot.simulator.robot, columns, runs[0].cable_names)
     if proposal is not None:
-        sent = rows._replace(command=found.arrangement.commands(rows.command))
-        size = size_of([_paths(arranged(robot, found.arrangement), sent)])
+        sent = rows._replace(command=finding.arrangement.commands(rows.command))
+        size = size_of([_paths(arranged(robot, finding.arrangement), sent)])
     else:
         sent, size = rows, size_of([here])
     other = None if size.within(limit_of(unit)) else _explained(robot, sent, likely_units(units, size))
     in_unit = unit if columns is None else f"{columns.command_unit} (command_unit)"
     words = (
         f"the markers move by {1e3 * size.measured:.3g} mm, the robot at rest under commands in {in_unit} by "
-        f"{1e3 * size.nominal:.3g} mm; agreement {found.written.straight:.2f}"
+        f"{1e3 * size.nominal:.3g} mm; agreement {finding.written.straight:.2f}"
     )
     cautions = motion_cautions(Motion(direction, size, proposal, other), columns, unit)
-    written = as_written(len(rows.command[0]), len(found.arrangement.turns))
-    return Compared(words, cautions, found.arrangement if cautions else written)
+    written = as_written(len(rows.command[0]), len(finding.arrangement.turns))
+    return Compared(words, cautions, finding.arrangement if cautions else written)
 
 
 def _paths(robot: RestingRobot, rows: Rows, factor: float = 1.0) -> Paths:
@@ -186,19 +175,20 @@ def _explained(robot: RestingRobot, rows: Rows, units: Sequence[Unit]) -> tuple[
     return None
 
 
-def _proposal(found: Finding, robot: Robot, columns: CsvColumns | None, names: Sequence[str]) -> Proposal | None:
+def _proposal(finding: Finding, robot: Robot, columns: CsvColumns | None, names: Sequence[str]) -> Proposal | None:
     """The found arrangement, if it has another order, another sign or rotated sections, and is clearly better.
 
     A turn of the whole is reported as a turn of the frame, see `direction_doubt`.
     """
-    changed = found.arrangement[:2] != (tuple(range(len(names))), (1,) * len(names))
-    if not (changed or found.sections_differ) or found.agreement < AGREEING or found.left > LEFT:
+    changed = finding.arrangement[:2] != (tuple(range(len(names))), (1,) * len(names))
+    if not (changed or finding.sections_differ) or finding.agreement < AGREEING or finding.unexplained > UNEXPLAINED:
         return None
     own = names if columns is None else columns.commands
     key = "channels in the order {}" if columns is None else "commands = [{}] in [data.columns]"
     also = [] if columns is None else [name for name in ("tensions", "motor_angles") if getattr(columns, name)]
     key += f", and {' and '.join(also)} in the same order" if also else ""
     lines, *others = (
-        tuple(order_lines(each, robot, own, key)) for each in (found.arrangement, *(each for each, _ in found.rivals))
+        tuple(order_lines(each, robot, own, key))
+        for each in (finding.arrangement, *(each for each, _ in finding.alternatives))
     )
-    return Proposal(found.agreement, lines, tuple("; ".join(each) for each in others), found.mirrored)
+    return Proposal(finding.agreement, lines, tuple("; ".join(each) for each in others), finding.mirrored)

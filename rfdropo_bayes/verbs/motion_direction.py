@@ -17,24 +17,16 @@ of 3 s by five robots in the right frame are reported as turned and none as mirr
 agree less.
 """
 TURNED = np.pi / 4.0
-QUARTER = np.pi / 12.0
-"""A turn as near to a number of quarters is written as ``axes``."""
+QUARTER = np.pi / 12.0  # A turn as near to a number of quarters is written as ``axes``
 
 
 class Direction(NamedTuple):
-    """Direction of the measured motion across the body relative to the nominal motion.
+    """Direction of the measured motion across the body relative to the nominal motion."""
 
-    Attributes:
-        turn: angle [rad] about +z from the simulated motion to the measured one.
-        agreement: correlation of both after that turn, 0 to 1.
-        mirrored: the same after a mirror, y to -y, and a turn.
-        mirror_turn: the angle [rad] of the latter.
-    """
-
-    turn: float
-    agreement: float
-    mirrored: float
-    mirror_turn: float = 0.0
+    turn: float  # angle [rad] about +z from the simulated motion to the measured one
+    agreement: float  # correlation of both after that turn, 0 to 1
+    mirrored: float  # the same after a mirror, y to -y, and a turn
+    mirror_turn: float = 0.0  # the angle [rad] of the latter
 
     @property
     def straight(self) -> float:
@@ -76,23 +68,23 @@ def _across(position: np.ndarray) -> np.ndarray:
     return plane - plane.mean()
 
 
-def direction_doubt(found: Direction, axes: tuple[str, str, str] | None) -> str | None:
+def direction_doubt(direction: Direction, axes: tuple[str, str, str] | None) -> str | None:
     """Doubt about the frame or the order of the cables from a direction, in words; None without doubt.
 
     Args:
-        found: the direction.
+        direction: direction of the motion.
         axes: axes of [data.columns] used to read the recordings; None for formats that have none.
     """
-    if found.agreement >= AGREEING and abs(found.turn) > TURNED:
-        degrees = np.degrees(found.turn)
+    if direction.agreement >= AGREEING and abs(direction.turn) > TURNED:
+        degrees = np.degrees(direction.turn)
         return (
             f"the measured motion is turned about z by {degrees:.0f} degrees, counted from +x towards +y, from the "
-            f"motion that the commands ask for (agreement {found.agreement:.2f}): {_remedy(found.turn, axes)}"
+            f"motion that the commands ask for (agreement {direction.agreement:.2f}): {_remedy(direction.turn, axes)}"
         )
-    if found.agreement < AGREEING <= found.mirrored:
+    if direction.agreement < AGREEING <= direction.mirrored:
         return (
-            f"the markers move as in a mirror (agreement {found.mirrored:.2f}, without the mirror "
-            f"{found.agreement:.2f}): {_mirror_remedy(found.mirror_turn, axes)}"
+            f"the markers move as in a mirror (agreement {direction.mirrored:.2f}, without the mirror "
+            f"{direction.agreement:.2f}): {_mirror_remedy(direction.mirror_turn, axes)}"
         )
     return None
 

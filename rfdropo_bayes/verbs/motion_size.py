@@ -16,10 +16,8 @@ lengths or angles, and the nearest units are a factor of ten apart. The ratio is
 """
 FAR_OFF = 30.0
 """The same for commands that are forces: how far they bend a body depends on its stiffness, which is not known."""
-EXPLAINED = 2.0
-"""A unit explains a motion that is within this factor of the measured motion."""
-IMPOSED = ("m", "rad")
-"""Units of commands that impose cable lengths."""
+EXPLAINED = 2.0  # A unit explains a motion that is within this factor of the measured motion
+IMPOSED = ("m", "rad")  # units of commands that impose cable lengths
 
 
 class Size(NamedTuple):

@@ -20,16 +20,14 @@ from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.mechanisms import motions_of
 from rfdropo_bayes.simulators.protocol import Result
 
-FINER, MORE_ELEMENTS = 4, 2
-"""The time step is divided by this, and the number of elements is multiplied by the second."""
+FINER, MORE_ELEMENTS = 4, 2  # the time step is divided by this, and the number of elements is multiplied by the second
 LIMIT = MORE_ELEMENTS**2 / (MORE_ELEMENTS**2 - 1)
 """Distance from the limit of infinitely many elements over the distance from `MORE_ELEMENTS` times the elements; the
 rod is of second order.
 """
 LONGEST, LONGEST_MESH = 20.0, 2.0
 """Longest simulated part of a recording [s], of a rod and of tetrahedra, whose steps take 100 times as long."""
-SOLVES = 4.0
-"""Linear solves that a row of a quasi-static motion takes on average, at most."""
+SOLVES = 4.0  # linear solves that a row of a quasi-static motion takes on average, at most
 ENOUGH = 0.01
 """Share of the markers' way by which a quasi-static motion may differ from a dynamic one and still be enough."""
 
@@ -88,8 +86,7 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
     return NumericalError(min(longest, float(recording.time[-1])), finer, elements, _way(here), rest)
 
 
-MOVING = ("time_step", "integrator")
-"""Keys of [simulator] that a quasi-static motion does not have."""
+MOVING = ("time_step", "integrator")  # keys of [simulator] that a quasi-static motion does not have
 
 
 def longest_of(rod: bool) -> float:
@@ -116,48 +113,48 @@ def nominal_markers(spec: ModelSpec, recording: Trajectory, longest: float) -> F
     commands, values = commands_of(simulator, recording), physical_values(spec, simulator)
     rows = int(np.sum(recording.time <= longest))
     steps = np.asarray(commands.sample_step)[rows - 1] + 1
-    found = jax.jit(lambda given: simulator.rollout(given, commands, steps))(values)
+    rollout = jax.jit(lambda given: simulator.rollout(given, commands, steps))(values)
     # Rows beyond the last step mean nothing, whatever the status of a rollout that was not taken there.
-    if int(found.status) != Result.OK:
-        word = Result(int(found.status)).name.lower().replace("_", " ")
+    if int(rollout.status) != Result.OK:
+        word = Result(int(rollout.status)).name.lower().replace("_", " ")
         raise InputError(f"the simulation of {recording.name!r} ended: {word}", where="[simulator]")
     shared = shared_markers([recording], simulator.marker_names)
     chosen = [simulator.marker_names.index(name) for name in shared]
-    return np.asarray(found.position)[:rows, chosen]
+    return np.asarray(rollout.position)[:rows, chosen]
 
 
 def numerical_error_lines(spec: ModelSpec, recording: Trajectory) -> list[tuple[str, str]]:
     """The numerical error in words, as `Check.lines`, compared with stated noise."""
-    found, table = measure_numerical_error(spec, recording), spec.simulator
+    error, table = measure_numerical_error(spec, recording), spec.simulator
     simulator = build_robot_simulator(spec)
     integrator, step = simulator.engine.integrator, 1e3 * simulator.time_step
-    over = f"at the markers over the first {found.seconds:.3g} s of {recording.name}, root mean square"
+    over = f"at the markers over the first {error.seconds:.3g} s of {recording.name}, root mean square"
     said = []
-    if found.time_step is not None:
-        said.append(f"a quarter of the time step ({step:.4g} ms, {integrator}): {found.time_step:.2g} mm {over}")
-    if found.elements is None:
+    if error.time_step is not None:
+        said.append(f"a quarter of the time step ({step:.4g} ms, {integrator}): {error.time_step:.2g} mm {over}")
+    if error.elements is None:
         said.append("the mesh of tetrahedra is as given: the error of the mesh is not measured")
     else:
         cut = "" if table.refine == 1 else f" (refine = {table.refine})"
-        limit = LIMIT * found.elements
-        share = f", {100.0 * limit / found.way:.2g} % of the way" if found.way > 0.0 else ""
+        limit = LIMIT * error.elements
+        share = f", {100.0 * limit / error.way:.2g} % of the way" if error.way > 0.0 else ""
         said.append(
-            f"twice the elements{cut}: {found.elements:.2g} mm{'' if said else f' {over}'}; their limit is about "
+            f"twice the elements{cut}: {error.elements:.2g} mm{'' if said else f' {over}'}; their limit is about "
             f"{limit:.2g} mm away{share}"
         )
-    if found.rest is not None:
-        said.append(rest_words(found.rest, rests=simulator.at_rest))
+    if error.rest is not None:
+        said.append(rest_words(error.rest, rests=simulator.at_rest))
     if spec.stated is not None and spec.stated.standard_deviation > 0.0:
         said.append(f"the noise that [noise] states: {1e3 * spec.stated.standard_deviation:.2g} mm a coordinate")
     return [("numerics" if k == 0 else "", words) for k, words in enumerate(said)]
 
 
-def rest_words(found: RestError, *, rests: bool) -> str:
+def rest_words(rest: RestError, *, rests: bool) -> str:
     """Which kind of motion is enough; ``rests``: the experiment's is quasi-static."""
-    share = f"{found.distance:.2g} mm, {100.0 * found.distance / max(found.way, 1e-12):.2g} % of the way"
-    if not found.enough:
+    share = f"{rest.distance:.2g} mm, {100.0 * rest.distance / max(rest.way, 1e-12):.2g} % of the way"
+    if not rest.enough:
         wrong = 'set motion = "dynamic"' if rests else 'motion = "dynamic" is right'
         return f"the robot moves as fast as its body answers: a quasi-static motion differs by {share}; {wrong}"
-    cost = f"is {found.cheaper:.2g} times cheaper and" if found.cheaper > 1.0 else "is not cheaper, and"
+    cost = f"is {rest.cheaper:.2g} times cheaper and" if rest.cheaper > 1.0 else "is not cheaper, and"
     words = f"the robot moves slower than its body answers: a quasi-static motion {cost} differs by {share}"
-    return words if rests or found.cheaper <= 1.0 else f'{words}; motion = "quasi-static" is enough'
+    return words if rests or rest.cheaper <= 1.0 else f'{words}; motion = "quasi-static" is enough'

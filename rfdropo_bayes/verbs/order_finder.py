@@ -25,37 +25,27 @@ from rfdropo_bayes.verbs.arrangement import (
 )
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, spread_rows
 
-ROWS, SEARCHED = 100, 60
-"""Rows that are simulated by the rod at rest, and of them by arcs."""
-WELL = 0.98
-"""Agreement at or above which no other arrangement is looked for."""
+ROWS, SEARCHED = 100, 60  # rows that are simulated by the rod at rest, and of them by arcs
+WELL = 0.98  # agreement at or above which no other arrangement is looked for
 ALIKE = 1.3
 """Ratio of two shares of unexplained motion below which the simpler arrangement is taken, and alternatives are
 named.
 """
-RIVALS = 6
-"""Number of simulated alternatives."""
+ALTERNATIVES = 6  # number of simulated alternatives
 SAME_TURN = np.radians(1.0)
 
 
 class Finding(NamedTuple):
-    """Result of a search for another arrangement.
+    """Result of a search for another arrangement."""
 
-    Attributes:
-        written: agreement of the robot and the commands as written.
-        arrangement: the simplest arrangement as good as the best; agreement: its correlation.
-        rivals: alternatives of equal quality, and their correlations.
-        mirror: correlation of the robot's mirror image, turned.
-    """
-
-    written: Agreement
-    arrangement: Arrangement
-    agreement: float
-    rivals: tuple[tuple[Arrangement, float], ...] = ()
-    mirror: float = 0.0
+    written: Agreement  # agreement of the robot and the commands as written
+    arrangement: Arrangement  # the simplest arrangement as good as the best
+    agreement: float  # its correlation
+    alternatives: tuple[tuple[Arrangement, float], ...] = ()  # alternatives of equal quality, and their correlations
+    mirror: float = 0.0  # correlation of the robot's mirror image, turned
 
     @property
-    def left(self) -> float:
+    def unexplained(self) -> float:
         """Share of the unexplained motion that is left, of the arrangement as written."""
         return unexplained(self.agreement) / max(unexplained(self.written.straight), 1e-12)
 
@@ -96,8 +86,8 @@ def find_arrangement(resting: RestingRobot, rows: Rows) -> Finding:
     tried = finder.simple(start) + [finder.canonical(finder.levelled(each)) for each in finder.search.best()]
     least = min(unexplained(finder.straight(each)) for each in tried)
     chosen = next(each for each in tried if unexplained(finder.straight(each)) <= ALIKE * least)
-    found = finder.straight(chosen)
-    return Finding(written, chosen, found, finder.rivals(chosen), written.mirrored)
+    best = finder.straight(chosen)
+    return Finding(written, chosen, best, finder.alternatives(chosen), written.mirrored)
 
 
 class _Finder:
@@ -152,7 +142,7 @@ class _Finder:
         search = self.search
         mine = np.flatnonzero(search.channel_section == section)
         azimuth = search.channel_azimuth[mine]
-        found = [arrangement]
+        equals = [arrangement]
         for beside in azimuth[1:] - azimuth[0]:
             apart = np.abs(np.angle(np.exp(1j * (azimuth[:, None] + beside - azimuth[None]))))
             onto = np.argmin(apart, axis=1)
@@ -164,22 +154,22 @@ class _Finder:
             for k, other in zip(mine, mine[onto], strict=True):
                 columns[k] = arrangement.columns[other]
             turns[section] += float(beside)
-            found.append(arrangement._replace(columns=tuple(columns), turns=tuple(turns)))
-        return found
+            equals.append(arrangement._replace(columns=tuple(columns), turns=tuple(turns)))
+        return equals
 
-    def rivals(self, chosen: Arrangement) -> tuple[tuple[Arrangement, float], ...]:
+    def alternatives(self, chosen: Arrangement) -> tuple[tuple[Arrangement, float], ...]:
         """Arrangements unlike the chosen one that explain the motion as well."""
         others = [each for each in neighbours(chosen, self.sections) if self._differs(each, chosen)]
         if not others:
             return ()
-        likely = np.argsort(-self.search.score_of(others))[:RIVALS]
+        likely = np.argsort(-self.search.score_of(others))[:ALTERNATIVES]
         turned = [self.levelled(self.search.turned_far(others[k])) for k in likely]
         limit, same = ALIKE * unexplained(self.straight(chosen)), self.canonical(chosen)
-        found = {
+        errors = {
             self.canonical(each): self.straight(each) for each in turned if unexplained(self.straight(each)) <= limit
         }
-        told = [(each, value) for each, value in found.items() if each[:2] != same[:2]]
-        return tuple(sorted(told, key=lambda each: -each[1]))
+        unlike = [(each, value) for each, value in errors.items() if each[:2] != same[:2]]
+        return tuple(sorted(unlike, key=lambda each: -each[1]))
 
     def _differs(self, one: Arrangement, other: Arrangement) -> bool:
         """Whether a column that moves is sent elsewhere, or the other way round."""
@@ -212,8 +202,8 @@ def order_lines(arrangement: Arrangement, robot: Robot, own: Sequence[str], key:
         rows = ", ".join(str([float(f"{value:g}") for value in row]) for row in gain)
         lines.append(f"gain = [{rows}] in [channels] of the robot file")
     if any(abs(turn) > SAME_TURN for turn in arrangement.turns):
-        told = [
+        azimuths = [
             f"{each.name} {each.azimuth_deg % 360.0:.0f}" for each in turned_robot(robot, arrangement.turns).actuators
         ]
-        lines.append(f"azimuth_deg in the robot file: {', '.join(told)}")
+        lines.append(f"azimuth_deg in the robot file: {', '.join(azimuths)}")
     return lines

@@ -17,10 +17,8 @@ from rfdropo_bayes.robots import Robot
 
 FAR = 0.4
 """Share of the robot's length: undeformed markers that are farther off than this, root mean square, are looked at."""
-NEAR = 0.15
-"""Share of the robot's length; a remedy that brings the markers this near is reported as the cause."""
-STRETCHED = 1.15
-"""Ratio to the distance of two markers on the undeformed robot above which they are reported."""
+NEAR = 0.15  # share of the robot's length; a remedy that brings the markers this near is reported as the cause
+STRETCHED = 1.15  # ratio to the distance of two markers on the undeformed robot above which they are reported
 
 
 class Start(NamedTuple):
@@ -55,17 +53,11 @@ def far_from_rest(robot: Robot, trajectory: Trajectory) -> dict[str, float] | No
 
 
 class Read(NamedTuple):
-    """Transformation of a file's positions to the frame of the base: subtract the origin, then turn.
+    """Transformation of a file's positions to the frame of the base: subtract the origin, then turn."""
 
-    Attributes:
-        turn: rotation from the file's frame to the base frame.
-        origin: origin of the base in the file's frame [m].
-        unit: unit of the file's positions and of ``origin`` in [data.columns]; "" for formats without that table.
-    """
-
-    turn: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
-    unit: str
+    turn: Float[np.ndarray, "3 3"]  # rotation from the file's frame to the base frame
+    origin: Float[np.ndarray, "3"]  # origin of the base in the file's frame [m]
+    unit: str  # unit of the file's positions and of ``origin`` in [data.columns]; "" for formats without that table
 
     @classmethod
     def by(cls, columns: CsvColumns | None) -> Read:
@@ -102,11 +94,11 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     hints = _stretched(start)
     if _rms(start.first - start.rest) <= FAR * length:
         return hints
-    found = _cause(start, length, Read.by(columns))
+    cause = _cause(start, length, Read.by(columns))
     head = f"the first row is {float(f'{1e3 * _rms(start.first - start.rest):.2g}'):g} mm off the undeformed robot"
-    if found is None and len(start.names) == 1 < len(trajectory.marker_names):
-        found = f"only {start.names[0]} is seen in it: too few markers to name a cause"
-    return [*hints, f"{head}; {found or 'look at axes, origin, units, the order of markers and their point_m'}"]
+    if cause is None and len(start.names) == 1 < len(trajectory.marker_names):
+        cause = f"only {start.names[0]} is seen in it: too few markers to name a cause"
+    return [*hints, f"{head}; {cause or 'look at axes, origin, units, the order of markers and their point_m'}"]
 
 
 def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: CsvColumns) -> list[str]:
@@ -122,10 +114,10 @@ def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: Csv
     start, length = _start(robot, marker_names(columns), in_base(first, columns)), robot.length
     if not start.names or _rms(start.first - start.rest) <= FAR * length:
         return []
-    found = _frame(start, length)
-    if found is None:
+    frame = _frame(start, length)
+    if frame is None:
         return []
-    return moved_frame(columns, *found)
+    return moved_frame(columns, *frame)
 
 
 def moved_frame(columns: CsvColumns, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> list[str]:
@@ -162,13 +154,13 @@ def _frame(start: Start, length: float) -> tuple[Float[np.ndarray, "3 3"], Float
 def _cause(start: Start, length: float, read: Read) -> str | None:
     """The simplest of a shift, an order of markers, axes, or axes and a shift, that brings the first row near."""
     names, rest, first = start
-    found, order = _frame(start, length), _ordered(start)
-    if found is None and _rms(first - rest[order]) <= NEAR * length:
+    frame, order = _frame(start, length), _ordered(start)
+    if frame is None and _rms(first - rest[order]) <= NEAR * length:
         meant = ", ".join(names[index] for index in order)
         return f"another order of the markers would bring it there: {', '.join(names)} look like {meant}"
-    if found is None:
+    if frame is None:
         return None
-    turn, shift = found
+    turn, shift = frame
     line = read.shifted(turn, shift)
     if np.array_equal(turn, np.eye(3)):
         if not read.unit:

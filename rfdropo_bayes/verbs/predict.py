@@ -35,23 +35,15 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, recorded_model_error
-from rfdropo_bayes.prediction.predictive import (
-    BEGUN,
-    FITTED,
-    KNOWN_NOISE,
-    NOISE,
-    match_cautions,
-    predict_new,
-    thin,
-)
+from rfdropo_bayes.prediction.predictive import BEGUN, FITTED, KNOWN_NOISE, NOISE, match_cautions, predict_new, thin
+from rfdropo_bayes.prediction.session_error import SessionError, recorded_session_error, session_sentence
 from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import given_fit
-from rfdropo_bayes.verbs.left_out_days import OPENINGS, of_unseen_days
+from rfdropo_bayes.verbs.left_out_sessions import OPENINGS, of_unseen_sessions
 from rfdropo_bayes.verbs.recording_doubts import cautions_after
 
 DRAWS = 200
@@ -110,7 +102,7 @@ def predict(
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     fitted = record.attrs.get(FITTED, sorted({info.scope.owner for info in record.free if info.scope.owner}))
     slow = _slow_error(record, unseen, groups, scopes)
-    found = predict_new(
+    drawn = predict_new(
         program,
         [unseen],
         values,
@@ -121,16 +113,16 @@ def predict(
         groups=groups,
         slow=slow,
     )
-    predicted = found.recordings[0]
+    predicted = drawn.recordings[0]
     bands = summarise(predicted)
     bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
-    bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
+    bands.attrs["draws_that_did_not_match_the_first_row"] = drawn.unmatched
     group = bands.attrs["group"] = group_of(unseen.name, groups)
     known = {p.scope.owner for p in scopes.deviating}
-    cautions = cautions_after(record, model, [unseen]) + match_cautions(found)
+    cautions = cautions_after(record, model, [unseen]) + match_cautions(drawn)
     if isinstance(simulator, RobotSimulator):
         cautions += simulator.robot.unstated([unseen.name])
-    said = [day_sentence(error) for error in slow.values() if not error.shown and group not in known]
+    said = [session_sentence(error) for error in slow.values() if not error.shown and group not in known]
     named = str(commands) if isinstance(commands, str | Path) else unseen.name
     facts = {
         "schema_version": SCHEMA_VERSION,
@@ -164,16 +156,18 @@ def _unseen(model: Model, commands: str, start: Any, begun: str | None, episode:
     return load_unseen(data, model.folder, commands, start, begun=begun, episode=episode)
 
 
-def _slow_error(record: PosteriorRecord, unseen: Trajectory, groups: Patterns, scopes: Scopes) -> dict[str, DayError]:
+def _slow_error(
+    record: PosteriorRecord, unseen: Trajectory, groups: Patterns, scopes: Scopes
+) -> dict[str, SessionError]:
     """The slow error of a recording's session, by name; empty if the fit has seen the session, or has no sessions."""
-    days = {p.scope.owner for p in scopes.deviating}
-    error = recorded_day_error(record) if days else None
+    sessions = {p.scope.owner for p in scopes.deviating}
+    error = recorded_session_error(record) if sessions else None
     if error is None:
         return {}
-    day = group_of(unseen.name, groups)
-    if day == record.attrs.get(ADAPTED_TO):
+    session = group_of(unseen.name, groups)
+    if session == record.attrs.get(ADAPTED_TO):
         return {unseen.name: error}
-    if not of_unseen_days([unseen], groups, list(days), record.attrs.get(OPENINGS)):
+    if not of_unseen_sessions([unseen], groups, list(sessions), record.attrs.get(OPENINGS)):
         return {}
     return {unseen.name: error._replace(shown=())}
 
@@ -205,7 +199,7 @@ def fitted_scopes(fit: Calibration) -> Scopes:
     """Inferred and fixed parameters of a calibration."""
     model, record = model_of(fit), fit.record
     fixed = fixed_values(model.spec, model.simulator)
-    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.held)
+    return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.fixed)
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
@@ -272,9 +266,9 @@ def summarise(predicted: RecordingPrediction) -> xr.Dataset:
 
 def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
     """Position of a pushed object: mean and quantiles of its centre, and every draw of its pose."""
-    found = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
+    variables = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
     centre = pose[..., :3]
     quantiles = np.quantile(centre, list(LEVELS.values()), axis=0)
     for name, value in (("mean", centre.mean(axis=0)), *zip(LEVELS, quantiles, strict=True)):
-        found[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
-    return found
+        variables[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
+    return variables

@@ -49,20 +49,15 @@ BY_ITSELF = "measured by itself"
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of parameters that recordings leave undetermined.
+    """A combination of parameters that recordings leave undetermined."""
 
-    Attributes:
-        together: relative changes of the parameters, logarithmic for scale parameters; the largest is 1 in prior
-            standard deviations.
-        kept: posterior over prior standard deviation.
-        ended_by: measurements that would determine it, with the remaining share of the deviation, best first.
-        sentence: the same in words.
-    """
-
+    # relative changes of the parameters, logarithmic for scale parameters; the largest is 1 in prior standard
+    # deviations
     together: dict[str, float]
-    kept: float
+    kept: float  # posterior over prior standard deviation
+    # measurements that would determine it, with the remaining share of the deviation, best first
     ended_by: dict[str, float]
-    sentence: str
+    sentence: str  # the same in words
 
     @property
     def needs_own_measurement(self) -> bool:
@@ -72,38 +67,30 @@ class Direction:
 
 @dataclass(frozen=True)
 class Preflight:
-    """Information of recordings on a model's parameters, before a fit.
+    """Information of recordings on a model's parameters, before a fit."""
 
-    Attributes:
-        directions: undetermined combinations, the worst first.
-        parameters: share of the prior standard deviation that remains for each parameter: ``alone`` with all other
-            parameters known, and ``kept``.
-        channels: constant command channels of each recording.
-        noise: assumed noise of the positions, in words.
-        draws: number of prior draws; failed: number of failed rollouts.
-        rollout_seconds: time to simulate one parameter set, all recordings.
-        rollouts: budget of the fit; minutes: its run time.
-        method: method of the fit.
-        seconds: run time of this analysis.
-    """
-
-    directions: list[Direction]
+    directions: list[Direction]  # undetermined combinations, the worst first
+    # share of the prior standard deviation that remains for each parameter: ``alone`` with all other parameters known,
+    # and ``kept``
     parameters: pd.DataFrame
-    channels: dict[str, list[str]]
-    noise: str
-    draws: int
-    failed: int
-    rollout_seconds: float
-    rollouts: int
-    minutes: float
-    method: str
-    seconds: float
+    channels: dict[str, list[str]]  # constant command channels of each recording
+    noise: str  # assumed noise of the positions, in words
+    draws: int  # number of prior draws
+    failed: int  # number of failed rollouts
+    rollout_seconds: float  # time to simulate one parameter set, all recordings
+    rollouts: int  # budget of the fit
+    minutes: float  # its run time
+    method: str  # method of the fit
+    seconds: float  # run time of this analysis
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[tuple[str, str]]:
         """Pairs of a label and a text, an empty label continues the previous pair."""
-        found = self._undetermined() or ["every combination, more or less"]
-        rows = [("undetermined" if self.directions else "determined", found[0]), *(("", text) for text in found[1:])]
+        undetermined = self._undetermined() or ["every combination, more or less"]
+        rows = [
+            ("undetermined" if self.directions else "determined", undetermined[0]),
+            *(("", text) for text in undetermined[1:]),
+        ]
         rows += [("" if index else "excited", text) for index, text in enumerate(self._excitation())]
         cost = (
             f"{self.method}: {self.rollouts} rollouts of {1e3 * self.rollout_seconds:.3g} ms, {minutes(self.minutes)}"
@@ -224,7 +211,7 @@ def preflight(
     return Preflight(
         _directions(coordinates, known, more),
         _shares(coordinates, known),
-        {run.name: _held(run) for run in runs},
+        {run.name: _constant_channels(run) for run in runs},
         noise.words,
         len(good),
         int(np.sum(~good)),
@@ -389,18 +376,18 @@ def innovations(
     """Series whitened by white plus correlated noise: each row less its prediction from earlier rows (Kalman filter),
     in linear time; zero for invalid rows.
     """
-    found = np.zeros_like(series)
+    whitened = np.zeros_like(series)
     mean, variance = np.zeros(series.shape[1:]), np.full(valid.shape[1], noise.lasting**2)
     for row, seen in enumerate(valid):
         if row:
             kept = np.exp(-(time[row] - time[row - 1]) / noise.time)
             mean, variance = kept * mean, kept**2 * variance + (1.0 - kept**2) * noise.lasting**2
         whole = variance + noise.white**2
-        left = np.where(seen[:, None], series[row] - mean, 0.0)
-        found[row] = left / np.sqrt(whole)[:, None]
+        innovation = np.where(seen[:, None], series[row] - mean, 0.0)
+        whitened[row] = innovation / np.sqrt(whole)[:, None]
         gain = np.where(seen, variance / whole, 0.0)
-        mean, variance = mean + gain[:, None] * left, (1.0 - gain) * variance
-    return found
+        mean, variance = mean + gain[:, None] * innovation, (1.0 - gain) * variance
+    return whitened
 
 
 def _information(white: Float[np.ndarray, "draw parameter row"]) -> Float[np.ndarray, "draw parameter parameter"]:
@@ -417,27 +404,27 @@ def _weighed(
     model: Model, problem: CalibrationProblem, coordinates: _Coordinates, drawn: Mapping[str, np.ndarray]
 ) -> Float[np.ndarray, "parameter row"]:
     """Derivatives of weighed masses divided by their error."""
-    found = np.zeros((len(coordinates.names), len(model.spec.weighed)))
+    derivatives = np.zeros((len(coordinates.names), len(model.spec.weighed)))
     for column, entry in enumerate(model.spec.weighed):
         for name in set(entry.parameters) & set(coordinates.names):
             k = coordinates.names.index(name)
             slope = np.median(drawn[name]) if coordinates.logarithmic[k] else 1.0
-            found[k, column] = coordinates.sd[k] * slope / entry.sd
-    return found
+            derivatives[k, column] = coordinates.sd[k] * slope / entry.sd
+    return derivatives
 
 
 def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> dict[str, np.ndarray]:
     """Information of possible further measurements, by name."""
-    found: dict[str, np.ndarray] = {}
+    information: dict[str, np.ndarray] = {}
     if tension.shape[-1] and not model.spec.channels.tension:
-        found[f"tensions of the cables (to {100 * TENSION_ERROR:g} %)"] = _information(tension)
+        information[f"tensions of the cables (to {100 * TENSION_ERROR:g} %)"] = _information(tension)
     for k, name in enumerate(coordinates.names):
         weight = np.zeros((1, *(len(coordinates.names),) * 2))
         size = 1.0 if coordinates.logarithmic[k] else max(abs(coordinates.mean[k]), coordinates.sd[k])
         weight[0, k, k] = (coordinates.sd[k] / (KNOWN * size)) ** 2
         word = "weighed" if coordinates.masses[k] else BY_ITSELF
-        found[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
-    return found
+        information[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
+    return information
 
 
 def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mapping[str, np.ndarray]) -> list[Direction]:
@@ -445,7 +432,7 @@ def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mappin
     covariance = _covariance(information)
     with_more = {what: _covariance(information + extra) for what, extra in more.items()}
     values, vectors = np.linalg.eigh(covariance)
-    found = []
+    directions = []
     for vector in _readable(vectors[:, values > FREE**2]).T:
         kept = _kept(covariance, vector)
         ended = {what: _kept(own, vector) for what, own in with_more.items()}
@@ -456,9 +443,11 @@ def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mappin
         together = {coordinates.names[k]: float(sign * vector[k] * coordinates.sd[k]) for k in names}
         logs = all(coordinates.logarithmic[k] for k in names)
         leading = sorted(sorted(names, key=lambda k: -abs(vector[k]))[:NAMES])
-        told = {coordinates.names[k]: together[coordinates.names[k]] for k in leading}
-        found.append(Direction(together, kept, ended, _sentence(told, len(names) - len(told), logs, kept, ended)))
-    return sorted(found, key=lambda direction: -direction.kept)
+        parts = {coordinates.names[k]: together[coordinates.names[k]] for k in leading}
+        directions.append(
+            Direction(together, kept, ended, _sentence(parts, len(names) - len(parts), logs, kept, ended))
+        )
+    return sorted(directions, key=lambda direction: -direction.kept)
 
 
 def _named(information: np.ndarray, vector: np.ndarray) -> list[int]:
@@ -486,8 +475,8 @@ def _readable(vectors: Float[np.ndarray, "parameter direction"]) -> Float[np.nda
     for _ in range(TURNS if vectors.shape[1] > 1 else 0):
         turned = vectors @ rotation
         gradient = vectors.T @ (turned**3 - turned * np.mean(turned**2, axis=0))
-        left, values, right = np.linalg.svd(gradient)
-        rotation = left @ right
+        first, values, second = np.linalg.svd(gradient)
+        rotation = first @ second
         if values.sum() < size * (1.0 + STILL):
             break
         size = values.sum()
@@ -497,16 +486,16 @@ def _readable(vectors: Float[np.ndarray, "parameter direction"]) -> Float[np.nda
 _OWN = f"nothing but the parameter {BY_ITSELF} would end it"
 
 
-def _sentence(told: Mapping[str, float], smaller: int, logs: bool, kept: float, ended: Mapping[str, float]) -> str:
+def _sentence(parts: Mapping[str, float], smaller: int, logs: bool, kept: float, ended: Mapping[str, float]) -> str:
     """A direction in words: its largest parts, and the number of smaller parts."""
-    names = list(told)
+    names = list(parts)
     if len(names) == 1:
         subject = names[0]
-    elif logs and all(value > 0.0 for value in told.values()):
+    elif logs and all(value > 0.0 for value in parts.values()):
         subject = f"the common scale of {', '.join(names[:-1])} and {names[-1]}"
     else:
-        up = [name for name, value in told.items() if value > 0.0]
-        down = [name for name, value in told.items() if value < 0.0]
+        up = [name for name, value in parts.items() if value > 0.0]
+        down = [name for name, value in parts.items() if value < 0.0]
         subject = f"{' and '.join(up)} up" + (f" with {' and '.join(down)} down" if down else " together")
     if smaller:
         subject += f", and {smaller} smaller part{'s' if smaller > 1 else ''}"
@@ -523,7 +512,7 @@ def _shares(coordinates: _Coordinates, information: np.ndarray) -> pd.DataFrame:
     return pd.DataFrame({"alone": alone, "kept": kept}, index=list(coordinates.names))
 
 
-def _held(run: Trajectory) -> list[str]:
+def _constant_channels(run: Trajectory) -> list[str]:
     """Channels whose command never changes."""
     sent = np.concatenate([np.asarray(run.initial_command)[None], np.asarray(run.command)])
-    return [name for name, spread in zip(run.cable_names, np.ptp(sent, axis=0), strict=True) if spread == 0.0]
+    return [name for name, extent in zip(run.cable_names, np.ptp(sent, axis=0), strict=True) if extent == 0.0]

@@ -21,12 +21,10 @@ from rfdropo_bayes.verbs.motion_direction import Paths, direction_of
 from rfdropo_bayes.verbs.motion_size import size_of
 from rfdropo_bayes.verbs.placement import NEAR, placement_hints
 
-DOUBTS = "doubts"
-"""Attribute of a posterior: cautions of the recordings that it is of."""
+DOUBTS = "doubts"  # attribute of a posterior: cautions of the recordings that it is of
 MILLIMETRES = 1e3
 MOST_NAMES = 12
-FEWEST_DRAWS = 8
-"""Least number of prior draws whose median may replace the nominal model."""
+FEWEST_DRAWS = 8  # least number of prior draws whose median may replace the nominal model
 
 
 def recording_cautions(
@@ -39,18 +37,18 @@ def recording_cautions(
         recordings: recordings as read.
         columns: table used to read them; None for formats that have none.
     """
-    found = [
+    cautions = [
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
         for recording in recordings
         for note in recording.notes
     ]
     for recording in recordings:
-        found += _misnamed(recording, robot.marker_names)
+        cautions += _misnamed(recording, robot.marker_names)
     if isinstance(robot, Robot):
         for recording in recordings:
-            found += _unasked(recording, robot) + _beyond_the_body(recording, robot)
-        found += _placements(robot, recordings, columns)
-    return found + _copies(recordings)
+            cautions += _unasked(recording, robot) + _beyond_the_body(recording, robot)
+        cautions += _placements(robot, recordings, columns)
+    return cautions + _copies(recordings)
 
 
 def cautions_of_fit(

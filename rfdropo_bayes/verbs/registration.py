@@ -23,29 +23,24 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import Arrangement, as_written, sections_of
 from rfdropo_bayes.verbs.at_rest import Rows, resting, rows_of, spread_rows
 from rfdropo_bayes.verbs.command_lag import best_delay
-from rfdropo_bayes.verbs.motion_check import LEFT, SOLVED
+from rfdropo_bayes.verbs.motion_check import SOLVED, UNEXPLAINED
 from rfdropo_bayes.verbs.motion_direction import AGREEING
 from rfdropo_bayes.verbs.order_finder import ALIKE, ROWS, SEARCHED, arranged, find_arrangement
 from rfdropo_bayes.verbs.placement import right_angles
 
-EXPLAINED = 0.5
-"""Least share of the squared motion that the rod explains in a frame that is taken from it."""
+EXPLAINED = 0.5  # least share of the squared motion that the rod explains in a frame that is taken from it
 BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
 """Factors of the bend of a command that are tried if no answer sets it, a factor of 1.4 apart. An arm whose cables lie
 at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
 
 
 class Frame(NamedTuple):
-    """The measured positions are ``scale * rotation @ simulated + shift``.
-
-    Attributes:
-        explained: share of the squared motion that this leaves no part of.
-    """
+    """The measured positions are ``scale * rotation @ simulated + shift``."""
 
     rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]  # [m]
     scale: float
-    explained: float
+    explained: float  # share of the squared motion that this leaves no part of
 
     @property
     def quarter(self) -> Float[np.ndarray, "3 3"]:
@@ -53,25 +48,19 @@ class Frame(NamedTuple):
         return max([np.eye(3), *right_angles()], key=lambda matrix: float(np.sum(matrix * self.rotation)))
 
     @property
-    def left_over(self) -> Float[np.ndarray, "3"]:
-        """Rotation vector that is left of the frame's, once it is turned back by right angles [rad]."""
+    def remaining_turn(self) -> Float[np.ndarray, "3"]:
+        """Rotation vector of the frame after its right angles are removed [rad]."""
         return Rotation.from_matrix(self.quarter.T @ self.rotation).as_rotvec()
 
 
 class Registration(NamedTuple):
-    """How a recording lies to its robot at rest.
+    """How a recording lies to its robot at rest."""
 
-    Attributes:
-        frame: frame that brings the robot to the recording; None if the robot explains the motion in no frame.
-        arrangement: order of the commands, if it explains much more than the written order.
-        evidence: reason for the arrangement, in words.
-        bend: bend of the body that explains the recording, over that of the robot as written.
-    """
-
+    # frame that brings the robot to the recording; None if the robot explains the motion in no frame
     frame: Frame | None
-    arrangement: Arrangement | None = None
-    evidence: str = ""
-    bend: float = 1.0
+    arrangement: Arrangement | None = None  # order of the commands, if it explains much more than the written order
+    evidence: str = ""  # reason for the arrangement, in words
+    bend: float = 1.0  # bend of the body that explains the recording, over the bend of the robot as written
 
 
 def frame_of(
@@ -83,9 +72,9 @@ def frame_of(
     motion = np.sum((seen - still)[both] ** 2)  # about each marker's own mean: distances between markers are no motion
     made, seen = made[both], seen[both]
     centre, place = made.mean(axis=0), seen.mean(axis=0)
-    left, size, right = np.linalg.svd((seen - place).T @ (made - centre))
-    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ np.diag(proper) @ right
+    first, size, second = np.linalg.svd((seen - place).T @ (made - centre))
+    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(first @ second))])
+    rotation = first @ np.diag(proper) @ second
     scale = float(np.sum(size * proper) / np.sum((made - centre) ** 2)) if scaled else 1.0
     moved = scale * made @ rotation.T
     shift = place - moved.mean(axis=0)
@@ -102,7 +91,7 @@ class _Sight(NamedTuple):
     bend: float
 
     @property
-    def left(self) -> float:
+    def unexplained(self) -> float:
         """Share of the squared motion that is left."""
         return 1.0 - self.frame.explained
 
@@ -154,20 +143,26 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
     if written is None:
         return nothing
     chosen, evidence = written, ""
-    found = find_arrangement(robot, rows)
-    positive = all(sign > 0 for sign in found.arrangement.signs)
-    if found.agreement >= AGREEING and found.left <= LEFT and positive and not found.rivals and not found.mirrored:
-        better = sight(found.arrangement, rows)
-        if better is not None and better.left <= LEFT * written.left:
+    finding = find_arrangement(robot, rows)
+    positive = all(sign > 0 for sign in finding.arrangement.signs)
+    if (
+        finding.agreement >= AGREEING
+        and finding.unexplained <= UNEXPLAINED
+        and positive
+        and not finding.alternatives
+        and not finding.mirrored
+    ):
+        better = sight(finding.arrangement, rows)
+        if better is not None and better.unexplained <= UNEXPLAINED * written.unexplained:
             chosen = better
             evidence = (
-                f"the motion agrees to {found.agreement:.2f} with a rod at rest, and to {found.written.straight:.2f} "
-                "without"
+                f"the motion agrees to {finding.agreement:.2f} with a rod at rest, and to "
+                f"{finding.written.straight:.2f} without"
             )
     tried = [each for one in _exchanged(chosen.arrangement, own) if (each := sight(one, fewer)) is not None]
-    best = min(tried, key=lambda each: each.left, default=None)
+    best = min(tried, key=lambda each: each.unexplained, default=None)
     better = None if best is None else sight(best.arrangement, rows)
-    if better is not None and better.left <= LEFT * chosen.left:
+    if better is not None and better.unexplained <= UNEXPLAINED * chosen.unexplained:
         evidence = (
             f"a rod at rest explains {100 * better.frame.explained:.3g} % of the motion, and "
             f"{100 * chosen.frame.explained:.3g} % without"

@@ -43,11 +43,11 @@ def first_answer(
 def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
     """Lines on errors, with predictors without physics and for every marker, and on every parameter."""
     without = {name: value for name, value in fit.unseen.items() if name != OWN}
-    told = ", ".join(f"{name} {_millimetres(value)}" for name, value in without.items())
+    listed = ", ".join(f"{name} {_millimetres(value)}" for name, value in without.items())
     marker, which = fit.markers[-1], "test rows" if fit.tested else "rows of the fitted recordings"
     lines = [
         f"a robot at rest, fitted to {fit.fitted} rows, is off by {_millimetres(fit.unseen[OWN])} mm at {marker} in "
-        f"{fit.other} {which} (before the fit {_millimetres(fit.before)}); without physics: {told}"
+        f"{fit.other} {which} (before the fit {_millimetres(fit.before)}); without physics: {listed}"
     ]
     if len(fit.markers) > 1:
         lines.append(f"by marker: {', '.join(map(_named, zip(fit.markers, fit.each, strict=True)))}")
@@ -77,33 +77,33 @@ def rest_notes(fit: RestFit) -> list[str]:
 
 def _drifts(fit: RestFit) -> list[str]:
     """Recordings whose residual changes steadily over time."""
-    found = []
+    drifts = []
     for number in np.unique(fit.recording):
         own = fit.recording == number
-        time, left = fit.rows.time[own], fit.residual[own, -1]
-        whole = np.isfinite(left).all(axis=1)
+        time, residual = fit.rows.time[own], fit.residual[own, -1]
+        whole = np.isfinite(residual).all(axis=1)
         if whole.sum() < 8:
             continue
-        time, left = time[whole] - time[whole].mean(), left[whole] - left[whole].mean(axis=0)
-        slope = time @ left / max(float(time @ time), 1e-300)
-        if np.sum(np.outer(time, slope) ** 2) > DRIFTS * np.sum(left**2):
+        time, residual = time[whole] - time[whole].mean(), residual[whole] - residual[whole].mean(axis=0)
+        slope = time @ residual / max(float(time @ time), 1e-300)
+        if np.sum(np.outer(time, slope) ** 2) > DRIFTS * np.sum(residual**2):
             way = _millimetres(float(np.linalg.norm(slope) * np.ptp(time)))
-            found.append(
+            drifts.append(
                 f"what a fit at rest leaves drifts by {way} mm over the recording: cables that creep, or a frame"
             )
-    return found[:1]
+    return drifts[:1]
 
 
 def _ways(fit: RestFit) -> list[str]:
     """The channel whose direction of motion explains most of the residual."""
-    left = fit.residual[:, -1]
-    whole = np.isfinite(left).all(axis=1)
+    residual = fit.residual[:, -1]
+    whole = np.isfinite(residual).all(axis=1)
     if whole.sum() < 8:
         return []
-    left, ways = left[whole] - left[whole].mean(axis=0), fit.ways[whole] - fit.ways[whole].mean(axis=0)
+    residual, ways = residual[whole] - residual[whole].mean(axis=0), fit.ways[whole] - fit.ways[whole].mean(axis=0)
     size = np.maximum(np.sum(ways**2, axis=0), 1e-300)
-    slope = ways.T @ left / size[:, None]
-    share = np.sum(slope**2, axis=1) * size / max(float(np.sum(left**2)), 1e-300)
+    slope = ways.T @ residual / size[:, None]
+    share = np.sum(slope**2, axis=1) * size / max(float(np.sum(residual**2)), 1e-300)
     most = int(np.argmax(share))
     if share[most] < WAYS:
         return []

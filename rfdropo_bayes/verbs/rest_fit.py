@@ -19,20 +19,13 @@ from rfdropo_bayes.report.baselines import mean_pose
 from rfdropo_bayes.report.fir import fit_fir
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, rows_of, spread_rows
 
-FITTED, SHOWN = 60, 240
-"""Rows that are fitted, and rows whose residuals are shown."""
-ITERATIONS, SETTLED = 10, 1e-3
-"""Most steps, and the least relative decrease of the cost by a step."""
-STEP = 0.01
-"""Step of derivatives, in standard deviations of the prior."""
-DRAWS = 400
-"""Number of prior draws for its location and size."""
-SHORTEST = 1e-2
-"""Shortest trial step, relative to the full step."""
-KEPT = 0.7
-"""Share of its prior standard deviation at or above which a parameter counts as undetermined."""
-SMALLEST = 1e-5
-"""Smallest noise [m]."""
+FITTED, SHOWN = 60, 240  # rows that are fitted, and rows whose residuals are shown
+ITERATIONS, SETTLED = 10, 1e-3  # most steps, and the least relative decrease of the cost by a step
+STEP = 0.01  # step of derivatives, in standard deviations of the prior
+DRAWS = 400  # number of prior draws for its location and size
+SHORTEST = 1e-2  # shortest trial step, relative to the full step
+KEPT = 0.7  # share of its prior standard deviation at or above which a parameter counts as undetermined
+SMALLEST = 1e-5  # smallest noise [m]
 
 
 class Scale(NamedTuple):
@@ -53,61 +46,45 @@ class Scale(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Result of a fit for a parameter.
-
-    Attributes:
-        value, prior: estimate, and middle of the prior, in its unit.
-        sd: its standard deviation, relative if ``logarithmic``.
-        kept: posterior over prior standard deviation.
-    """
+    """Result of a fit for a parameter."""
 
     name: str
     unit: str
+    # value, prior: estimate, and middle of the prior, in its unit
     value: float
     prior: float
-    sd: float
+    sd: float  # its standard deviation, relative if ``logarithmic``
     logarithmic: bool
-    kept: float
+    kept: float  # posterior over prior standard deviation
 
 
 class RestFit(NamedTuple):
-    """A fit at rest.
+    """A fit at rest."""
 
-    Attributes:
-        estimates: results for the parameters.
-        markers: names; the errors are those of the last marker, root mean square [m].
-        before, after: errors on the fitted rows.
-        unseen: errors on unfitted rows of the fit and of predictors without physics, by name.
-        each: error of every marker on the unfitted rows.
-        fitted, other: numbers of fitted rows and of rows with these errors.
-        tested: whether these are rows of test recordings.
-        rows: shown rows of all recordings; residual: measured less computed [m]; ways: whether each command was
-            last changed upwards (1) or downwards (-1); recording: number of each row's recording.
-    """
-
-    estimates: tuple[Estimate, ...]
-    markers: tuple[str, ...]
+    estimates: tuple[Estimate, ...]  # results for the parameters
+    markers: tuple[str, ...]  # names; errors are of the last marker, root mean square [m]
+    # before, after: errors on the fitted rows
     before: float
     after: float
-    unseen: Mapping[str, float]
-    each: tuple[float, ...]
+    unseen: Mapping[str, float]  # errors on unfitted rows of the fit and of predictors without physics, by name
+    each: tuple[float, ...]  # error of every marker on the unfitted rows
+    # fitted, other: numbers of fitted rows and of rows with these errors
     fitted: int
     other: int
-    tested: bool
-    rows: Rows
-    residual: Float[np.ndarray, "row marker 3"]
-    ways: Float[np.ndarray, "row channel"]
-    recording: np.ndarray
+    tested: bool  # whether these are rows of test recordings
+    rows: Rows  # shown rows of all recordings
+    residual: Float[np.ndarray, "row marker 3"]  # measured less computed [m]
+    ways: Float[np.ndarray, "row channel"]  # whether each command was last changed upwards (1) or downwards (-1)
+    recording: np.ndarray  # number of each row's recording
 
 
-OWN = "own"
-"""Key of the fitted robot among errors."""
+OWN = "own"  # key of the fitted robot among errors
 
 
 def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
     """Priors of the inferred parameters of a robot at rest, without parameters of single recordings."""
     drawn = scopes.sample(jax.random.key(0), DRAWS)
-    found = []
+    scales = []
     for parameter in scopes.parameters:
         draws, spec = np.asarray(drawn[parameter.name]), parameter.spec
         if parameter.name not in known or not np.ptp(draws) > 0.0:
@@ -116,8 +93,8 @@ def scales_of(scopes: Scopes, known: Sequence[str]) -> list[Scale]:
         logarithmic = family in ("LogNormal", "LogUniform") and bool(np.all(draws > 0.0))
         inside = np.log(draws) if logarithmic else draws
         middle, sd = float(np.median(inside)), float(np.std(inside))
-        found.append(Scale(spec.name, spec.unit, logarithmic, middle, sd, spec.low, spec.high))
-    return found
+        scales.append(Scale(spec.name, spec.unit, logarithmic, middle, sd, spec.low, spec.high))
+    return scales
 
 
 def least_squares(
@@ -137,18 +114,18 @@ def least_squares(
     size = float(np.std(measured[seen])) or 1.0
 
     def residuals(made: Float[np.ndarray, "set number"]) -> Float[np.ndarray, "set number"]:
-        left = measured[seen] - made[:, seen]
-        return np.where(np.isfinite(left), left, size)
+        residual = measured[seen] - made[:, seen]
+        return np.where(np.isfinite(residual), residual, size)
 
     for _ in range(ITERATIONS):
-        left = residuals(predict(z + STEP * np.vstack([np.zeros(count), np.eye(count)])))
-        noise = max(float(np.sqrt(np.mean(left[0] ** 2))), SMALLEST)
-        slope = (left[0] - left[1:]) / STEP / noise
+        residual = residuals(predict(z + STEP * np.vstack([np.zeros(count), np.eye(count)])))
+        noise = max(float(np.sqrt(np.mean(residual[0] ** 2))), SMALLEST)
+        slope = (residual[0] - residual[1:]) / STEP / noise
         information = np.eye(count) + slope @ slope.T
-        step = np.linalg.solve(information, slope @ left[0] / noise - z)
+        step = np.linalg.solve(information, slope @ residual[0] / noise - z)
         tried = z + np.geomspace(1.0, SHORTEST, count + 1)[:, None] * step
         cost = np.sum((residuals(predict(tried)) / noise) ** 2, axis=1) + np.sum(tried**2, axis=1)
-        before = float(np.sum((left[0] / noise) ** 2) + np.sum(z**2))
+        before = float(np.sum((residual[0] / noise) ** 2) + np.sum(z**2))
         if cost.min() >= before:
             break
         z = tried[int(np.argmin(cost))]
@@ -190,12 +167,14 @@ def fit_at_rest(
     counts = [len(run.time) for run in (*fit, *test)]
     number = np.repeat(np.arange(len(counts)), counts)
     ways = np.concatenate([_ways(run.command_at(run.time - late)) for run in (*fit, *test)])
-    held = number >= len(fit) if test else np.ones(len(number), dtype=bool)
-    index = np.unique(np.concatenate([_even(np.flatnonzero(held), SHOWN), _even(np.flatnonzero(~held), SHOWN // 2)]))
-    shown, judged = whole.of(index), held[index]
+    tested = number >= len(fit) if test else np.ones(len(number), dtype=bool)
+    index = np.unique(
+        np.concatenate([_even(np.flatnonzero(tested), SHOWN), _even(np.flatnonzero(~tested), SHOWN // 2)])
+    )
+    shown, rated = whole.of(index), tested[index]
     residual = shown.position - made(z[None], shown)[0]
     without = {
-        name: _rms(shown.position - path[index], judged) for name, path in _without_physics(fit, test, robot).items()
+        name: _rms(shown.position - path[index], rated) for name, path in _without_physics(fit, test, robot).items()
     }
     start, end = (rows.position - each[0] for each in (made(np.zeros((1, len(z))), rows), made(z[None], rows)))
     fitted = np.ones(len(rows.time), dtype=bool)
@@ -204,10 +183,10 @@ def fit_at_rest(
         robot.shown,
         _rms(start, fitted),
         _rms(end, fitted),
-        {OWN: _rms(residual, judged), **without},
-        tuple(_rms(residual[:, : k + 1], judged) for k in range(len(robot.shown))),
+        {OWN: _rms(residual, rated), **without},
+        tuple(_rms(residual[:, : k + 1], rated) for k in range(len(robot.shown))),
         len(rows.time),
-        int(judged.sum()),
+        int(rated.sum()),
         bool(test),
         shown,
         residual,
@@ -226,14 +205,14 @@ def _without_physics(
         "linear FIR": fit_fir(fit, groups, degree=1).predict,
         "mean pose": mean_pose(fit),
     }
-    found = {}
+    predictions = {}
     for name, predict in predictors.items():
         paths = []
         for run in (*fit, *test):
             chosen = [run.marker_names.index(marker) for marker in robot.shown]
             paths.append(predict(run)[:, chosen])
-        found[name] = np.concatenate(paths)
-    return found
+        predictions[name] = np.concatenate(paths)
+    return predictions
 
 
 def _estimate(scale: Scale, z: float, kept: float) -> Estimate:

@@ -81,8 +81,8 @@ def simulate(
     values = physical_values(spec, model.simulator)
     sources = commands if isinstance(commands, Sequence) else _sources(model)
     return [
-        _as_trajectory(found, model, values, index)
-        for index, found in enumerate(_rollouts(model.simulator, values, sources))
+        _as_trajectory(rollout, model, values, index)
+        for index, rollout in enumerate(_rollouts(model.simulator, values, sources))
     ]
 
 
@@ -129,16 +129,16 @@ def _simulate_into(out: Path, model: Model) -> dict[str, Any]:
     sources = _sources(model)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
     distances = []
-    for index, found in enumerate(_rollouts(simulator, values, sources)):
-        source, pose = found.source, found.pose
+    for index, rollout in enumerate(_rollouts(simulator, values, sources)):
+        source, pose = rollout.source, rollout.pose
         stem = "trajectory" if len(sources) == 1 else source.name
-        simulated = _as_trajectory(found, model, values, index)
+        simulated = _as_trajectory(rollout, model, values, index)
         simulated.save(out / f"{stem}.nc")
         with whole(out / f"{stem}.csv") as partial:
             _table(source, simulated).to_csv(partial, index=False, float_format="%.6f")
-        distances.append(_distance(source, found.position, found.markers))
+        distances.append(_distance(source, rollout.position, rollout.markers))
         report["recordings"][source.name] = {
-            "status": found.result.name.lower(),
+            "status": rollout.result.name.lower(),
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if measured else None,
         }
@@ -188,9 +188,9 @@ def _known_markers(names: Sequence[str], simulator: AnySimulator) -> list[str]:
     return [name for name in simulator.marker_names if name in names]
 
 
-def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], index: int) -> Trajectory:
+def _as_trajectory(rollout: Simulated, model: Model, values: Mapping[str, float], index: int) -> Trajectory:
     """The simulated motion as a recording with a note that it is synthetic, and how it was made."""
-    source, position, simulator = found.source, found.position, model.simulator
+    source, position, simulator = rollout.source, rollout.position, model.simulator
     noise, seed = model.spec.stated, model.settings.seed
     if noise is not None:
         key = jax.random.fold_in(jax.random.key(seed), index)
@@ -219,7 +219,7 @@ def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], 
             cable_names=source.cable_names,
             initial_command=source.initial_command,
         ).trusted(),
-        Measured(time=source.time, position=position, marker_names=found.markers, object_pose=found.pose),
+        Measured(time=source.time, position=position, marker_names=rollout.markers, object_pose=rollout.pose),
     )
 
 

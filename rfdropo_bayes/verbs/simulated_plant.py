@@ -87,21 +87,21 @@ def true_simulator(
         described, folder, base = Experiment.model_validate(tables), Path(), base or robot
     spec = spec_of(described, folder, base)
     base = robot_of(spec)
-    for what, found, wanted in (
+    for what, given, wanted in (
         ("channels", base.channel_names, robot.channel_names),
         ("markers", base.marker_names, robot.marker_names),
         ("unit of commands", base.command_unit, robot.command_unit),
     ):
-        if found != wanted:
+        if given != wanted:
             raise InputError(
-                f"its {what} are {found}, those of {robot.name} {wanted}",
+                f"its {what} are {given}, those of {robot.name} {wanted}",
                 where=f"plant {base.name}",
                 remedy="deploy a robot with the same values",
             )
     table = spec.simulator
-    held = {name: value for name, value in spec.fixed.items() if table.push or name not in OBJECT}
+    fixed = {name: value for name, value in spec.fixed.items() if table.push or name not in OBJECT}
     alone = changed(table, where="[simulator]", drives="robot", threads=table.threads or 1)
-    spec = replace(spec, fixed=held, simulator=alone)
+    spec = replace(spec, fixed=fixed, simulator=alone)
     simulator = build_robot_simulator(spec)
     return simulator, physical_values(spec, simulator)
 
@@ -156,28 +156,28 @@ class SimulatedTrunk:
 
     def _start(self, length: Float[np.ndarray, " channel"]) -> None:
         self._length = length
-        found = self._session.reset(np.array([0]), self._values, command=(length / self._scale)[None])
-        self._take(found)
+        state = self._session.reset(np.array([0]), self._values, command=(length / self._scale)[None])
+        self._take(state)
 
     def _step(self, length: Float[np.ndarray, " channel"]) -> None:
         self._length = length
         self._take(self._session.act((length / self._scale)[None]))
 
-    def _take(self, found: Observation) -> None:
-        status = Result(int(np.asarray(found.status)[0]))
+    def _take(self, state: Observation) -> None:
+        status = Result(int(np.asarray(state.status)[0]))
         if status in (Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM):
             raise InputError(
                 f"the simulation ends ({status.name.lower().replace('_', ' ')})", where="plant", remedy=status.remedy
             )
-        self._found = found
+        self._state = state
 
     def _seen(self) -> PlantState:
         # By virtual work: a drum holds its cables' tensions, each times its displacement per command, at the drum's
         # radius.
-        tension = self._matrix.T @ np.asarray(self._found.tension, dtype=float)[0] / self._scale
-        position = np.asarray(self._found.position, dtype=float)[0]
+        tension = self._matrix.T @ np.asarray(self._state.tension, dtype=float)[0] / self._scale
+        position = np.asarray(self._state.position, dtype=float)[0]
         position = position + self._noise * self._random.standard_normal(position.shape)
-        if self._found.object_pose is None:
+        if self._state.object_pose is None:
             return PlantState(tension, position)
         errors = self._noise * self._random.standard_normal((1, 6))
-        return PlantState(tension, position, pose_with_errors(np.asarray(self._found.object_pose), errors)[0])
+        return PlantState(tension, position, pose_with_errors(np.asarray(self._state.object_pose), errors)[0])

@@ -8,10 +8,8 @@ from jaxtyping import Float
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import Robot
 
-LAGGING = 0.01
-"""Share of its way by which a body may stay behind its commands and count as slow."""
-SETTLED = 10.0
-"""Times a body's slowest period and its damping's time after which it has come to rest."""
+LAGGING = 0.01  # share of its way by which a body may stay behind its commands and count as slow
+SETTLED = 10.0  # times a body's slowest period and its damping's time after which it has come to rest
 
 
 def first_period(robot: Robot) -> float:
@@ -50,9 +48,9 @@ def slow_motion(robot: Robot, recording: Trajectory) -> str | None:
 def command_rate(recording: Trajectory) -> float | None:
     """Rate of change of commands from row to row, relative to their size [1/s]; None for commands that never change."""
     at = np.searchsorted(recording.command_time, recording.time, side="right")
-    held: Float[np.ndarray, "time channel"] = np.vstack([recording.initial_command, recording.command])[at]
-    if not np.ptp(held, axis=0).any():
+    command: Float[np.ndarray, "time channel"] = np.vstack([recording.initial_command, recording.command])[at]
+    if not np.ptp(command, axis=0).any():
         return None
-    size = np.sqrt(np.mean(np.sum((held - held.mean(axis=0)) ** 2, axis=1)))
-    speed = np.diff(held, axis=0) / np.diff(recording.time)[:, None]
+    size = np.sqrt(np.mean(np.sum((command - command.mean(axis=0)) ** 2, axis=1)))
+    speed = np.diff(command, axis=0) / np.diff(recording.time)[:, None]
     return float(np.sqrt(np.mean(np.sum(speed**2, axis=1))) / size)

@@ -100,11 +100,11 @@ def train(
 
     record: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": known, "texts": model.texts()}
     with run_folder(Path(out), "train", **record, resume=resume, overwrite=overwrite) as out:
-        found = learn(
+        training = learn(
             environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known, show=show
         )
         say_step("the training is done: exporting the policy", show=show)
-        layout = found.model.get_env().get_attr("layout")[0]
+        layout = training.model.get_env().get_attr("layout")[0]
         facts = {
             "rfdropo_version": software_versions()["rfdropo_bayes"],
             "randomisation": randomisation.kind,
@@ -114,14 +114,14 @@ def train(
             "time_step_s": f"{simulator.time_step:g}",
             "seed": str(seed),
         }
-        if "tension_largest" in found.best:
-            facts |= _tension_facts(found.best, table)
-        policy = ExportedPolicy(export_policy(found.model, found.normalisation, layout, out / POLICY, facts))
-        _check_parity(policy, found)
+        if "tension_largest" in training.best:
+            facts |= _tension_facts(training.best, table)
+        policy = ExportedPolicy(export_policy(training.model, training.normalisation, layout, out / POLICY, facts))
+        _check_parity(policy, training)
         sees = varied_parameters(randomisation).names if table.critic == "parameters" else ()
-        summary = _summary(table, found, policy, facts) | {"critic_sees": list(sees)}
+        summary = _summary(table, training, policy, facts) | {"critic_sees": list(sees)}
         summary["cautions"] = [caution.as_dict() for caution in cautions]
-        curve_figure(found.curve).savefig(out / CURVE, dpi=150)
+        curve_figure(training.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
         if page:
             say_step(f"playing the policy in {EPISODES} episodes, and filming the median and the worst", show=show)
@@ -138,11 +138,11 @@ def _cautions(table: TrainingTable, fit: Calibration | Path | None, folder: Path
     source = fit
     if source is None and table.source is not None and table.randomisation in ("posterior", "phi"):
         source = source_of(table.source, folder)
-    found = None if source is None else posterior_caution(source, table.width)
-    if found is None:
+    caution = None if source is None else posterior_caution(source, table.width)
+    if caution is None:
         return []
-    say_step(f"warning: {found.sentence}", show=show)
-    return [found]
+    say_step(f"warning: {caution.sentence}", show=show)
+    return [caution]
 
 
 def _tension_facts(best: Mapping[str, float], table: TrainingTable) -> dict[str, str]:
@@ -163,16 +163,18 @@ def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:
         )
 
 
-def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts: Mapping[str, str]) -> dict[str, Any]:
+def _summary(
+    table: TrainingTable, training: Trained, policy: ExportedPolicy, facts: Mapping[str, str]
+) -> dict[str, Any]:
     return {
         "task": table.task,
         "algorithm": table.algorithm,
-        "steps": found.curve[-1]["steps"],
-        "seconds": found.seconds,
-        "diverged_episodes": found.diverged,
-        "redrawn_parameters": found.redrawn,
-        "evaluation": _plain({key: value for key, value in found.best.items() if key != "seconds"}),
-        "curve": [_plain(row) for row in found.curve],
+        "steps": training.curve[-1]["steps"],
+        "seconds": training.seconds,
+        "diverged_episodes": training.diverged,
+        "redrawn_parameters": training.redrawn,
+        "evaluation": _plain({key: value for key, value in training.best.items() if key != "seconds"}),
+        "curve": [_plain(row) for row in training.curve],
         "latency": latency(policy),
         "layout_sha256": policy.layout.sha256,
         "settings": table.model_dump(mode="json"),
@@ -188,7 +190,7 @@ def _plain(row: Mapping[str, float]) -> dict[str, float | None]:
     return {name: value if np.isfinite(value) else None for name, value in row.items()}
 
 
-def learnt(summary: Mapping[str, Any]) -> str:
+def training_sentence(summary: Mapping[str, Any]) -> str:
     """Evaluation of the kept policy, in one or two sentences."""
     best = summary["evaluation"]
     half, most = (best[f"distance_{name}"] for name in ("median", "q95"))
@@ -221,7 +223,7 @@ Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {su
 Time steps: {summary["integrator"]}, {1e3 * float(summary["time_step_s"]):g} ms.
 Parameters of every episode: {summary["randomisation"]}, SHA-256 {summary["posterior_sha256"][:16]}.
 
-This is the policy after {best["steps"]} steps, the best evaluated, in {episodes} episodes: {learnt(summary)}
+This is the policy after {best["steps"]} steps, the best evaluated, in {episodes} episodes: {training_sentence(summary)}
 One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} ms at the 99th percentile.
 
 | Observation | Numbers | Unit |

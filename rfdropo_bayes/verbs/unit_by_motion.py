@@ -17,10 +17,8 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_units import Unit
 from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
 
-MOST_TURN = np.pi
-"""Largest turn of a body [rad] by its cables."""
-MISREAD = 5.0
-"""Ratio of the measured motion and this estimate at or above which another unit replaces a guess."""
+MOST_TURN = np.pi  # largest turn of a body [rad] by its cables
+MISREAD = 5.0  # ratio of the measured motion and this estimate at or above which another unit replaces a guess
 STEPS = 81  # along the body
 
 

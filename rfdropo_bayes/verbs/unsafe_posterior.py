@@ -52,7 +52,7 @@ def _audited(folder: Path, summary: Mapping[str, Any]) -> list[str]:
     """Effects that the calibrated model lacks according to audits of its recordings; empty if an audit passed this
     model.
     """
-    own, found = _terms(folder / CONFIG), []
+    own, reasons = _terms(folder / CONFIG), []
     for path in sorted(folder.parent.glob(f"*/{AUDIT}")):
         audit = _read(path)
         verdict, place = audit.get("verdict"), path.parent
@@ -62,10 +62,12 @@ def _audited(folder: Path, summary: Mapping[str, Any]) -> list[str]:
             return []
         extended = _terms(place / EXTENDED)
         if own is not None and extended is not None and extended - own:
-            found.append(f"the audit in {place} names the effects that its model lacks, see {path.with_name(EXTENDED)}")
+            reasons.append(
+                f"the audit in {place} names the effects that its model lacks, see {path.with_name(EXTENDED)}"
+            )
         elif verdict in (PARTLY, UNEXPLAINED):
-            found.append(f"the audit in {place} leaves a discrepancy unexplained")
-    return found
+            reasons.append(f"the audit in {place} leaves a discrepancy unexplained")
+    return reasons
 
 
 def _same_recordings(folder: Path, summary: Mapping[str, Any], place: Path, audit: Mapping[str, Any]) -> bool:

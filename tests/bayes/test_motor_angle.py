@@ -176,7 +176,7 @@ def test_angles_tell_a_slow_drive_from_a_damped_body():
 
     Off by more than 4 deviations: one seed in 10^4, and the seed is fixed.
     """
-    options = {"starts": 1, "blocks": 1, "screen": 16, "draws": 4000}
+    options = {"starts": 1, "blocks": 1, "prior_draws": 16, "draws": 4000}
     fits = {
         angles: methods.run(problem(recording(), angles=angles), "laplace", options, jax.random.key(5)).draws
         for angles in (True, False)

@@ -58,7 +58,7 @@ def test_an_unusable_table_says_what_is_wrong_and_where(spec, table, message):
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 20.0), (0.05, 20.0), (0.0, np.inf), (0.05, np.inf)])
 def test_a_log_normal_prior_ends_at_the_hard_bounds(low, high):
-    """However far a climb goes in unconstrained coordinates, and with a density that integrates to one there."""
+    """However far a search goes in unconstrained coordinates, and with a density that integrates to one there."""
     spec = ParameterSpec("drag", "1/s", low, high, 0.1, {"distribution": "LogNormal", "median": 0.1, "sigma": 1.0}, "")
     space = build_scopes([spec], {"drag": {}}, {}, ["a"])
     u = jnp.linspace(-30.0, 30.0, 60001)[:, None]

@@ -147,7 +147,7 @@ def sum_of(values, group):
     return values["offset_x"] + values[f"offset_x_deviation@{group}"]
 
 
-def test_a_climb_starts_from_a_group_s_own_deviation_and_from_no_other_s():
+def test_an_optimisation_starts_from_a_group_s_own_deviation_and_from_no_other_s():
     earlier = {"offset_x": {"": np.full(3, 0.01)}, "offset_x_deviation": {"january": np.full(3, 0.001)}}
     values = pooled_space().sample_around(earlier, jax.random.key(1), DRAWS)
     np.testing.assert_allclose(values["offset_x_deviation@january"], 0.001, rtol=1e-12)

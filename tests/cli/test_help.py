@@ -49,8 +49,7 @@ def test_every_option_is_described_and_none_shows_a_type_of_python(name):
 
 
 @pytest.mark.parametrize(
-    ("command", "option", "unit"),
-    [("design", "seconds", "seconds"), ("doctor", "seconds", "seconds")],
+    ("command", "option", "unit"), [("adapt", "seconds", "seconds"), ("doctor", "seconds", "seconds")]
 )
 def test_an_option_of_time_names_its_unit(command, option, unit):
     (found,) = (each for each in COMMANDS[f"rfdropo {command}"].params if each.name == option)

@@ -174,16 +174,10 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
     ("change", "message"),
     [
         ({"fits": []}, r"\[data\]: unknown key 'fits'; did you mean 'fit'\?"),
-        (
-            {"format": "sofa_csv"},
-            "'sofa_csv': Input should be 'sofa-csv', 'optitrack-csv', .* or 'netcdf'",
-        ),
+        ({"format": "sofa_csv"}, "'sofa_csv': Input should be 'sofa-csv', 'optitrack-csv', .* or 'netcdf'"),
         ({"fit": []}, "at least 1 item"),
         ({"resample": -0.1}, "greater than 0"),
-        (
-            {"fit": [{"observation": "a.csv"}]},
-            "unknown key 'fit.0.observation'; did you mean 'observations'",
-        ),
+        ({"fit": [{"observation": "a.csv"}]}, "unknown key 'fit.0.observation'; did you mean 'observations'"),
         ({"fit": [{"observations": "a", "row": [0, 1]}]}, "unknown key 'fit.0.row'; did you mean 'rows'"),
         ({"fit": "a.csv"}, "fit = 'a.csv': Input should be a valid list"),
         ({"format": "csv"}, r"needs a \[data.columns\] table"),

@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import (
-    CsvColumns,
-    read_asl_csv,
-    read_optitrack_csv,
-    read_plain_csv,
-    read_sofa_csv,
-)
+from rfdropo_bayes.data import CsvColumns, read_asl_csv, read_optitrack_csv, read_plain_csv, read_sofa_csv
 from rfdropo_bayes.data.actions import cumulative_displacement
 from rfdropo_bayes.errors import InputError
 

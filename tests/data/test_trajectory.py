@@ -38,8 +38,7 @@ def test_hash_follows_the_content_and_nothing_else(build):
 
 
 @pytest.mark.parametrize(
-    ("scale", "message"),
-    [(1e3, "millimetres given as metres"), (1e-3, "metres given as millimetres")],
+    ("scale", "message"), [(1e3, "millimetres given as metres"), (1e-3, "metres given as millimetres")]
 )
 def test_a_wrong_unit_of_length_is_named(build, scale, message):
     with pytest.raises(InputError, match=message):

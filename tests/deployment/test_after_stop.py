@@ -32,10 +32,7 @@ class Shown:
     [
         ((ENABLED, ENABLED, STOPPED, STOPPED), []),
         ((ENABLED, STOPPED, ENABLED, ENABLED), ["enabled itself again"]),
-        (
-            (ENABLED, STOPPED, DISABLED, DISABLED),
-            ["let its cable go after the quick stop: it is in switch"],
-        ),
+        ((ENABLED, STOPPED, DISABLED, DISABLED), ["let its cable go after the quick stop: it is in switch"]),
         ((ENABLED, DISABLED), ["let its cable go"]),  # a quick stop that it does not hold
         ((ENABLED, STOPPED, FAULT), ["it is in fault"]),
         ((STOPPED, None), ["unknown state"]),

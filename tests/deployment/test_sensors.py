@@ -15,15 +15,12 @@ from rfdropo_bayes.deployment.sensors import (
     MarkerView,
     NatNetMarkers,
     NoSensor,
-    RecordedMarkers,
     SensorTable,
     Sighting,
     SimulatedMarkers,
 )
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-
-from .test_policy import recording
 
 NAMES = ("a", "b")
 
@@ -133,13 +130,6 @@ def test_simulated_markers_take_the_newest_of_their_size() -> None:
     np.testing.assert_allclose(sensor.latest().object_pose, np.arange(7.0))
     out.close()
     sensor.close()
-
-
-def test_recorded_markers_come_at_their_own_pace(robot: Robot) -> None:
-    sensor = RecordedMarkers(recording(robot), robot)
-    assert sensor.latest().number == 1
-    time.sleep(0.25)
-    assert 2 <= sensor.latest().number <= 11
 
 
 def body(

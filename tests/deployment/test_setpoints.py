@@ -64,7 +64,7 @@ def test_the_way_takes_as_long_as_a_trapezoid(robot: Robot) -> None:
         made.towards(goal)
         steps += 1
     motor = robot.motors[0]
-    expected = 0.02 / motor.rate_limit_m_s + motor.stopping_time_s
+    expected = 0.02 / motor.rate_limit_m_s + motor.rate_limit_m_s / motor.acceleration_limit_m_s2
     assert steps * PERIOD == pytest.approx(expected, abs=3 * PERIOD)
 
 
@@ -77,7 +77,8 @@ def test_a_halt_takes_the_stopping_time(robot: Robot) -> None:
     while not made.at_rest:
         made.halt()
         steps += 1
-    assert steps * PERIOD <= robot.motors[0].stopping_time_s + PERIOD + 1e-9
+    motor = robot.motors[0]
+    assert steps * PERIOD <= motor.rate_limit_m_s / motor.acceleration_limit_m_s2 + PERIOD + 1e-9
 
 
 def test_a_motor_found_beyond_its_limit_may_come_back_but_go_no_further(robot: Robot) -> None:

@@ -49,8 +49,8 @@ def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
 
 @pytest.mark.slow
 def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drums_does_the_same(monkeypatch):
-    """A base fit that stopped at half the radius, and gains of the cables that make up for it. Climbs that do not move
-    at all show where they start: the base model at what imitates the gains, which is as good as they are."""
+    """A base fit that stopped at half the radius, and gains of the cables that make up for it. Optimisations that do
+    not move show where they start: at the base model whose radius imitates the gains, which is as good as they are."""
     asked = problem_of(Geared(), {"radius": 1.0, **TRUTH}, 4, base=3)
     target, right = base_model(asked, 0)
     screen = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(right)

@@ -14,7 +14,7 @@ import numpy as np
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.repeat_noise import mean_of, spread
+from rfdropo_bayes.bayes.repeat_noise import departures_from_mean, mean_of
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
@@ -201,7 +201,9 @@ def measurements(single: np.ndarray, members: tuple[tuple[int, ...], ...]) -> Me
     joined = replace(channel.of_recordings(firsts), readings=mean_of(channel, members))
     time = np.tile(0.05 * np.arange(single.shape[1]), (len(members), 1))
     names = tuple("abcdefgh"[index] for index in firsts)
-    return Measurements(names, members, time, (joined,), (channel,), None, count, spread(channel, members))
+    return Measurements(
+        names, members, time, (joined,), (channel,), None, count, departures_from_mean(channel, members)
+    )
 
 
 LANES = Lanes(Toy(), np.arange(4))
@@ -215,8 +217,7 @@ def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProbl
     gathered = gather_recordings(toy, trajectories)
     space = build_scopes(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     coordinates = COORDINATES.setdefault(
-        gathered.names,
-        Coordinates(space, len(BASE), tuple(s.name for s in toy.parameters)),
+        gathered.names, Coordinates(space, len(BASE), tuple(s.name for s in toy.parameters))
     )
     model = TrajectoryModel(toy, space, gathered, (Markers.gather(gathered, "repeats"),))
     place = {name: i for i, name in enumerate(space.names)}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rfdropo_bayes import fem  # noqa: F401  (double precision)
 from rfdropo_bayes.fem import rod_elements, sections
-from rfdropo_bayes.fem.cables import Held
+from rfdropo_bayes.fem.cables import TautCables
 from rfdropo_bayes.fem.components import cross, rotation, turned
 
 STATIONS = 4
@@ -40,12 +40,12 @@ def lawful(fibre: float) -> sections.Sections:
     return sections.Sections(jnp.asarray(stretch), jnp.asarray(bending), INNER, jnp.asarray(fibre))
 
 
-def taut() -> Held:
+def taut() -> TautCables:
     """Cables that hold elements, at random."""
     rng = np.random.default_rng(4)
     force, mixed, moment = rng.normal(size=(3, 3, 3, STATIONS - 1))
     force, moment = force + np.swapaxes(force, 0, 1), moment + np.swapaxes(moment, 0, 1)
-    return Held(*(jnp.asarray(part) for part in (force, mixed, moment)))
+    return TautCables(*(jnp.asarray(part) for part in (force, mixed, moment)))
 
 
 @jax.jit
@@ -61,7 +61,7 @@ def compared(position, quaternion, motion, section, held):
     slope = jax.grad(lambda change: jnp.sum(LENGTH * sections.energy(section, strain(change))))(none)
     rates = rod_elements.strain_rates(elements, motion)
     moved = jax.jvp(strain, (none,), (motion,))[1]
-    resultant = leant(sections.linear(section, rates)) + rod_elements.held_resultant(elements, held, rates)
+    resultant = leant(sections.linear(section, rates)) + rod_elements.taut_resultant(elements, held, rates)
     stiff = -rod_elements.station_forces(elements, resultant)
     k = rod_elements.tangent(elements, section.stretch, section.bending, held)
 
@@ -73,10 +73,7 @@ def compared(position, quaternion, motion, section, held):
 
     (ra, aa), (rb, ab) = ((motion[:3, part], motion[3:, part]) for part in (slice(0, -1), slice(1, None)))
     first = jnp.concatenate(
-        [
-            apply(k.c, ra - rb) - apply(k.a, aa) - apply(k.b, ab),
-            back(k.a, rb - ra) + apply(k.aa, aa) + back(k.ba, ab),
-        ]
+        [apply(k.c, ra - rb) - apply(k.a, aa) - apply(k.b, ab), back(k.a, rb - ra) + apply(k.aa, aa) + back(k.ba, ab)]
     )
     second = jnp.concatenate(
         [apply(k.c, rb - ra) + apply(k.a, aa) + apply(k.b, ab), back(k.b, rb - ra) + apply(k.ba, aa) + apply(k.bb, ab)]

@@ -107,12 +107,12 @@ def test_refuses_inverted_elements_and_loose_nodes():
     body = beam(1, 1, 1)
     with pytest.raises(InputError, match="element 0 has volume -"):
         tetrahedral_body(body.rest, body.element[:, [1, 0, 2, 3]], body.fixed)
-    with pytest.raises(InputError, match="no node is held"):
+    with pytest.raises(InputError, match="no node is fixed"):
         tetrahedral_body(body.rest, body.element, np.zeros(len(body.rest), bool))
     elements = np.vstack([body.element, body.element + len(body.rest)])
-    held = np.concatenate([body.fixed, np.zeros(len(body.rest), bool)])
-    with pytest.raises(InputError, match="hang on no held node"):
-        tetrahedral_body(np.vstack([body.rest, body.rest]), elements, held)
+    fixed = np.concatenate([body.fixed, np.zeros(len(body.rest), bool)])
+    with pytest.raises(InputError, match="are tied to no fixed node"):
+        tetrahedral_body(np.vstack([body.rest, body.rest]), elements, fixed)
 
 
 def pulled_beam(frames):

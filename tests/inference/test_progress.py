@@ -26,11 +26,11 @@ def test_it_moves_with_rollouts_and_tells_the_time_that_is_left(seconds):
     with Progress("smc", budget=200.0) as progress:
         seconds[0] = 30.0  # compiling
         progress.spend(20.0)
-        assert progress.seconds_left is None
+        assert progress.remaining_seconds is None
         seconds[0] = 40.0
         progress.spend(20.0)
         assert progress.share == pytest.approx(0.2)
-        assert progress.seconds_left == pytest.approx(80.0)  # 10 % took 10 s, 80 % are left
+        assert progress.remaining_seconds == pytest.approx(80.0)  # 10 % took 10 s, 80 % are left
         progress.spend(1000.0)
         assert progress.share == module.UNFINISHED
         progress.stage(1.0)

@@ -119,7 +119,7 @@ def test_replicates_that_disagree_are_named():
 
 
 @pytest.mark.parametrize(
-    ("replicates", "climbs", "alone"),
+    ("replicates", "optimisations", "alone"),
     [
         (1, None, "one replicate"),
         (1, 4, "one replicate"),
@@ -128,8 +128,8 @@ def test_replicates_that_disagree_are_named():
         (2, 2, None),
     ],
 )
-def test_what_cannot_show_a_lost_mode_says_so(replicates, climbs, alone):
-    found = unseen_modes(replicates, climbs)
+def test_what_cannot_show_a_lost_mode_says_so(replicates, optimisations, alone):
+    found = unseen_modes(replicates, optimisations)
     assert [caution.code for caution in found] == ([Code.MODES_UNSEEN] if alone else [])
     assert not alone or found[0].sentence.startswith(alone)
 

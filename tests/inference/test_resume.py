@@ -23,14 +23,13 @@ from .toys import Decay, Spring
 
 KEY = jax.random.key(12)
 OPTIONS = {
-    "smc": {"particles": 40, "replicates": 2, "blocks": 2, "target_ess": 0.3},
+    "smc": {"particles": 40, "replicates": 2, "blocks": 2},
     "laplace": {"starts": 2, "blocks": 2, "draws": 50},
-    "bridge": {"particles": 40, "replicates": 2, "climb": {"starts": 1, "blocks": 1}},
     "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
 }
 CASES = [
     *OPTIONS.items(),
-    ("laplace", {"starts": 4, "survey": 50, "rollouts": 2000.0, "draws": 50}),
+    ("laplace", {"starts": 4, "pilot_particles": 50, "rollouts": 2000.0, "draws": 50}),
     ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "linear"}),
 ]
 
@@ -154,7 +153,6 @@ methods.run(problem, sys.argv[3], json.loads(sys.argv[4]), jax.random.key(12), c
     ("method", "options", "begun"),
     [
         pytest.param("smc", OPTIONS["smc"], "smc_1", marks=pytest.mark.slow),
-        pytest.param("bridge", OPTIONS["bridge"], "smc_0", marks=pytest.mark.slow),
         pytest.param("rfdropo", OPTIONS["rfdropo"], "rfdropo", marks=pytest.mark.slow),
         pytest.param(*CASES[-1], "rfdropo", marks=pytest.mark.slow),
     ],
@@ -187,7 +185,7 @@ def test_a_checkpoint_of_another_run_is_refused(change, tmp_path):
     methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
     options, key = dict(OPTIONS["smc"]), KEY
     if change == "options":
-        options["target_ess"] = 0.6
+        options["particles"] = 50
     elif change == "key":
         key = jax.random.key(13)
     elif change == "data":
@@ -210,9 +208,9 @@ def test_a_damaged_checkpoint_is_refused(damage, tmp_path):
         methods.run(decay(), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True)
 
 
-@pytest.mark.parametrize("part", ["survey", "smc_climbs"])
-def test_a_damaged_checkpoint_of_climbs_does_not_start_them_over(part, tmp_path):
-    """They fall back to the prior, but only where no draw to climb from has a likelihood."""
+@pytest.mark.parametrize("part", ["pilot_run", "smc_optimisations"])
+def test_a_damaged_checkpoint_of_optimisations_does_not_start_them_over(part, tmp_path):
+    """They fall back to the prior, but only if no draw to start from has a likelihood."""
     (tmp_path / f"{part}.npz").write_bytes(b"")
     options = {"rollouts": 6000.0, "particles": 60, "start": "optimum"}
     with pytest.raises(InputError, match="damaged"):

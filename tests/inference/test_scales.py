@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 
 GROUPS, KINDS, SIGMA, WIDTH = 4, 3, 0.3, 2.0

@@ -225,7 +225,8 @@ class Ratio(LinearGaussian):
 
     def to_unconstrained(self, values):
         x = together(values, self.names)
-        return kind(x).log((x - self.low) / (self.high - x))
+        with np.errstate(invalid="ignore"):  # beyond a bound there is no coordinate
+            return kind(x).log((x - self.low) / (self.high - x))
 
     def from_unconstrained(self, u):
         x = self.low + (self.high - self.low) * sigmoid(u)
@@ -260,8 +261,9 @@ class Ratio(LinearGaussian):
 
 
 class Washboard(LinearGaussian):
-    """A valley with a ripple of 20 nats across it: climbs end on the nearest of thousands of crests, and the highest
-    holds the posterior. Each row has an equal share."""
+    """A valley with a ripple of 20 nats across it: optimisations end at the nearest of thousands of local maxima, and
+    the highest holds the posterior. Each row has an equal share.
+    """
 
     width, ripple = 0.25, 10.0
 

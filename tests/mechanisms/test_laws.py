@@ -90,10 +90,7 @@ def without_law():
     return plain, given, np.asarray(plain.rollout({}, given).position)
 
 
-@pytest.mark.parametrize(
-    "port",
-    [pytest.param(port, marks=[pytest.mark.slow] * (port in SAME_WAY)) for port in PORTS],
-)
+@pytest.mark.parametrize("port", [pytest.param(port, marks=[pytest.mark.slow] * (port in SAME_WAY)) for port in PORTS])
 def test_a_law_of_zero_changes_no_bit_and_another_one_acts(without_law, port):
     _, given, still = without_law
     acting = build_robot_simulator(spec(law(port, "magnitude", commands=["left"])))

@@ -86,8 +86,7 @@ def test_observations_have_the_papers_size_and_goals_its_boxes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("actions", "observed"),
-    [pytest.param("discrete", "paper", marks=pytest.mark.slow), ("continuous", "markers")],
+    ("actions", "observed"), [pytest.param("discrete", "paper", marks=pytest.mark.slow), ("continuous", "markers")]
 )
 def test_gymnasium_and_sb3_accept_the_environment(actions, observed) -> None:
     env = TrunkEnv(REACH, actions=actions, observed=observed, render_mode="rgb_array")

@@ -222,10 +222,7 @@ def test_keys_that_came_later_are_as_they_are_by_default(trained, tmp_path) -> N
         train(Points, TABLE.model_copy(update={"history": 2}), tmp_path, seed=3, gamma=0.9, resume=True)
 
 
-@pytest.mark.parametrize(
-    ("change", "seed", "words"),
-    [({"environments": 8}, 3, "environments"), ({}, 4, "seed")],
-)
+@pytest.mark.parametrize(("change", "seed", "words"), [({"environments": 8}, 3, "environments"), ({}, 4, "seed")])
 def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, change, seed, words) -> None:
     source, _ = trained
     shutil.copytree(source / "checkpoints", tmp_path / "checkpoints")

@@ -42,10 +42,7 @@ def test_a_dead_time_postpones_everything_whatever_the_time_step(time_step):
     np.testing.assert_allclose(late.step[:steps, 0], 0.0, atol=1e-12)
 
 
-@given(
-    st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=8),
-    st.floats(0.005, 0.3),
-)
+@given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=8), st.floats(0.005, 0.3))
 @settings(deadline=None, max_examples=50)
 def test_every_ramp_ends_at_the_last_command(values, ramp):
     """Whatever the ramp, the command that was sent last is reached once the ramp has passed."""

@@ -180,7 +180,7 @@ def test_options_that_do_not_fit_are_refused(mesh):
         ({"marker_cables": ("long_9",)}, "no cable 'long_9'"),
         ({"marker_cables": ("long_0", "short_4")}, "of some cables but not of all"),
         ({"drive_rate": 1e-3}, "drive_rate has no effect"),
-        ({"clamp_height": -1.0}, "no node is held"),
+        ({"clamp_height": -1.0}, "no node is fixed"),
     ):
         with pytest.raises(InputError, match=message):
             assemble_mesh(ROBOT, mesh, table(**options))

@@ -76,10 +76,7 @@ def test_the_size_of_what_is_hidden_is_as_asked(tmp_path):
     brief = Setting()
     commands = brief.commands.model_copy(update={"duration": 1.0})
     setting = replace(
-        brief,
-        commands=commands,
-        audited={"refine": 1, "time_step": 0.01},
-        made={"refine": 1, "time_step": 0.01},
+        brief, commands=commands, audited={"refine": 1, "time_step": 0.01}, made={"refine": 1, "time_step": 0.01}
     )
     found = hide(setting, ["camera_rotation"], 0.5, 0, tmp_path / "a", workshop=SHOP)
     base = hide(setting, [], 0.0, 0, tmp_path / "b", workshop=SHOP)

@@ -24,8 +24,7 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.report import page
 from rfdropo_bayes.verbs import adapt as adaptation
-from rfdropo_bayes.verbs import design_day as day_design
-from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
+from rfdropo_bayes.verbs.left_out_sessions import of_unseen_sessions, openings_of
 from tests.undrawn import without_panels
 from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
@@ -56,12 +55,12 @@ def fit(zeros):
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
     runs = recorded([f"day_{k}_a" for k in range(5)], zeros[:5], 0)
     unseen = recorded([f"new_{k}" for k in range(10)], zeros[5:], 10)
-    return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, screen=32), test=unseen, seed=0, show=False)
+    return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, prior_draws=32), test=unseen, seed=0, show=False)
 
 
 @pytest.mark.slow
 def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
-    """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
+    """Optimisations start where an earlier fit ended, fit the data that they were given, and say how far they are."""
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
     earlier = {"gain": {"": np.full(2, 1.1 * GAIN)}, "zero_deviation": {"day_1": np.full(2, 0.004)}}
     whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)
@@ -271,7 +270,7 @@ def test_a_day_that_the_model_cannot_fit_has_a_caution(known, zeros):
     run = recorded(["b"], zeros[1:2], 51)[0]
     drift = 10.0 * SIGMA * np.sqrt(3.0) * np.sin(40.0 * run.time)
     off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + xr.DataArray(drift, dims="time")))
-    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.DAY_UNMATCHED]
+    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.SESSION_UNMATCHED]
     times = float(said[0].sentence.removeprefix("the session is fitted ").partition(" ")[0])
     assert times == pytest.approx(np.sqrt(1.0 + 10.0**2 * 3.0 / 2.0), rel=0.25)
     assert not [c for c in rb.adapt(known, run, show=False).cautions if "times worse" in c.sentence]
@@ -328,8 +327,8 @@ def test_fitted_days_under_other_commands_are_unseen(zeros):
     repeat, new = (fitted[0].with_attributes(name=name) for name in ("day_0_b", "new"))
     other = recorded(["day_0_c"], zeros[:1], 77)[0]
     days = ["day_0", "day_1"]
-    assert of_unseen_days([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
-    assert of_unseen_days([repeat, other, new], DAYS, days, None) == ["new"]
+    assert of_unseen_sessions([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
+    assert of_unseen_sessions([repeat, other, new], DAYS, days, None) == ["new"]
 
 
 @pytest.mark.slow
@@ -372,65 +371,6 @@ def test_a_day_that_was_fitted_is_refused_before_a_folder_is_made(known, zeros, 
     assert rb.adapt(known, run, group="anew", show=False).content["details"]["moved"] == ["zero_deviation@anew"]
 
 
-def test_the_shortest_commands_that_determine_a_day(known, zeros):
-    """One row of a marker that a zero moves says what there is to say; where it moves none, no commands do."""
-    runs = recorded(["day_0_a"], zeros[:1], 0)
-    found = rb.design_day(known, runs, seconds=1.0)
-    assert found.content["determined"]
-    assert found.content["seconds"] == 0.0
-    assert found.content["parameters_of_a_day"] == ["zero_deviation@another day"]
-    assert found.content["tip_uncertain_before_mm"] == pytest.approx(1e3 * GAIN * SPREAD, rel=0.1)
-    assert found.content["tip_uncertain_after_mm"] <= found.content["tip_error_of_the_model_mm"]
-    assert list(found.commands.columns) == ["time_s", "pull_m"]
-    assert "The first row of a recording is enough" in found.sentence
-    assert found.content["group"] == "day_0"
-    none = {**known.record.posterior, "zero_spread": np.full((1, 60), 1e-9)}
-    same = rb.design_day(replace(known, record=replace(known.record, posterior=none)), runs, seconds=1.0)
-    assert same.content["tip_uncertain_before_mm"] < 1e-3
-
-
-def test_proposals_are_as_long_as_asked_for(known, zeros):
-    """Longer than the recordings at hand, and from rest as they began; a group that none is of is refused."""
-    runs = [run.slice_rows(0, 25) for run in recorded(["day_0_a", "day_1_a"], zeros[:2], 0)]
-    begun = day_design._begun_like(runs[0], 5.0)
-    assert begun.name == "day_0_a"
-    np.testing.assert_allclose(begun.time, STEP * np.arange(251))
-    tried = day_design._followed_proposals(known.model, begun, runs[0], runs, np.random.default_rng(0))
-    assert max(time[-1] for _, time, _ in tried) > 4.5
-    assert rb.design_day(known, runs, seconds=1.0).content["group"] == "day_1"
-    with pytest.raises(rb.InputError, match="no given recording belongs to the group 'day_2'"):
-        rb.design_day(known, runs, group="day_2")
-
-
-@pytest.fixture
-def stated():
-    """An arm whose first drive ignores what is beyond 12 mm in April, and forgets it in January."""
-    named = {"january": "jan_*", "april": "apr_*"}
-    drives = [{"recordings": name, "low": 0.0, "high": 0.012, "beyond": "lost", "cables": ["up"]} for name in named]
-    return rb.Model("smooth_arm", groups=named, drives=[drives[0] | {"high": 0.03}, drives[1]])
-
-
-def test_proposals_are_what_the_drives_of_the_day_follow(stated):
-    """Commands of up to 40 mm were sent, of which the drives followed 30 mm in January and 12 mm in April."""
-    made = rb.Trajectory.load(DEMO)
-    command = 0.04 * np.linspace(0.0, 1.0, len(made.command))[:, None] * np.array([1.0, 0.5, 0.0, 0.0])
-    runs = [
-        rb.Trajectory(made.dataset.assign(command=made.dataset["command"].copy(data=command))).with_attributes(
-            name=name
-        )
-        for name in ("jan_1", "apr_1")
-    ]
-    for run, most in zip(runs, (0.03, 0.012), strict=True):
-        begun = day_design._begun_like(run, 2.0)
-        tried = day_design._followed_proposals(stated, begun, run, runs, np.random.default_rng(1))
-        top = np.max([value.max(axis=0) for _, _, value in tried], axis=0)
-        assert 0.6 * most < top[0] <= most
-        assert 0.01 < top[1] <= 0.02
-        for _, _, value in tried:  # as sent
-            taken = stated.simulator.taken(f"{run.name}[proposal 3]", run.initial_command, value)
-            np.testing.assert_array_equal(taken, value)
-
-
 def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
     record = known.record
     shared = tuple(info for info in record.parameters if info.name in (*PRIORS, "observation_noise"))
@@ -448,13 +388,3 @@ def test_the_command_refuses_a_folder_without_a_posterior(tmp_path):
     found = CliRunner().invoke(app, ["adapt", str(tmp_path), "--recording", "x.csv", "--out", str(tmp_path / "out")])
     assert isinstance(found.exception, rb.InputError)
     assert "holds no posterior.nc" in str(found.exception)
-
-
-@pytest.mark.slow
-def test_a_day_that_one_row_determines_needs_no_motion() -> None:
-    assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=0.0), 0.0, 0.002, 0.005).startswith(
-        "The first row"
-    )
-    assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=1.5), 1.5, 0.02, 0.005).startswith(
-        "Record the first 1.5 s"
-    )

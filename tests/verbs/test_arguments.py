@@ -58,7 +58,7 @@ def test_one_recording_is_a_list_of_one():
     assert test == [RUN]
 
 
-@pytest.mark.parametrize("call", [rb.predict, rb.adapt, rb.design_day], ids=["predict", "adapt", "design_day"])
+@pytest.mark.parametrize("call", [rb.predict, rb.adapt], ids=["predict", "adapt"])
 def test_the_folder_of_a_run_is_no_calibration(call):
     with pytest.raises(rb.InputError, match=r"'runs/arm' is not a calibration; .*rb\.load\(folder\)"):
         call("runs/arm", RUN)

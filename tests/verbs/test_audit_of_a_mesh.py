@@ -44,10 +44,7 @@ def experiment(bar_mesh: Path, **audit: object) -> Experiment:
     tables = {
         "robot": ROBOT.name,
         "data": {"format": "netcdf", "fit": ["*.nc"]},
-        "simulator": {
-            "body": "tetrahedra",
-            "tetrahedra": {"mesh": str(bar_mesh), "unit": "mm", "clamp_height": 0.02},
-        },
+        "simulator": {"body": "tetrahedra", "tetrahedra": {"mesh": str(bar_mesh), "unit": "mm", "clamp_height": 0.02}},
         "model": {"priors": {"young_modulus": {"distribution": "LogNormal", "median": 4e6, "sigma": 0.3}}},
         "audit": audit,
     }

@@ -57,7 +57,7 @@ def test_a_black_box_is_calibrated_and_its_run_is_read_again(tmp_path, monkeypat
     truth, noise = {"gain": 1.4, "time_constant": 0.25, "zero": 0.0}, {"standard_deviation": SIGMA}
     model = rb.Model(BOX, noise="white", priors=PRIORS)
     runs = rb.simulate(model, walk | {"recordings": ["one", "two"]}, parameters=truth, noise=noise, seed=1)
-    quick = rb.Laplace(draws=200, starts=2, screen=16)
+    quick = rb.Laplace(draws=200, starts=2, prior_draws=16)
     found = rb.calibrate(model, runs[:1], quick, test=runs[1:], seed=0, show=False, out=tmp_path / "run")
     for name in ("gain", "time_constant"):
         row = found.summary.loc[name]
@@ -95,7 +95,7 @@ def test_commands_that_no_draw_survives_leave_the_fit_its_page(tmp_path, monkeyp
     wide = walk | {"recordings": ["two"], "low": -0.3, "high": 0.3, "step": 0.1}
     (far,) = rb.simulate(model, wide, parameters=truth, noise=noise, seed=1)
     own = rb.Model(box, noise="white", priors=PRIORS)
-    quick = rb.Laplace(draws=200, starts=2, screen=16)
+    quick = rb.Laplace(draws=200, starts=2, prior_draws=16)
     found = rb.calibrate(own, [run], quick, test=[far], seed=0, show=False, out=tmp_path / "run")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     (caution,) = [each for each in summary["cautions"] if each["code"] == Code.NOT_PREDICTED]
@@ -180,7 +180,7 @@ def test_a_start_is_refused_where_it_would_be_ignored_or_is_not_there(tmp_path):
     assert earlier_draws(None, "nested") is None
 
 
-def test_climbs_start_from_the_optimum_of_an_earlier_calibration(tmp_path):
+def test_optimisations_start_from_the_optimum_of_an_earlier_calibration(tmp_path):
     """Draws of many parameters may all fit worse than the optimum; a folder without summary has draws alone."""
     draws = {"young_modulus": np.array([[1e6, 2e6, 3e6]])}
     info = ParameterInfo("young_modulus", "Pa", 0.0, np.inf, {}, "")

@@ -22,11 +22,7 @@ from rfdropo_bayes.verbs import check as check_verb
 from rfdropo_bayes.verbs import numerical_error
 from rfdropo_bayes.verbs.check import Check, run_check
 from rfdropo_bayes.verbs.motion_direction import Direction, Paths, direction_doubt, direction_of
-from rfdropo_bayes.verbs.numerical_error import (
-    measure_numerical_error,
-    nominal_markers,
-    numerical_error_lines,
-)
+from rfdropo_bayes.verbs.numerical_error import measure_numerical_error, nominal_markers, numerical_error_lines
 from rfdropo_bayes.verbs.placement import placement_hints
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"

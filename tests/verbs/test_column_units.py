@@ -8,13 +8,7 @@ import pytest
 
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.verbs.column_units import (
-    command_time_unit,
-    command_unit,
-    time_unit,
-    told_unit,
-    unit_of_places,
-)
+from rfdropo_bayes.verbs.column_units import command_time_unit, command_unit, time_unit, unit_in_names, unit_of_places
 
 ROWS = 161
 NOISE = np.random.default_rng(0).normal(size=(2 * ROWS, 3))
@@ -78,12 +72,12 @@ def named(*names: str, **units: str) -> CsvTable:
 
 def test_columns_may_be_in_several_units_of_one_kind():
     names = ("a_mm", "b_cm", "c_mm")
-    assert told_unit(named(*names), names) == ("mm", {"b_cm": "cm"}, "")
-    assert told_unit(named("a", "b", a="cm", b="cm"), ("a", "b")) == ("cm", {}, "")
-    assert told_unit(named("a", "b"), ("a", "b")) is None
-    assert told_unit(named("a_cm", "b"), ("a_cm", "b")).evidence == "a_cm tells it, and b tells none"
+    assert unit_in_names(named(*names), names) == ("mm", {"b_cm": "cm"}, "")
+    assert unit_in_names(named("a", "b", a="cm", b="cm"), ("a", "b")) == ("cm", {}, "")
+    assert unit_in_names(named("a", "b"), ("a", "b")) is None
+    assert unit_in_names(named("a_cm", "b"), ("a_cm", "b")).evidence == "a_cm tells it, and b tells none"
     with pytest.raises(InputError, match="a_mm in mm, b_deg in deg"):
-        told_unit(named("a_mm", "b_deg"), ("a_mm", "b_deg"))
+        unit_in_names(named("a_mm", "b_deg"), ("a_mm", "b_deg"))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.named_columns import CsvColumns
-from rfdropo_bayes.verbs.command_lag import best_delay, lag_words, left_by_rows
+from rfdropo_bayes.verbs.command_lag import best_delay, errors_by_row, lag_words
 
 TABLE = {
     "sample_time": 1.0,
@@ -36,7 +36,7 @@ def recording(lag: int, rows: int = 80, *, with_poses: bool = False) -> Trajecto
 
 @pytest.mark.parametrize("lag", [-1, 0, 1, 2])
 def test_the_row_whose_command_a_pose_shows_is_found(lag):
-    left = {each.rows: each.error for each in left_by_rows([recording(lag)])}
+    left = {each.rows: each.error for each in errors_by_row([recording(lag)])}
     assert min(left, key=lambda rows: left[rows]) == lag
     assert left[lag] < 0.2 * sorted(left.values())[1]
 

@@ -127,8 +127,7 @@ def mesh(folder: Path, bar: Path) -> Bench:
 
 
 @pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("demo", "own", "mesh")],
+    scope="module", params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("demo", "own", "mesh")]
 )
 def bench(request, tmp_path_factory, bar_mesh) -> Bench:
     folder = tmp_path_factory.mktemp(request.param)
@@ -186,16 +185,7 @@ def test_report_draws_the_same_page_again(bench) -> None:
 @pytest.mark.slow
 def test_predict_says_where_new_commands_lead(bench, tmp_path) -> None:
     rfdropo(
-        *(
-            "predict",
-            bench.experiment,
-            "--from",
-            bench.run,
-            "--commands",
-            bench.unseen,
-            "--out",
-            tmp_path / "next",
-        ),
+        *("predict", bench.experiment, "--from", bench.run, "--commands", bench.unseen, "--out", tmp_path / "next"),
         overrides=bench.overrides,
     )
     assert list((tmp_path / "next").glob("*.csv"))
@@ -249,17 +239,3 @@ def test_two_groups_of_recordings_are_compared(bench, tmp_path) -> None:
     found = json.loads((tmp_path / "days" / "audit.json").read_text())
     assert found["between"]["groups"] == {name: [f"demo_{k}[0:{ROWS}]"] for name, k in (("before", 1), ("after", 2))}
     assert (tmp_path / "days" / "report.html").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bench", ["demo"], indirect=True)
-def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
-    rfdropo(
-        *("design", bench.experiment, "--from", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
-        overrides=[*bench.overrides, "model.per_group.young_modulus=1e5"],
-    )
-    proposed = pd.read_csv(tmp_path / "day" / "next_commands.csv")
-    assert proposed["time_s"].between(0.0, 1.0).all()
-    assert np.isfinite(proposed.to_numpy()).all()
-    assert proposed.shape[1] == 5  # time and the four cables
-    assert json.loads((tmp_path / "day" / "design.json").read_text())["sentence"]

@@ -52,7 +52,7 @@ def test_a_recording_goes_through_every_verb(tmp_path):
         return rb.simulate(model, WALK | {"recordings": [name]}, parameters=truth, noise=noise, seed=seed)[0]
 
     runs = [recorded(f"first_{k}", 0.001, k) for k in range(3)]
-    method = rb.Laplace(draws=50, starts=2, screen=16)
+    method = rb.Laplace(draws=50, starts=2, prior_draws=16)
     fit = rb.calibrate(model, runs[:2], method, test=runs[2:], seed=0, show=False, out=tmp_path / "fit")
     silent = {name: value for name, value in fit.record.attrs.items() if name != INTEGRATOR}  # as earlier versions were
     earlier = replace(fit, record=replace(fit.record, attrs=silent))

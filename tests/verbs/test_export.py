@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord
+from rfdropo_bayes.posteriors import FIXED, ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import build_summary, write_summary
@@ -100,7 +100,7 @@ def test_a_model_is_written_with_what_was_fixed_for_several_elements_and_what_th
     info = ParameterInfo("mass", "kg", 0.01, 10.0)
     draws = {"mass": np.full((1, 4), 0.06)}
     PosteriorRecord(
-        (info,), draws, attrs={HELD: [{"parameter": ParameterInfo("stiffness", "-").as_dict(), "value": 0.3}]}
+        (info,), draws, attrs={FIXED: [{"parameter": ParameterInfo("stiffness", "-").as_dict(), "value": 0.3}]}
     ).save(tmp_path / POSTERIOR)
     written = mujoco.MjModel.from_xml_path(str(export_model(tmp_path)))
     np.testing.assert_allclose(written.dof_damping, 0.02)

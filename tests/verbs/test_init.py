@@ -75,7 +75,7 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.commands == [f"motor{k}" for k in range(1, 5)]
     assert guess.tensions == [f"tension{k}" for k in range(1, 5)]
     assert guess.motor_angles == [f"motor{k}_meas" for k in range(1, 5)]
-    assert guess.left == ["battery"]
+    assert guess.unused == ["battery"]
 
 
 def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(tmp_path):
@@ -183,7 +183,7 @@ def test_the_unit_of_times_is_told_by_their_name_or_size(tmp_path, name, factor,
     run.to_csv(tmp_path / "run.csv", index=False)
     guess = guess_columns(tmp_path / "run.csv")
     assert (guess.time, guess.time_unit) == (name, unit)
-    assert name not in guess.left
+    assert name not in guess.unused
 
 
 def test_dates_are_times(tmp_path):

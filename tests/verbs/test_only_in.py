@@ -45,7 +45,7 @@ def fit(runs, tmp_path_factory):
     out = tmp_path_factory.mktemp("fit") / "run"
     model = model_of(per_group={"zero": 0.02})
     unseen = recorded({"april_tested": DELAY, "june_tested": 0.0}, 20)
-    rb.calibrate(model, runs, rb.Laplace(draws=100, starts=2, screen=16), test=unseen, out=out, show=False)
+    rb.calibrate(model, runs, rb.Laplace(draws=100, starts=2, prior_draws=16), test=unseen, out=out, show=False)
     return rb.load(out, model=model)
 
 
@@ -108,7 +108,7 @@ def test_a_day_that_is_adapted_to_is_without(fit):
 def test_another_recording_of_a_fitted_group_keeps_the_value_of_the_group(runs):
     """Its zero is its own; the delay is that of its group, which 0.3 s do not show."""
     model = model_of(per_recording={"zero": "all"})
-    fit = rb.calibrate(model, runs, rb.Laplace(draws=60, starts=1, screen=16), show=False)
+    fit = rb.calibrate(model, runs, rb.Laplace(draws=60, starts=1, prior_draws=16), show=False)
     (april,) = recorded({"april_new": DELAY}, 30)
     found = rb.adapt(fit, april, seconds=0.3, draws=30, show=False)
     np.testing.assert_allclose(found.record.flat("command_delay@april").mean(), DELAY, atol=0.003)
@@ -129,7 +129,7 @@ def test_the_file_that_an_audit_writes_is_calibrated_with_the_mechanism_in_its_g
     tables = tomllib.loads((tmp_path / "audit" / "extended.toml").read_text())["model"]
     assert tables["only_in"] == {"command_delay": ["april"]}
     model = rb.Model(BOX, **tables)
-    fit = rb.calibrate(model, known, rb.Laplace(draws=60, starts=1, screen=16), show=False)
+    fit = rb.calibrate(model, known, rb.Laplace(draws=60, starts=1, prior_draws=16), show=False)
     names = [info.name for info in fit.record.free if info.name.startswith("command_delay")]
     assert names == ["command_delay@april"]
     assert fit.record.flat(names[0]).mean() == pytest.approx(DELAY, abs=0.003)
@@ -160,7 +160,7 @@ def test_the_law_of_one_group_that_an_audit_writes_is_calibrated_and_predicted_t
     tables = tomllib.loads((tmp_path / "audit" / "extended.toml").read_text())["model"]
     ((name, groups),) = tables["only_in"].items()
     assert groups == ["april"]
-    fit = rb.calibrate(rb.Model(BOX, **tables), known, rb.Laplace(draws=60, starts=1, screen=16), show=False)
+    fit = rb.calibrate(rb.Model(BOX, **tables), known, rb.Laplace(draws=60, starts=1, prior_draws=16), show=False)
     assert [info.name for info in fit.record.free if info.name.startswith("law")] == [f"{name}@april"]
     assert fit.record.flat(f"{name}@april").mean() == pytest.approx(15.0, abs=1.0)
     for run in shown(["april_new", "june_new"], 30):

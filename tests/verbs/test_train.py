@@ -19,12 +19,12 @@ from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.posteriors import HELD, ParameterInfo, PosteriorRecord, Scope
+from rfdropo_bayes.posteriors import FIXED, ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
-from rfdropo_bayes.verbs.train import _summary, _tension_facts, learnt
+from rfdropo_bayes.verbs.train import _summary, _tension_facts, training_sentence
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -95,7 +95,12 @@ def test_a_policy_is_trained_under_a_calibration_with_one_command(tmp_path) -> N
     runs = rb.read("virtual/reach_1.nc", folder=REPOSITORY / "experiments")
     model = rb.Model("virtual_trunk", priors={"young_modulus": {}}, noise="white", simulator=SINGLE)
     rb.calibrate(
-        model, runs, rb.Laplace(starts=1, screen=4, max_steps=3, draws=16), seed=0, show=False, out=tmp_path / "fit"
+        model,
+        runs,
+        rb.Laplace(starts=1, prior_draws=4, max_steps=3, draws=16),
+        seed=0,
+        show=False,
+        out=tmp_path / "fit",
     )
     settings = [part for entry in [*QUICK, 'training.critic="parameters"'] for part in ("--set", entry)]
     told = rfdropo("train", "--from", tmp_path / "fit", "--task", "reach", "--goal", "0.01,-0.03,0.13", *settings)
@@ -156,7 +161,7 @@ def test_a_summary_is_json_where_episodes_have_no_end() -> None:
 )
 def test_what_was_learnt_does_not_take_a_few_stopped_episodes_for_most(ends, words) -> None:
     pull = {"tension_median": 1.0, "tension_largest": 6.0, "tension_stopped": 7}
-    told = learnt(summary_of(distance_median=ends[0], distance_q95=ends[1], failed=1, **pull))
+    told = training_sentence(summary_of(distance_median=ends[0], distance_q95=ends[1], failed=1, **pull))
     assert told.startswith(words)
     assert told.endswith("the limit of 5 N stopped 7 of them.")
 
@@ -286,7 +291,7 @@ def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
     held = {"trunk_mass": 0.31, "observation_noise": 1e-3}
     modulus = ParameterInfo("young_modulus", "Pa", 1e4, 1e9, {}, "stiffness")
     record = PosteriorRecord(
-        (modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={HELD: [held_at(*each) for each in held.items()]}
+        (modulus,), {"young_modulus": np.full((1, 3), 2e6)}, attrs={FIXED: [held_at(*each) for each in held.items()]}
     )
     record.save(tmp_path / "posterior.nc")
     normal = {"mean": 2e6, "std": 1e4, "low": 1.9e6, "high": 2.1e6, "unit": "Pa"}

@@ -12,7 +12,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.verbs.unsafe_posterior import posterior_caution
 
-UNSAFE = {"verdict": "unsafe", "reasons": ["the best climb stopped", "second", "third", "fourth"]}
+UNSAFE = {"verdict": "unsafe", "reasons": ["the best optimisation stopped", "second", "third", "fourth"]}
 CAREFUL = {"verdict": "with care", "reasons": ["no recording was kept back to test it on"]}
 MODEL = '[model]\nnoise = "white"\n'
 TILTED = '[model]\nmechanisms = ["base_tilt"]\n'
@@ -35,7 +35,7 @@ def test_a_calibration_that_its_own_record_calls_unsafe_is_warned_of_and_no_othe
     found = posterior_caution(folder)
     assert found is not None
     assert found.code is Code.UNSAFE_POSTERIOR
-    assert "the best climb stopped; second; third. " in found.sentence
+    assert "the best optimisation stopped; second; third. " in found.sentence
     assert posterior_caution(folder / "posterior.nc") == found
     assert found.sentence.endswith("or draw wider with [training] width")
     assert str(posterior_caution(folder, 3.0)).count("Width 3 may make up") == 1

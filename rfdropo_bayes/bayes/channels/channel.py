@@ -20,27 +20,17 @@ from rfdropo_bayes.simulators.protocol import Observation
 
 
 class Seen(NamedTuple):
-    """Simulated observations under a set of values.
+    """Simulated observations under a set of values."""
 
-    Attributes:
-        observation: observations of every recording, with a leading axis over recordings.
-        values: all parameters by name, inferred and fixed.
-        offset: shift of measured against simulated positions in each recording [m].
-    """
-
-    observation: Observation
-    values: Mapping[str, Any]
-    offset: Float[Any, "recording 3"]
+    observation: Observation  # observations of every recording, with a leading axis over recordings
+    values: Mapping[str, Any]  # all parameters by name, inferred and fixed
+    offset: Float[Any, "recording 3"]  # shift of measured against simulated positions in each recording [m]
 
 
 class Channel(ABC):
-    """One kind of measurement; a model's log likelihood is the sum over its channels.
+    """One kind of measurement; a model's log likelihood is the sum over its channels."""
 
-    Attributes:
-        name: name of its data.
-    """
-
-    name: ClassVar[str]
+    name: ClassVar[str]  # name of its data
 
     @property
     @abstractmethod
@@ -69,18 +59,12 @@ class Channel(ABC):
 
 @dataclass(frozen=True)
 class Series(Channel):
-    """A channel with readings in every row of every recording.
+    """A channel with readings in every row of every recording."""
 
-    Attributes:
-        readings: readings, zero if missing.
-        valid: mask of the valid columns of an error (`deviation`).
-        linear: whether errors are readings less simulated values, without a nonlinear map.
-        known: its noise in these recordings if stated or estimated; None if its parameters are inferred.
-    """
-
-    linear: ClassVar[bool]
-    readings: Float[Any, "recording time *reading"]
-    valid: Bool[np.ndarray, "recording time column"]
+    linear: ClassVar[bool]  # whether errors are readings less simulated values, without a nonlinear map
+    readings: Float[Any, "recording time *reading"]  # readings, zero if missing
+    valid: Bool[np.ndarray, "recording time column"]  # mask of the valid columns of an error (`deviation`)
+    # its noise in these recordings if stated or estimated; None if its parameters are inferred
     known: Autoregression | None = None
 
     @property
@@ -186,13 +170,9 @@ class Series(Channel):
 
 
 class WhiteSeries(Series):
-    """A channel whose inferred noise is white with a single standard deviation.
+    """A channel whose inferred noise is white with a single standard deviation."""
 
-    Attributes:
-        size: standard deviation of an error.
-    """
-
-    size: ClassVar[ParameterSpec]
+    size: ClassVar[ParameterSpec]  # standard deviation of an error
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
@@ -242,17 +222,17 @@ def padded_readings(
     Raises:
         InputError: a recording without readings that needs them.
     """
-    found: list[tuple[np.ndarray, ...]] = []
+    parts: list[tuple[np.ndarray, ...]] = []
     for index, trajectory in enumerate(trajectories):
         own = read(trajectory)
         if own is not None:
-            found.append(tuple(np.pad(part, ((0, length - len(part)), (0, 0))) for part in own))
+            parts.append(tuple(np.pad(part, ((0, length - len(part)), (0, 0))) for part in own))
         elif needed is not None and index >= needed:
-            found.append(tuple(np.zeros_like(part) for part in found[0]))
+            parts.append(tuple(np.zeros_like(part) for part in parts[0]))
         else:
             remedy = f"leave [model] {key} = true out, or record them"
             raise InputError(f"has no {words}", where=trajectory.name, remedy=remedy)
-    measured, valid = zip(*found, strict=True)
+    measured, valid = zip(*parts, strict=True)
     return np.stack(measured), np.stack(valid)
 
 

@@ -34,17 +34,12 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 @dataclass(frozen=True, kw_only=True)
 class Markers(Series):
-    """Positions of the markers [m], (recording, time, marker, 3); a column is one coordinate of one marker.
-
-    Attributes:
-        recordings: recordings with these positions.
-        model: name of the noise model, one of `NOISE_MODELS`; of known noise its source.
-    """
+    """Positions of the markers [m], (recording, time, marker, 3); a column is one coordinate of one marker."""
 
     name: ClassVar[str] = "markers"
     linear: ClassVar[bool] = True
-    recordings: RecordingSet
-    model: str = "auto"
+    recordings: RecordingSet  # recordings with these positions
+    model: str = "auto"  # name of the noise model, one of `NOISE_MODELS`; of known noise its source
 
     @classmethod
     def gather(cls, recordings: RecordingSet, model: str, known: Autoregression | None = None) -> Markers:

@@ -26,11 +26,9 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-OFFSETS = ("offset_x", "offset_y", "offset_z")
-"""Parameters that shift measured against simulated positions [m]."""
+OFFSETS = ("offset_x", "offset_y", "offset_z")  # parameters that shift measured against simulated positions [m]
 
-LEVER = 0.02
-"""[m] Distance from the centre of the point whose path stands for a turn among the features."""
+LEVER = 0.02  # [m] Distance from the centre of the point whose path stands for a turn among the features
 
 OBJECT_NOISE = ParameterSpec(
     "object_noise",
@@ -80,18 +78,13 @@ class ObjectPose(Series):
     """Poses of the pushed body: centre [m] and unit quaternion (x, y, z, w); columns are centre and turn.
 
     The first pose is the start of the body and is not predicted.
-
-    Attributes:
-        line: rows with a pose and their predecessors, as for a single marker.
-        time: observation times [s].
-        lasting: whether its inferred noise is correlated in time.
     """
 
     name: ClassVar[str] = "object_pose"
     linear: ClassVar[bool] = False
-    line: Timeline
-    time: Float[np.ndarray, "recording time"]
-    lasting: bool = True
+    line: Timeline  # rows with a pose and their predecessors, as for a single marker
+    time: Float[np.ndarray, "recording time"]  # observation times [s]
+    lasting: bool = True  # whether its inferred noise is correlated in time
 
     @classmethod
     def gather(

@@ -96,15 +96,15 @@ class Orientation(WhiteSeries):
         Raises:
             InputError: a simulator without section orientations.
         """
-        found = seen.observation.orientation
-        if found is None:
+        simulated = seen.observation.orientation
+        if simulated is None:
             raise InputError(
                 "the simulator has no section orientations",
                 where="[model] orientation",
                 remedy="leave it out, or use a body that is a rod",
             )
         turn = jnp.stack([jnp.asarray(seen.values.get(spec.name, 0.0), float) for spec in FRAME_TURNS])
-        turned = product(of_rotation_vector(turn), jnp.asarray(found)[:, :, list(self.sections)])
+        turned = product(of_rotation_vector(turn), jnp.asarray(simulated)[:, :, list(self.sections)])
         return turned.reshape(*turned.shape[:2], -1)
 
     def deviation(

@@ -48,15 +48,12 @@ class Tension(WhiteSeries):
 
     This is the size of the true tension, not of its reading. Otherwise low readings would count more than high
     readings, and bias all forces down by twice the square of the relative error.
-
-    Attributes:
-        cables: indices of the measured cables.
     """
 
     name: ClassVar[str] = "tension"
     linear: ClassVar[bool] = False
     size: ClassVar[ParameterSpec] = TENSION_NOISE
-    cables: Int[np.ndarray, " cable"]
+    cables: Int[np.ndarray, " cable"]  # indices of the measured cables
 
     @classmethod
     def gather(

@@ -23,17 +23,11 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Weighed(NamedTuple):
-    """A parameter, or the sum of several, known from a measurement of its own.
+    """A parameter, or the sum of several, known from a measurement of its own."""
 
-    Attributes:
-        parameters: names; their sum was measured.
-        value: measured value in their unit.
-        sd: its standard deviation.
-    """
-
-    parameters: tuple[str, ...]
-    value: float
-    sd: float
+    parameters: tuple[str, ...]  # names; their sum was measured
+    value: float  # measured value in their unit
+    sd: float  # its standard deviation
 
 
 @dataclass(frozen=True)
@@ -52,7 +46,8 @@ class WeighedParts(Channel):
             InputError: a part that is no inferred parameter, or one of several.
         """
         entries = (
-            entry._replace(parameters=tuple(_found(p, inferred) for p in entry.parameters)) for entry in self.entries
+            entry._replace(parameters=tuple(_inferred_name(p, inferred) for p in entry.parameters))
+            for entry in self.entries
         )
         return replace(self, entries=tuple(entries))
 
@@ -87,7 +82,7 @@ class WeighedParts(Channel):
         return self._sums(seen.values) + self._sd * jax.random.normal(key, (len(self.entries),))
 
 
-def _found(name: str, inferred: Sequence[ParameterInfo]) -> str:
+def _inferred_name(name: str, inferred: Sequence[ParameterInfo]) -> str:
     """The label of the inferred parameter that is meant."""
     names = [p.name for p in inferred]
     pieces = [p.name for p in inferred if p.scope.owner and label(p.parameter, whole(p.scope.owner)) == name]

@@ -36,26 +36,20 @@ LEAST_ROWS = 3  # for each column, to estimate correlations at all
 
 @dataclass(frozen=True)
 class Autoregression:
-    """Stationary AR(p) noise with one memory for all columns.
+    """Stationary AR(p) noise with one memory for all columns."""
 
-    Attributes:
-        scale: marginal standard deviation of each column, in the column's unit.
-        autocorrelation: values at lags 0 ... p; its length gives the order.
-        source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's
-            residuals are noise of such a process).
-        freedom: degrees of freedom of the variance; infinite if stated.
-        correlation: correlation of the columns at one time; None if they are independent.
-        step: time between rows [s] that the lags count; None if unknown, and rows of any rate count equally.
-        paces: time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then
-            have an axis of these recordings before the time axis.
-    """
-
-    scale: Float[np.ndarray, " column"]
-    autocorrelation: Float[np.ndarray, " lag"]
+    scale: Float[np.ndarray, " column"]  # marginal standard deviation of each column, in the column's unit
+    autocorrelation: Float[np.ndarray, " lag"]  # values at lags 0 ... p; its length gives the order.
+    # "repeats" (pure error), "stated" (in the experiment file) or "residuals" (assumes that the base model's residuals
+    # are noise of such a process)
     source: str
-    freedom: float
+    freedom: float  # degrees of freedom of the variance; infinite if stated
+    # correlation of the columns at one time; None if they are independent
     correlation: Float[np.ndarray, "column column"] | None = None
+    # time between rows [s] that the lags count; None if unknown, and rows of any rate count equally
     step: float | None = None
+    # time between the rows of each recording, in steps; None if all have the rate of ``step``. Series then have an axis
+    # of these recordings before the time axis.
     paces: tuple[float, ...] | None = None
 
     @property
@@ -90,8 +84,8 @@ class Autoregression:
         """The same noise in recordings with the given seconds between rows."""
         if self.step is None or not self.order:
             return self
-        found = tuple(_pace(float(step) / self.step, np) for step in steps)
-        paces = None if set(found) <= {1.0} else found
+        every = tuple(_pace(float(step) / self.step, np) for step in steps)
+        paces = None if set(every) <= {1.0} else every
         return self if paces == self.paces else replace(self, paces=paces)
 
     def resampled(self, step: float) -> Autoregression:
@@ -108,9 +102,9 @@ class Autoregression:
     def as_dict(self) -> dict[str, Any]:
         """As plain values without recordings; `from_dict` is the inverse."""
         arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
-        found = {name: None if array is None else array.tolist() for name, array in arrays.items()}
+        values = {name: None if array is None else array.tolist() for name, array in arrays.items()}
         freedom = self.freedom if np.isfinite(self.freedom) else None
-        return {**found, "source": self.source, "freedom": freedom, "step": self.step}
+        return {**values, "source": self.source, "freedom": freedom, "step": self.step}
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> Autoregression:
@@ -175,11 +169,11 @@ class Autoregression:
         """Logarithms that normalise the density of `whiten`: zero if not valid; their sum is half the log determinant
         of the covariance. The effect of correlation is divided equally between a row's columns.
         """
-        found = np.log(self._prediction(valid)[1] * self.scale)
+        logarithm = np.log(self._prediction(valid)[1] * self.scale)
         if self.correlation is not None:
             shared = half_log_determinant(self.correlation, valid)
-            found = found + (shared / np.maximum(valid.sum(axis=-1), 1))[..., None]
-        return np.where(valid, found, 0.0)
+            logarithm = logarithm + (shared / np.maximum(valid.sum(axis=-1), 1))[..., None]
+        return np.where(valid, logarithm, 0.0)
 
     def innovations(
         self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
@@ -239,8 +233,8 @@ class Autoregression:
         memory = np.minimum(np.arange(rows), self.order)
 
         def advance(last: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-            share, spread, fresh = row
-            now = share @ last + spread * fresh
+            share, scale, fresh = row
+            now = share @ last + scale * fresh
             return jnp.concatenate([now[None], last[:-1]]), now
 
         before = jnp.zeros((coefficients.shape[1], len(self.scale)))
@@ -411,12 +405,12 @@ def mixed(
     patterns, which = _patterns(valid)
     if len(patterns) == 1 and patterns[0].all():
         return used @ _power(correlation, power)
-    found = numbers.zeros_like(used)
+    result = numbers.zeros_like(used)
     for index, pattern in enumerate(patterns):
         root = np.zeros_like(correlation)
         root[np.ix_(pattern, pattern)] = _power(correlation[np.ix_(pattern, pattern)], power)
-        found = numbers.where((which == index)[..., None], used @ root, found)
-    return found
+        result = numbers.where((which == index)[..., None], used @ root, result)
+    return result
 
 
 def half_log_determinant(

@@ -83,17 +83,11 @@ LONG_AGO = 1e6
 
 
 class Timeline(NamedTuple):
-    """For every row and marker: is it valid, which valid row came before it, and how long ago.
+    """For every row and marker: is it valid, which valid row came before it, and how long ago."""
 
-    Attributes:
-        valid: False for masked positions.
-        previous: index of the last valid row before; its own index if there is none.
-        gap: time since then [s]; `LONG_AGO` if there is none.
-    """
-
-    valid: Bool[np.ndarray, "time marker"]
-    previous: Int[np.ndarray, "time marker"]
-    gap: Float[np.ndarray, "time marker"]
+    valid: Bool[np.ndarray, "time marker"]  # False for masked positions
+    previous: Int[np.ndarray, "time marker"]  # index of the last valid row before; its own index if there is none
+    gap: Float[np.ndarray, "time marker"]  # time since then [s]; `LONG_AGO` if there is none
 
 
 def timeline(time: Float[np.ndarray, " time"], valid: Bool[np.ndarray, "time marker"]) -> Timeline:
@@ -106,20 +100,15 @@ def timeline(time: Float[np.ndarray, " time"], valid: Bool[np.ndarray, "time mar
 
 
 class Noise(NamedTuple):
-    """Values of a noise model; absent parts are None.
+    """Values of a noise model; absent parts are None."""
 
-    Attributes:
-        sigma: standard deviation [m] of one coordinate of one marker: of the white part, or of all noise if there is no
-            correlated part. For heavy-tailed noise half the width of the central 68 %, which tails do not change.
-        tau: correlation time [s] of the correlated part; None for independent rows.
-        lasting: standard deviation [m] of the correlated part beside a white part; None if all noise is correlated.
-        degrees: degrees of freedom of a Student-t; None for normal noise.
-    """
-
+    # standard deviation [m] of one coordinate of one marker: of the white part, or of all noise if there is no
+    # correlated part. For heavy-tailed noise half the width of the central 68 %, which tails do not change.
     sigma: Any
-    tau: Any = None
+    tau: Any = None  # correlation time [s] of the correlated part; None for independent rows
+    # standard deviation [m] of the correlated part beside a white part; None if all noise is correlated
     lasting: Any = None
-    degrees: Any = None
+    degrees: Any = None  # degrees of freedom of a Student-t; None for normal noise
 
     @property
     def deviation(self) -> Any:
@@ -213,8 +202,8 @@ def _filtered(
         surprise = value - phi[:, None] * mean
         gain = (power - short_now) / variance
         updated = phi[:, None] * mean + gain[:, None] * surprise
-        left = power - white * gain
-        state = jnp.where(valid[:, None], updated, mean), jnp.where(valid, left, short)
+        remaining = power - white * gain
+        state = jnp.where(valid[:, None], updated, mean), jnp.where(valid, remaining, short)
         return state, (surprise / jnp.sqrt(variance)[:, None], jnp.sqrt(variance))
 
     nothing = jnp.zeros(residual.shape[1:]), jnp.zeros(residual.shape[1])
@@ -252,8 +241,8 @@ def _lasting(
     phi, scale = jnp.exp(-gap / tau), _innovation(sigma, gap, tau)
 
     def advance(last: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        coefficient, spread, innovation = row
-        now = coefficient * last + spread * innovation
+        coefficient, size, innovation = row
+        now = coefficient * last + size * innovation
         return now, now
 
     return jax.lax.scan(advance, jnp.zeros((markers, 3)), (phi, scale, white))[1]

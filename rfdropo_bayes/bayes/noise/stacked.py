@@ -14,13 +14,9 @@ from rfdropo_bayes.bayes.noise.autoregression import Autoregression
 
 @dataclass(frozen=True)
 class Stacked:
-    """Noise of columns that belong to several channels.
+    """Noise of columns that belong to several channels."""
 
-    Attributes:
-        parts: one for each channel, the markers' first.
-    """
-
-    parts: tuple[Autoregression, ...]
+    parts: tuple[Autoregression, ...]  # one for each channel, the markers' first
 
     @property
     def first(self) -> Autoregression:

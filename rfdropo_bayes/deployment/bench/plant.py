@@ -24,16 +24,11 @@ _END = 5.0  # [s]: for the present step, and for the clean-up of its libraries
 
 
 class PlantState(NamedTuple):
-    """Measurable state of a plant.
+    """Measurable state of a plant."""
 
-    Attributes:
-        tension: tension of each channel's cable [N].
-        position: positions of the markers in the robot's base frame [m].
-        object_pose: centre [m] and unit quaternion x, y, z, w of the pushed object; None without an object.
-    """
-
-    tension: Float[np.ndarray, " channel"]
-    position: Float[np.ndarray, "marker 3"]
+    tension: Float[np.ndarray, " channel"]  # tension of each channel's cable [N]
+    position: Float[np.ndarray, "marker 3"]  # positions of the markers in the robot's base frame [m]
+    # centre [m] and unit quaternion x, y, z, w of the pushed object; None without an object
     object_pose: Float[np.ndarray, "7"] | None = None
 
 

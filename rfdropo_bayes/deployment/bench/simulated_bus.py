@@ -39,30 +39,19 @@ MAGIC = b"RFMK"
 
 
 class SimulationTable(NamedTuple):
-    """Settings of a simulation.
+    """Settings of a simulation."""
 
-    Attributes:
-        robot: name or path of a robot with motors.
-        bus: the bus that the drives are on.
-        plant, settings: see `build_plant`.
-        own_process: whether the plant runs in its own process.
-        markers: "HOST:PORT" that markers are sent to; empty for none.
-        encoder_offset: counts that every encoder shows at length zero, less the motor's own offset.
-        start_length_m: cable on every drum at power-on.
-        values: entries of every node's dictionary, as for `SimulatedNode`.
-        eds: data sheet of the drives.
-    """
-
-    robot: str
-    bus: BusTable
+    robot: str  # name or path of a robot with motors
+    bus: BusTable  # the bus that the drives are on
+    # plant, settings: see `build_plant`
     plant: str = "springs"
     settings: Mapping[str, Any] = {}
-    own_process: bool = False
-    markers: str = ""
-    encoder_offset: int = 0
-    start_length_m: float = 0.0
-    values: Mapping[tuple[int, int], int] = {}
-    eds: str = str(objects.SIMULATED_EDS)
+    own_process: bool = False  # whether the plant runs in its own process
+    markers: str = ""  # "HOST:PORT" that markers are sent to; empty for none
+    encoder_offset: int = 0  # counts that every encoder shows at length zero, less the motor's own offset
+    start_length_m: float = 0.0  # cable on every drum at power-on
+    values: Mapping[tuple[int, int], int] = {}  # entries of every node's dictionary, as for `SimulatedNode`
+    eds: str = str(objects.SIMULATED_EDS)  # data sheet of the drives
 
 
 class SimulatedDrives:

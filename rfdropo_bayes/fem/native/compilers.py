@@ -70,14 +70,14 @@ def _ours() -> Compilers:
     return Compilers(OURS, deferred, whole)
 
 
-def _tried(found: Compilers) -> Compilers:
+def _tried(compilers: Compilers) -> Compilers:
     """The same compilers, after they have compiled a function within a function within a kernel, and it ran rightly."""
-    square = found.part(lambda value: value * value, no_cpython_wrapper=True)
-    shifted = found.part(lambda value: square(value) + 1.0, no_cpython_wrapper=True)
-    total = found.whole(lambda value: shifted(value) + square(value))(3.0)
+    square = compilers.part(lambda value: value * value, no_cpython_wrapper=True)
+    shifted = compilers.part(lambda value: square(value) + 1.0, no_cpython_wrapper=True)
+    total = compilers.whole(lambda value: shifted(value) + square(value))(3.0)
     if total != 19.0:
         raise ValueError(f"a trial kernel returned {total} for 19")
-    return found
+    return compilers
 
 
 COMPILERS = chosen_compilers(os.environ.get(VARIABLE), numba.__version__)

@@ -62,13 +62,13 @@ class KernelCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kernel for a signature; None if this process has to compile it."""
-        found = super().load_overload(sig, target_context)
-        if found is None:
+        kernel = super().load_overload(sig, target_context)
+        if kernel is None:
             self._wait()
-            found = super().load_overload(sig, target_context)
-            if found is not None:
+            kernel = super().load_overload(sig, target_context)
+            if kernel is not None:
                 self._let_others()
-        return found
+        return kernel
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what was compiled."""

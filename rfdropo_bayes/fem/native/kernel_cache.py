@@ -25,19 +25,19 @@ IMPORT = re.compile(rb"^from (\S+) import", re.MULTILINE)
 def kernel_sources(module: str) -> str:
     """Digest of a module of kernels, of all modules of kernels that it imports, directly or not, and of the modules
     that these take their constants from; and of the compiler that is used."""
-    found: dict[str, bytes] = {}
+    sources: dict[str, bytes] = {}
     waiting = [f"{__package__}.{module}"]
     while waiting:
         name = waiting.pop()
         path = PACKAGE.joinpath(*name.split(".")[1:]).with_suffix(".py")
-        if name in found or not path.is_file():
+        if name in sources or not path.is_file():
             continue
-        found[name] = path.read_bytes()
-        if KERNELS not in found[name]:
+        sources[name] = path.read_bytes()
+        if KERNELS not in sources[name]:
             continue
-        waiting.extend(module for match in IMPORT.findall(found[name]) if (module := match.decode()).startswith(OWN))
+        waiting.extend(module for match in IMPORT.findall(sources[name]) if (module := match.decode()).startswith(OWN))
     compiler = COMPILERS.name.encode()
-    return hashlib.sha256(b"".join(found[name] for name in sorted(found)) + compiler).hexdigest()
+    return hashlib.sha256(b"".join(sources[name] for name in sorted(sources)) + compiler).hexdigest()
 
 
 def named_by(sources: str) -> Callable[[Callable], Callable]:

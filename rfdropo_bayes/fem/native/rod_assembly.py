@@ -17,14 +17,7 @@ by h.
 from __future__ import annotations
 
 from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL
-from rfdropo_bayes.fem.native.rod_effects import (
-    BENDING,
-    BRANCH,
-    LOADED,
-    add_branch,
-    find_slopes,
-    place_law_stress,
-)
+from rfdropo_bayes.fem.native.rod_effects import BENDING, BRANCH, LOADED, add_branch, find_slopes, place_law_stress
 from rfdropo_bayes.fem.native.rod_records import (
     ALONG,
     BOW,
@@ -53,18 +46,7 @@ from rfdropo_bayes.fem.native.simd import (
     store,
     where_greater,
 )
-from rfdropo_bayes.fem.native.vectors import (
-    add_to,
-    added,
-    combined,
-    components,
-    cross,
-    dot,
-    minus,
-    plus,
-    put,
-    scaled,
-)
+from rfdropo_bayes.fem.native.vectors import add_to, added, combined, components, cross, dot, minus, plus, put, scaled
 
 
 @kernel

@@ -17,12 +17,7 @@ from rfdropo_bayes.fem.native.rod_assembly import measure_element
 from rfdropo_bayes.fem.native.rod_constraints import constrained_stage
 from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED, follow_branch
 from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
-from rfdropo_bayes.fem.native.rod_statics import (
-    come_to_rest,
-    keep_found,
-    measure_imbalance,
-    put_at_rest,
-)
+from rfdropo_bayes.fem.native.rod_statics import come_to_rest, keep_found, measure_imbalance, put_at_rest
 from rfdropo_bayes.fem.native.rod_step import predict_stations, set_factors
 from rfdropo_bayes.fem.native.rod_tables import FRAME, INNER, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
@@ -99,10 +94,7 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         moduli=3, density=1, scale=elements, point_mass=stations, section=SECTION * elements, inner=INNER * elements,
         gravity=3, damping=2, law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
-    state = dict.fromkeys(
-        ("velocity", "solution", "field", "before", "sudden", "branch", "stress"),
-        stations * SIZE,
-    )
+    state = dict.fromkeys(("velocity", "solution", "field", "before", "sudden", "branch", "stress"), stations * SIZE)
     once = (
         "unsolved", "accepted", "lost", "failed", "moving", "largest", "pace", "solves", "imbalance", "softness",
         "firmness", "loss",

@@ -127,10 +127,10 @@ class RodSession:
         known = self._equilibria if settles else OrderedDict()
         first = {key: row for row, key in reversed(list(enumerate(keys))) if key not in known}
         fresh = self._settled(_taken(run, list(first.values())))
-        found = {key: known[key] for key in keys if key in known}
-        found |= {key: jax.tree.map(itemgetter(row), fresh) for row, key in enumerate(first)}
-        self._remember(known, found)
-        lanes = jax.tree.map(lambda *parts: np.stack(parts), *(found[key] for key in keys))
+        cached = {key: known[key] for key in keys if key in known}
+        cached |= {key: jax.tree.map(itemgetter(row), fresh) for row, key in enumerate(first)}
+        self._remember(known, cached)
+        lanes = jax.tree.map(lambda *parts: np.stack(parts), *(cached[key] for key in keys))
         pose = None
         if run.cubes is not None:
             lanes, pose = self._with_cubes(lanes, run.cubes), np.asarray(run.cubes.state[:, None, :7], float)
@@ -138,11 +138,7 @@ class RodSession:
         return lanes.motion._replace(pose=pose)
 
     def advance(
-        self,
-        drive: Float[np.ndarray, "lane steps drives"],
-        *,
-        stride: int = 1,
-        loads: SectionLoads | None = None,
+        self, drive: Float[np.ndarray, "lane steps drives"], *, stride: int = 1, loads: SectionLoads | None = None
     ) -> Motion:
         """Take steps to the drives at their ends, under the loads of each step; recorded before the
         first, and every ``stride``.
@@ -236,9 +232,9 @@ class RodSession:
                 lanes.state[:, place.first : place.last] = fields[place.name]
         return lanes
 
-    def _remember(self, known: OrderedDict[bytes, _SessionLane], found: dict[bytes, _SessionLane]) -> None:
+    def _remember(self, known: OrderedDict[bytes, _SessionLane], results: dict[bytes, _SessionLane]) -> None:
         """Cache the latest results within the reserved memory."""
-        for key, lane in found.items():
+        for key, lane in results.items():
             known[key] = lane
             known.move_to_end(key)
         most = REMEMBERED // (self.memory.shape[1] * self.engine.dtype.itemsize)

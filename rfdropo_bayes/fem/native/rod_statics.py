@@ -15,17 +15,7 @@ from rfdropo_bayes.fem.native.rod_constraints import hold
 from rfdropo_bayes.fem.native.rod_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.rod_step import condense_increment, gather_cables, move_stations, near, place_directors
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
-from rfdropo_bayes.fem.native.simd import (
-    any_greater,
-    fill,
-    fma,
-    fnma,
-    kernel,
-    load,
-    magnitude,
-    store,
-    where_greater,
-)
+from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, kernel, load, magnitude, store, where_greater
 from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_row, sum_losses
 
 UNBOUNDED = 1e30

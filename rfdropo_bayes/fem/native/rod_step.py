@@ -5,20 +5,9 @@
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.chain_cholesky import (
-    BLOCK,
-    PANEL,
-    combine_border,
-    eliminate,
-    substitute_back,
-)
+from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL, combine_border, eliminate, substitute_back
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.rod_assembly import (
-    add_going,
-    add_station_loads,
-    add_station_mass,
-    assemble_element,
-)
+from rfdropo_bayes.fem.native.rod_assembly import add_going, add_station_loads, add_station_mass, assemble_element
 from rfdropo_bayes.fem.native.rod_effects import GAIN, GIVE, SHARE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
 from rfdropo_bayes.fem.native.simd import (

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression, estimate_noise
 from rfdropo_bayes.bayes.problem import ResidualProblem
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.modes.targets import Target
 
 WIDER = 1.2  # by a fifth
@@ -58,17 +58,11 @@ class CountedProblem(ResidualProblem, Protocol):
 
 
 class Lasting(NamedTuple):
-    """Statistics of a channel's residuals at an optimum, which correct its likelihood.
+    """Statistics of a channel's residuals at an optimum, which correct its likelihood."""
 
-    Attributes:
-        share: weight of a row; 1 for uncorrelated residuals.
-        rows: correlation time of residuals, in rows; 1 if uncorrelated.
-        widened: errors in rows left out of the fit over residuals, per column.
-    """
-
-    share: float
-    rows: float
-    widened: Float[np.ndarray, " column"]
+    share: float  # weight of a row; 1 for uncorrelated residuals
+    rows: float  # correlation time of residuals, in rows; 1 if uncorrelated
+    widened: Float[np.ndarray, " column"]  # errors in rows left out of the fit over residuals, per column
 
 
 def lasting_residuals(problem: CountedProblem, target: Target, mode: Laplace) -> dict[str, Lasting]:

@@ -12,19 +12,17 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from numpyro.diagnostics import effective_sample_size
-from scipy.special import softmax
 
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 
-MIXTURES = ("equal", "evidence", "best")
 CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
 STRONG = 3.0  # nats by which it must also be worse: less is no strong evidence under any noise (Kass & Raftery 1995)
 
 
-def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
+def alternatives(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
     """Mask of the optima that explain the data about as well as the best, from the log density of rows.
 
     An optimum is excluded if its sum over rows is lower by more than 3 nats and by more than two standard errors of
@@ -47,21 +45,15 @@ def _uncertain(difference: Float[np.ndarray, " row"]) -> bool:
     return bool(difference.sum() <= CERTAIN * count * difference.std(ddof=1) / np.sqrt(size))
 
 
-def mixture_weights(mixture: str, log_evidence: Sequence[float]) -> Float[np.ndarray, " mode"]:
-    """Weights of optima, best evidence first; `MIXTURES` names the rules."""
-    if mixture == "evidence":
-        return softmax(np.asarray(log_evidence))
-    equal = np.full(len(log_evidence), 1.0 / len(log_evidence))
-    return equal if mixture == "equal" else np.eye(len(log_evidence))[0]
+def shares(modes: int, count: int) -> Int[np.ndarray, " mode"]:
+    """Numbers of draws of each mode, equal up to one."""
+    return np.diff(np.round(np.arange(1, modes + 1) / modes * count).astype(int), prepend=0)
 
 
-def draw_mixture(
-    modes: Sequence[Laplace], weights: Float[np.ndarray, " mode"], count: int, key: PRNGKeyArray
-) -> Float[np.ndarray, "draw d"]:
-    """Draws from a mixture of normals, in random order; each gets its share of them up to one draw."""
+def draw_mixture(modes: Sequence[Laplace], count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draw d"]:
+    """Draws from normals in equal parts, in random order."""
     order_key, draw_key = jax.random.split(key)
-    ends = np.round(np.cumsum(weights) * count).astype(int)
-    member = np.repeat(np.arange(len(modes)), np.diff(ends, prepend=0))
+    member = np.repeat(np.arange(len(modes)), shares(len(modes), count))
     normal = np.asarray(jax.random.normal(draw_key, (count, len(modes[0].mean))))
     factors = np.stack([np.linalg.cholesky(mode.covariance) for mode in modes])
     means = np.stack([mode.mean for mode in modes])
@@ -69,13 +61,12 @@ def draw_mixture(
     return drawn[np.asarray(jax.random.permutation(order_key, count))]
 
 
-def mixture_cautions(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
+def mixture_cautions(optima: int) -> list[Caution]:
     """A caution if several optima explain the data about equally well."""
-    if len(weights) == 1:
+    if optima == 1:
         return []
-    use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
     sentence = (
-        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does "
-        "not describe this posterior; use the bridge or SMC if the noise model is right"
+        f"{optima} optima explain the data about as well, and they are mixed in equal parts: one normal distribution "
+        "does not describe this posterior; use SMC if the noise model is right"
     )
     return [Caution(Code.SEVERAL_OPTIMA, sentence)]

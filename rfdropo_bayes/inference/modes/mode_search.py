@@ -1,14 +1,15 @@
 """Search for modes: optimisations from the best of many prior draws, over growing horizons, then Laplace.
 
 1. Optimisations start at prior draws that explain a short prefix of the data: the best draw, and distant draws of the
-   best quarter. If the budget allows it, a pilot run (`survey`) replaces the draws: particles tempered from the prior
-   to the posteriors of short prefixes. An optimisation stops at the first local optimum, and the best prior draws need
-   not lie near the highest. A slowly tempered population ends in the basins with most mass, at horizons with cheap
+   best quarter. If the budget allows it, a pilot run (`pilot_run`) replaces the draws: particles tempered from the
+   prior to the posteriors of short prefixes. An optimisation stops at the first local optimum, and the best prior draws
+   need not lie near the highest. A slowly tempered population ends in the basins with most mass, at horizons with cheap
    rollouts.
 2. Each optimisation is a Levenberg-Marquardt search at growing horizons. Short prefixes come first, because a long
    recording has many local optima.
 3. Each optimum keeps one optimisation for the next horizon: the better half of the optima, and every optimum within
-   `RIVAL` nats of the best. They restart at draws from the normal distributions around these optima, see `begun_anew`.
+   `ALTERNATIVE` nats of the best. They restart at draws from the normal distributions around these optima, see
+   `begun_anew`.
 4. Around each optimum stands a normal distribution (Laplace's approximation), whose integral estimates its evidence.
 """
 
@@ -30,30 +31,20 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.method_options import MethodOptions
-from rfdropo_bayes.inference.modes.climb import (
-    Climbable,
+from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
+from rfdropo_bayes.inference.modes.mixture import alternatives, draw_mixture, mixture_cautions, shares
+from rfdropo_bayes.inference.modes.optimisation import (
     Laplace,
     LevenbergState,
-    climb_cost,
+    Optimisable,
     laplace,
     maximise,
     normal_at,
-)
-from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
-from rfdropo_bayes.inference.modes.mixture import (
-    MIXTURES,
-    draw_mixture,
-    mixture_cautions,
-    mixture_weights,
-    rivals,
+    optimisation_cost,
 )
 from rfdropo_bayes.inference.modes.reweighting import CANDIDATE_SHARE, Reweighted, reweighted, reweighting_cautions
 from rfdropo_bayes.inference.modes.scales import integrate_scales
-from rfdropo_bayes.inference.modes.targets import (
-    Target,
-    make_target,
-    prior_derivatives,
-)
+from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import Draws, InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc import sampler
@@ -62,10 +53,10 @@ from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
 JACOBIANS = ("auto", "forward", "central")
 SAME = 0.02  # largest difference of any coordinate between two optimisations with the same result
-RIVAL = 30.0  # nats below the best optimum, beyond which another matters to no posterior: exp(-30) is 1e-13
-SURVEY_OF_CLIMBS = 0.6  # share of the budget of optimisations that a pilot run may take, and of their progress
-SURVEYS = 2  # number of last prefixes whose particles start optimisations; the same number of horizons follows
-SURVEY_MOVES = 8  # of a stage, at most: optimisations need a start in the right basins, not a fair sample of them
+ALTERNATIVE = 30.0  # nats below the best optimum, beyond which another matters to no posterior: exp(-30) is 1e-13
+PILOT_SHARE = 0.6  # share of the budget of optimisations that a pilot run may take, and of their progress
+PILOT_PREFIXES = 2  # number of last prefixes whose particles start optimisations; the same number of horizons follows
+PILOT_MOVES = 8  # of a stage, at most: optimisations need a start in the right basins, not a fair sample of them
 FEWEST_STEPS = 4.0  # of an optimisation that is worth its start
 
 
@@ -76,68 +67,56 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
     Attributes:
         starts: number of optimisations at the first horizon; the better half of their optima continue to longer
             horizons, with every optimum close to the best.
-        screen: number of draws from the prior, or from the problem's own distribution of starts, evaluated at the first
-            horizon. The best draw is the first start; the others are distant draws of the best quarter.
-        survey: particles of a tempered pilot run that finds the starts instead; 0 for none. Only for problems with
-            residuals.
+        prior_draws: number of draws from the prior, or from the problem's own distribution of starts, evaluated at the
+            first horizon. The best draw is the first start; the others are distant draws of the best quarter.
+        pilot_particles: particles of a tempered pilot run that finds the starts instead; 0 for none. Only for problems
+            with residuals.
         blocks: number of horizons of an optimisation or of the pilot run, doubling; two follow a pilot run.
         max_steps: most steps of an optimisation at one horizon.
         tolerance: predicted gain of a step below which an optimisation ends [nat].
         jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximations, weighted by the exact posterior and resampled.
-        mixture: weights of the optima that explain the data about equally well, see `mixture.rivals`: "equal",
-            "evidence" (Laplace's), or "best" for the best alone.
-        rollouts: budget in full-length rollouts, shared by the optimisations, with at most `SURVEY_OF_CLIMBS` for a
+        rollouts: budget in full-length rollouts, shared by the optimisations, with at most `PILOT_SHARE` for a
             pilot run; the rest, at least a quarter, weights the draws. None for no limit.
     """
 
     starts: int = 4
-    screen: int = 64
-    survey: int = 0
+    prior_draws: int = 64
+    pilot_particles: int = 0
     blocks: int = 3
     max_steps: int = 60
     tolerance: float = 1e-4
     jacobian: str = "auto"
     draws: int = 2000
     rollouts: float | None = None
-    mixture: str = "equal"
 
     def __post_init__(self) -> None:
-        for name in ("starts", "screen", "blocks", "max_steps", "draws"):
+        for name in ("starts", "prior_draws", "blocks", "max_steps", "draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where="[inference]")
-        if self.survey and self.survey < FEWEST_PARTICLES:
-            raise InputError(f"survey = {self.survey} is neither 0 nor {FEWEST_PARTICLES} or more", where="[inference]")
+        if self.pilot_particles and self.pilot_particles < FEWEST_PARTICLES:
+            raise InputError(
+                f"pilot_particles = {self.pilot_particles} is neither 0 nor {FEWEST_PARTICLES} or more",
+                where="[inference]",
+            )
         if self.tolerance <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
             raise InputError("tolerance and rollouts must be positive", where="[inference]")
-        if self.mixture not in MIXTURES:
-            raise InputError(
-                f"unknown mixture {self.mixture!r}", where="[inference]", remedy=f"use one of {', '.join(MIXTURES)}"
-            )
         if self.jacobian not in JACOBIANS:
             raise InputError(
                 f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"use one of {', '.join(JACOBIANS)}"
             )
 
 
-class Climbs(NamedTuple):
-    """State of several optimisations over growing horizons.
+class Optimisations(NamedTuple):
+    """State of several optimisations over growing horizons."""
 
-    Attributes:
-        positions: present point of each optimisation.
-        log_density: log posterior there, at the horizon of its last update.
-        converged: whether it converged at that horizon.
-        level: index of the present horizon; done: optimisations finished at it.
-        noise: noise coordinates.
-        ledger, trace, seconds: as in every method.
-    """
-
-    positions: Float[np.ndarray, "start d"]
-    log_density: Float[np.ndarray, " start"]
-    converged: Bool[np.ndarray, " start"]
-    level: int
-    done: int
-    noise: Bool[np.ndarray, " d"] | None
+    positions: Float[np.ndarray, "start d"]  # present point of each optimisation
+    log_density: Float[np.ndarray, " start"]  # log posterior there, at the horizon of its last update
+    converged: Bool[np.ndarray, " start"]  # whether it converged at that horizon
+    level: int  # index of the present horizon
+    done: int  # optimisations finished at it
+    noise: Bool[np.ndarray, " d"] | None  # noise coordinates
+    # ledger, trace, seconds: as in every method
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float
@@ -147,7 +126,7 @@ class Modes(NamedTuple):
     """Distinct optima at the full horizon, best evidence first, with the cost of the search."""
 
     modes: list[Laplace]
-    climbs: Climbs
+    search: Optimisations
     cautions: list[Caution]
 
 
@@ -158,7 +137,7 @@ def find_modes(
     checkpoint: Checkpoint = UNSAVED,
     logbook: Logbook = UNRECORDED,
     ledger: Ledger | None = None,
-    chosen: Callable[[Climbs], Bool[np.ndarray, " start"]] | None = None,
+    chosen: Callable[[Optimisations], Bool[np.ndarray, " start"]] | None = None,
 ) -> Modes:
     """Optimise from the best of some prior draws to the optima of the full posterior.
 
@@ -169,7 +148,7 @@ def find_modes(
         checkpoint: checkpoint of the optimisations.
         logbook: checkpoint of a pilot run, and reports of stages.
         ledger: charged with the cost, also after an error.
-        chosen: selects from the final optimisations; by default all within `RIVAL` nats of the best.
+        chosen: selects from the final optimisations; by default all within `ALTERNATIVE` nats of the best.
 
     Raises:
         InputError: a problem without residuals whose likelihood JAX cannot differentiate.
@@ -180,44 +159,44 @@ def find_modes(
     if saved is None:
         began = time.monotonic()
         ledger = Ledger() if ledger is None else ledger
-        if config.survey and isinstance(problem, ResidualProblem):
-            starts = surveyed(problem, config, horizons[0], key, ledger, logbook.part(0.0, SURVEY_OF_CLIMBS))
+        if config.pilot_particles and isinstance(problem, ResidualProblem):
+            starts = starts_of_pilot_run(problem, config, horizons[0], key, ledger, logbook.part(0.0, PILOT_SHARE))
         else:
-            starts = screened(problem, config.screen, horizons[0], config.starts, key, ledger)
-        climbs = begin(*starts, ledger, time.monotonic() - began)
+            starts = starts_of_draws(problem, config.prior_draws, horizons[0], config.starts, key, ledger)
+        search = begin(*starts, ledger, time.monotonic() - began)
     else:
-        climbs = _unpack(*saved)
+        search = _unpack(*saved)
     target = None
-    while climbs.level < len(horizons):
-        began, horizon = time.monotonic(), horizons[climbs.level]
+    while search.level < len(horizons):
+        began, horizon = time.monotonic(), horizons[search.level]
         if target is None:
-            target = target_at(horizon, climbs.ledger, climbs.positions[0], climbs.noise)
-        allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
-        state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
-        climbs = _record(climbs, state, len(steps), horizon, target)
-        if climbs.done == len(climbs.positions):
-            climbs = _go_on(climbs, horizon)
-            if climbs.level < len(horizons):
-                longer, level_key = horizons[climbs.level], jax.random.fold_in(key, climbs.level)
-                climbs = begun_anew(problem, target, climbs, longer, config.screen, level_key)
+            target = target_at(horizon, search.ledger, search.positions[0], search.noise)
+        allowed = _affordable_steps(problem.n_rows, config, search, horizons, int(target.noise.sum()))
+        state, steps = maximise(target, search.positions[search.done], max_steps=allowed, tolerance=config.tolerance)
+        search = _record(search, state, len(steps), horizon, target)
+        if search.done == len(search.positions):
+            search = _go_on(search, horizon)
+            if search.level < len(horizons):
+                longer, level_key = horizons[search.level], jax.random.fold_in(key, search.level)
+                search = begun_anew(problem, target, search, longer, config.prior_draws, level_key)
             target = None
-        climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
-        checkpoint.save(*_pack(climbs))
-        share = (climbs.level + climbs.done / len(climbs.positions)) / len(horizons)
-        logbook.part(SURVEY_OF_CLIMBS * (config.survey > 0), 1.0).stage(share, method="laplace", **climbs.trace[-1])
-    assert climbs.noise is not None
-    matter = climbs.log_density > climbs.log_density.max() - RIVAL if chosen is None else chosen(climbs)
-    return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise), matter)
+        search = search._replace(seconds=search.seconds + time.monotonic() - began)
+        checkpoint.save(*_pack(search))
+        share = (search.level + search.done / len(search.positions)) / len(horizons)
+        logbook.part(PILOT_SHARE * (config.pilot_particles > 0), 1.0).stage(share, method="laplace", **search.trace[-1])
+    assert search.noise is not None
+    matter = search.log_density > search.log_density.max() - ALTERNATIVE if chosen is None else chosen(search)
+    return _collect(search, target_at(problem.n_rows, search.ledger, search.positions[0], search.noise), matter)
 
 
-def screened(
-    problem: Problem, screen: int, horizon: int, count: int, key: PRNGKeyArray, ledger: Ledger
+def starts_of_draws(
+    problem: Problem, prior_draws: int, horizon: int, count: int, key: PRNGKeyArray, ledger: Ledger
 ) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
     """Some of many draws from the prior, or from the problem's own distribution of starts.
 
     Args:
         problem: problem to optimise.
-        screen: number of draws.
+        prior_draws: number of draws.
         horizon: horizon at which draws are evaluated.
         count: number of starts; there may be fewer.
         key: random key.
@@ -230,25 +209,25 @@ def screened(
         NoLikelihoodError: none of the draws has a positive likelihood.
     """
     draw = problem.sample_starts if isinstance(problem, WarmStart) else problem.sample_prior
-    u = np.asarray(problem.to_unconstrained(draw(key, max(screen, count))), dtype=float)
+    u = np.asarray(problem.to_unconstrained(draw(key, max(prior_draws, count))), dtype=float)
     density = _heights(problem, u, horizon, ledger)
     order = _spread(u, density, count)
     return u[order], density[order]
 
 
-def surveyed(
+def starts_of_pilot_run(
     problem: ResidualProblem, config: LaplaceConfig, horizon: int, key: PRNGKeyArray, ledger: Ledger, logbook: Logbook
 ) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
-    """Particles of the last prefixes of a pilot run, equally many of each; returns the same as `screened`.
+    """Particles of the last prefixes of a pilot run, equally many of each; returns the same as `starts_of_draws`.
 
     The longest prefix locates the optimum best, unless all its particles lie in a wrong basin; particles of a shorter
     prefix cross between basins more easily.
     """
     prefixes = block_boundaries(problem.n_rows, config.blocks + 1)
-    found = survey(problem, config, prefixes[:-1] or prefixes, key, ledger, logbook)[-SURVEYS:]
+    populations = pilot_run(problem, config, prefixes[:-1] or prefixes, key, ledger, logbook)[-PILOT_PREFIXES:]
     chosen = []
-    for index, (position, density) in enumerate(reversed(found)):
-        wanted = config.starts // len(found) + (index < config.starts % len(found))
+    for index, (position, density) in enumerate(reversed(populations)):
+        wanted = config.starts // len(populations) + (index < config.starts % len(populations))
         chosen.append(position[_spread(position, density, wanted)[:wanted]])
     u = np.concatenate(chosen)
     density = _heights(problem, u, horizon, ledger)
@@ -281,9 +260,9 @@ def _spread(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count
     order = order[np.isfinite(density[order]) & np.isfinite(u[order]).all(axis=1)]
     if len(order) == 0:
         return order
-    spread = u[order].std(axis=0)
+    deviation = u[order].std(axis=0)
     order = order[: max(count, len(u) // 4)]
-    scaled = u[order] / np.maximum(spread, 1e-300)
+    scaled = u[order] / np.maximum(deviation, 1e-300)
     chosen = [0]
     while len(chosen) < min(count, len(order)):
         distance = np.linalg.norm(scaled[:, None] - scaled[chosen], axis=2).min(axis=1)
@@ -291,7 +270,7 @@ def _spread(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count
     return order[chosen]
 
 
-def survey(
+def pilot_run(
     problem: ResidualProblem,
     config: LaplaceConfig,
     horizons: tuple[int, ...],
@@ -319,16 +298,9 @@ def survey(
     straight_key, run_key = jax.random.split(key)
     blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
     # The sampler assumes rows of equal cost in a block, which overestimates short prefixes.
-    whole = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts * problem.n_rows / horizons[-1]
-    sampling = sampler.SmcConfig(
-        rollouts=whole,
-        particles=config.survey,
-        blocks=len(horizons),
-        spacing="linear",
-        max_moves=SURVEY_MOVES,
-        draws=1,
-    )
-    checkpoint = logbook.checkpoint("survey", run_digest(blocks, "survey", sampling, run_key))
+    whole = None if config.rollouts is None else PILOT_SHARE * config.rollouts * problem.n_rows / horizons[-1]
+    sampling = sampler.SmcConfig(rollouts=whole, particles=config.pilot_particles, draws=1)
+    checkpoint = logbook.checkpoint("pilot_run", run_digest(blocks, "pilot_run", sampling, run_key))
     populations, state = _populations(blocks, sampling, run_key, checkpoint, logbook)
     _charge(problem, horizons, state.trace, ledger)
     ledger.excluded.update(state.ledger.excluded)
@@ -345,11 +317,12 @@ def _populations(
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], sampler.SmcState]:
     """Positions and rows of the particles at the end of each block, and the sampler's last state."""
     init_key, stage_key = jax.random.split(key)
-    plan = sampler.make_plan(blocks, config)
+    every = tuple(range(1, blocks.n_rows + 1))
+    plan = sampler.make_plan(blocks, config, every)._replace(most_moves=PILOT_MOVES)
     ends: list[tuple[np.ndarray, np.ndarray]] = []
     saved = checkpoint.load()
     if saved is None:
-        state = sampler.init(init_key, blocks, plan, config)
+        state = sampler.init(init_key, blocks, plan)
     else:
         arrays, meta = saved
         state = sampler.unpack(arrays, meta)
@@ -365,7 +338,7 @@ def _populations(
         checkpoint.save(arrays, meta | {"ends": len(ends)})
         facts = {name: state.trace[-1][name] for name in ("ess", "acceptance", "moves")}
         share, horizon = population.progress / blocks.n_rows, blocks.horizons[state.block]
-        logbook.stage(share, method="survey", stage=state.stage, horizon=horizon, **facts)
+        logbook.stage(share, method="pilot_run", stage=state.stage, horizon=horizon, **facts)
     return ends, state
 
 
@@ -380,36 +353,38 @@ def _charge(problem: ResidualProblem, horizons: tuple[int, ...], trace: list[dic
 
 def begin(
     positions: Float[np.ndarray, "start d"], log_density: Float[np.ndarray, " start"], ledger: Ledger, seconds: float
-) -> Climbs:
+) -> Optimisations:
     """Optimisations at their starts."""
-    return Climbs(positions, log_density, np.zeros(len(positions), dtype=bool), 0, 0, None, ledger, [], seconds)
+    return Optimisations(positions, log_density, np.zeros(len(positions), dtype=bool), 0, 0, None, ledger, [], seconds)
 
 
-def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, target: Climbable) -> Climbs:
+def _record(
+    search: Optimisations, state: LevenbergState, steps: int, horizon: int, target: Optimisable
+) -> Optimisations:
     """Record a finished optimisation."""
-    positions, density, converged = climbs.positions.copy(), climbs.log_density.copy(), climbs.converged.copy()
-    positions[climbs.done], density[climbs.done] = state.position, state.log_density
-    converged[climbs.done] = state.converged
-    facts = {"horizon": horizon, "start": climbs.done, "steps": steps, "log_density": state.log_density}
-    climbs.trace.append(facts | {"converged": state.converged, "rollouts": climbs.ledger.rollouts})
-    return climbs._replace(
-        positions=positions, log_density=density, converged=converged, done=climbs.done + 1, noise=target.noise
+    positions, density, converged = (search.positions.copy(), search.log_density.copy(), search.converged.copy())
+    positions[search.done], density[search.done] = state.position, state.log_density
+    converged[search.done] = state.converged
+    facts = {"horizon": horizon, "start": search.done, "steps": steps, "log_density": state.log_density}
+    search.trace.append(facts | {"converged": state.converged, "rollouts": search.ledger.rollouts})
+    return search._replace(
+        positions=positions, log_density=density, converged=converged, done=search.done + 1, noise=target.noise
     )
 
 
-def _go_on(climbs: Climbs, horizon: int) -> Climbs:
+def _go_on(search: Optimisations, horizon: int) -> Optimisations:
     """Keep one optimisation of each optimum and continue at the next horizon.
 
-    The better half of the optimisations continues (successive halving), and every optimum within `RIVAL` nats of the
-    best.
+    The better half of the optimisations continues (successive halving), and every optimum within `ALTERNATIVE` nats of
+    the best.
 
     Raises:
         NoLikelihoodError: no optimisation has a likelihood.
     """
-    positions, density = climbs.positions, climbs.log_density
+    positions, density = search.positions, search.log_density
     if not np.isfinite(density).any():
         raise NoLikelihoodError(
-            f"no optimisation has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
+            f"no optimisation has a positive likelihood up to row {horizon} ({search.ledger.reasons})",
             where="[inference]",
             remedy="look at the simulator's reports there, or allow more starts",
         )
@@ -418,104 +393,106 @@ def _go_on(climbs: Climbs, horizon: int) -> Climbs:
         if all(np.max(np.abs(positions[index] - positions[other])) > SAME for other in kept):
             kept.append(int(index))
     order = np.array([index for index in kept if np.isfinite(density[index])])
-    order = order[(2 * np.arange(len(order)) < len(order)) | (density[order] > density[order[0]] - RIVAL)]
-    return climbs._replace(
+    order = order[(2 * np.arange(len(order)) < len(order)) | (density[order] > density[order[0]] - ALTERNATIVE)]
+    return search._replace(
         positions=positions[order],
         log_density=density[order],
-        converged=climbs.converged[order],
-        level=climbs.level + 1,
+        converged=search.converged[order],
+        level=search.level + 1,
         done=0,
     )
 
 
 def begun_anew(
-    problem: Problem, target: Climbable, climbs: Climbs, horizon: int, screen: int, key: PRNGKeyArray
-) -> Climbs:
+    problem: Problem, target: Optimisable, search: Optimisations, horizon: int, prior_draws: int, key: PRNGKeyArray
+) -> Optimisations:
     """The optimisations at their starts for a longer prefix of the data.
 
     Parameters that a prefix does not inform, such as the mass of a cube before contact, are at the prior's centre in
     every optimum. All optimisations of the longer prefix would then share this value. Starts are therefore chosen from
-    the optima and from ``screen`` draws of the normal distributions around them, which keep the prior's spread.
+    the optima and from ``prior_draws`` draws of the normal distributions around them, which keep the prior's spread.
 
     Args:
         problem: problem to optimise.
         target: posterior of the finished prefix.
-        climbs: one optimisation per optimum.
+        search: one optimisation per optimum.
         horizon: horizon of the longer prefix, at which draws are evaluated.
-        screen: number of draws.
+        prior_draws: number of draws.
         key: random key.
 
     Raises:
         NoLikelihoodError: neither an optimum nor a draw has a positive likelihood.
     """
-    ends = zip(climbs.positions, climbs.log_density, climbs.converged, strict=True)
+    ends = zip(search.positions, search.log_density, search.converged, strict=True)
     modes = [normal_at(target, LevenbergState(u, float(density), 0.0, bool(done))) for u, density, done in ends]
-    drawn = draw_mixture(modes, mixture_weights("equal", [mode.log_evidence for mode in modes]), screen, key)
-    u = np.concatenate([climbs.positions, drawn])
-    density = _heights(problem, u, horizon, climbs.ledger)
+    drawn = draw_mixture(modes, prior_draws, key)
+    u = np.concatenate([search.positions, drawn])
+    density = _heights(problem, u, horizon, search.ledger)
     order = _spread(u, density, len(modes))
-    return climbs._replace(positions=u[order], log_density=density[order], converged=np.zeros(len(order), dtype=bool))
+    return search._replace(positions=u[order], log_density=density[order], converged=np.zeros(len(order), dtype=bool))
 
 
-def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _pack(search: Optimisations) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and metadata of the optimisations, for a checkpoint."""
-    assert climbs.noise is not None
-    meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
-    arrays = {name: getattr(climbs, name) for name in ("positions", "log_density", "converged", "noise")}
-    return arrays, meta | {"ledger": climbs.ledger.record()}
+    assert search.noise is not None
+    meta = {name: getattr(search, name) for name in ("level", "done", "trace", "seconds")}
+    arrays = {name: getattr(search, name) for name in ("positions", "log_density", "converged", "noise")}
+    return arrays, meta | {"ledger": search.ledger.record()}
 
 
-def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
+def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Optimisations:
     """Inverse of `_pack`."""
     named = {name: meta[name] for name in ("level", "done", "trace", "seconds")}
     saved: dict[str, Any] = {**arrays, **named}
-    return Climbs(ledger=Ledger.from_record(meta["ledger"]), **saved)
+    return Optimisations(ledger=Ledger.from_record(meta["ledger"]), **saved)
 
 
-def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
+def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Optimisable]]:
     """Horizons of the search, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
     if not isinstance(problem, ResidualProblem):
         raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
     prior = prior_derivatives(problem)
 
-    def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
+    def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Optimisable:
         return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
 
-    return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
+    return block_boundaries(problem.n_rows, PILOT_PREFIXES if config.pilot_particles else config.blocks), by_residuals
 
 
-def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
+def _affordable_steps(
+    n_rows: int, config: LaplaceConfig, search: Optimisations, horizons: tuple[int, ...], noise: int
+) -> int:
     """Steps of the present optimisation: the rest of the budget is shared among optimisations by their horizons.
 
     Half of the optimisations are expected to continue, see `_go_on`.
     """
     if config.rollouts is None:
         return config.max_steps
-    starts, d = climbs.positions.shape
-    now = horizons[climbs.level]
-    later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[climbs.level + 1 :], start=1))
-    waiting = starts - climbs.done
+    starts, d = search.positions.shape
+    now = horizons[search.level]
+    later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[search.level + 1 :], start=1))
+    waiting = starts - search.done
     share = now * waiting / (now * waiting + later)
-    grid, step = climb_cost(d, noise)
-    rows = max(config.rollouts - climbs.ledger.rollouts, 0.0) * n_rows / now * share
+    grid, step = optimisation_cost(d, noise)
+    rows = max(config.rollouts - search.ledger.rollouts, 0.0) * n_rows / now * share
     # More optima than expected may have reached the last horizon: continue with the best, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
 
-def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start"]) -> Modes:
+def _collect(search: Optimisations, target: Optimisable, matter: Bool[np.ndarray, " start"]) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     modes: list[Laplace] = []
-    for index in np.argsort(-climbs.log_density, kind="stable"):
+    for index in np.argsort(-search.log_density, kind="stable"):
         state = LevenbergState(
-            climbs.positions[index], float(climbs.log_density[index]), 0.0, bool(climbs.converged[index])
+            search.positions[index], float(search.log_density[index]), 0.0, bool(search.converged[index])
         )
         if state.log_density > -np.inf and matter[index] and _apart(state.position, modes):
             mode = laplace(target, state)
             modes += [mode] if _apart(mode.mean, modes) else []
     modes.sort(key=lambda mode: -mode.log_evidence)
-    best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
-    return Modes(modes, climbs, _unfinished(bool(climbs.converged[best])))
+    best = np.argmin(np.max(np.abs(search.positions - modes[0].mean), axis=1))
+    return Modes(modes, search, _unfinished(bool(search.converged[best])))
 
 
 def _unfinished(converged: bool) -> list[Caution]:
@@ -523,7 +500,7 @@ def _unfinished(converged: bool) -> list[Caution]:
     sentence = (
         "the best optimisation had not converged when its steps or its budget ran out; raise max_steps or rollouts"
     )
-    return [] if converged else [Caution(Code.CLIMB_UNFINISHED, sentence, grave=True)]
+    return [] if converged else [Caution(Code.OPTIMISATION_UNFINISHED, sentence, grave=True)]
 
 
 def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
@@ -535,64 +512,59 @@ def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
     return all(distance > len(position) for distance in away)
 
 
-def run(
-    problem: Problem,
-    config: LaplaceConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Posterior modes and draws of the normal approximations around them, mapped back to physical units.
 
-    A `Hierarchy` is climbed with its standard deviations held, which are then integrated out (`integrate_scales`).
+    A `Hierarchy` is optimised at fixed standard deviations, which are then integrated out (`integrate_scales`).
     """
     mode_key, draw_key = jax.random.split(key)
     digest = run_digest(problem, "laplace", config, key)
     checkpoint = logbook.checkpoint("laplace", digest)
-    whole, held = problem, dict(problem.typical_scales) if isinstance(problem, Hierarchy) else {}
-    if isinstance(whole, Hierarchy) and held:
-        problem = whole.holding(held)
+    whole, fixed = problem, dict(problem.typical_scales) if isinstance(problem, Hierarchy) else {}
+    if isinstance(whole, Hierarchy) and fixed:
+        problem = whole.holding(fixed)
 
-    def explain_as_well(climbs: Climbs) -> Bool[np.ndarray, " start"]:
-        return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
+    def explain_as_well(search: Optimisations) -> Bool[np.ndarray, " start"]:
+        return alternatives(evaluate_rows(problem, search.positions, problem.n_rows, search.ledger))
 
     allowed = None if config.rollouts is None else (1.0 - CANDIDATE_SHARE) * config.rollouts
-    climbing = replace(config, rollouts=allowed)
-    found = find_modes(problem, climbing, mode_key, checkpoint, logbook, chosen=explain_as_well)
-    ledger, began = found.climbs.ledger, time.monotonic()
-    problem, found, lasting = _counted(problem, found, climbing)
-    modes, exact, rows = found.modes, None, None
-    compared = not (isinstance(whole, Hierarchy) and held)
-    if isinstance(whole, Hierarchy) and held:
-        draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
+    settings = replace(config, rollouts=allowed)
+    optima = find_modes(problem, settings, mode_key, checkpoint, logbook, chosen=explain_as_well)
+    ledger, began = optima.search.ledger, time.monotonic()
+    problem, optima, lasting = _counted(problem, optima, settings)
+    modes, exact, rows = optima.modes, None, None
+    compared = not (isinstance(whole, Hierarchy) and fixed)
+    if isinstance(whole, Hierarchy) and fixed:
+        draws, modes = _with_scales(whole, problem, fixed, modes, config, draw_key)
     else:
-        weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
-        left = config.draws if config.rollouts is None else min(config.draws, int(config.rollouts - ledger.rollouts))
-        by_evidence = config.mixture == "evidence"
-        exact = reweighted(problem, modes, weights, left, draw_key, ledger, config.draws, by_evidence)
-        position = draw_mixture(modes, weights, config.draws, draw_key) if exact is None else exact.position
+        affordable = (
+            config.draws if config.rollouts is None else min(config.draws, int(config.rollouts - ledger.rollouts))
+        )
+        exact = reweighted(problem, modes, affordable, draw_key, ledger, config.draws)
+        position = draw_mixture(modes, config.draws, draw_key) if exact is None else exact.position
         draws = chains(problem, [position])
         rows = None if exact is None or exact.rows is None else _whole_rows(exact.rows, problem, problem is whole)
-    best, seconds = modes[0], found.climbs.seconds + time.monotonic() - began
+    best, seconds = modes[0], optima.search.seconds + time.monotonic() - began
     return InferenceResult(
         method="laplace",
         draws=draws,
         log_evidence=(float(logsumexp([mode.log_evidence for mode in modes])), float("nan")),
         log_likelihood=rows,
-        trace=found.climbs.trace,
+        trace=optima.search.trace,
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
         cautions=[
-            *found.cautions,
-            *mixture_cautions(weights, config.mixture),
+            *optima.cautions,
+            *mixture_cautions(len(modes)),
             *(reweighting_cautions(exact) if compared else []),
             *lasting_cautions(lasting),
             *prior_cautions(whole, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
         seconds=seconds,
-        optimum={**mode_values(problem, best), **held},
-        details=_details(problem, found._replace(modes=modes), lasting, weights, exact),
+        optimum={**mode_values(problem, best), **fixed},
+        details=_details(problem, optima._replace(modes=modes), lasting, exact),
     )
 
 
@@ -607,22 +579,18 @@ def _whole_rows(
 
 
 def _details(
-    problem: Problem,
-    found: Modes,
-    lasting: Mapping[str, Lasting],
-    weights: Float[np.ndarray, " mode"],
-    exact: Reweighted | None,
+    problem: Problem, optima: Modes, lasting: Mapping[str, Lasting], exact: Reweighted | None
 ) -> dict[str, Any]:
     """Further numbers of a result."""
-    modes = found.modes
+    modes = optima.modes
     return {
         "effective_draws": None if exact is None else exact.effective,
         "lasting": {name: {**each._asdict(), "widened": each.widened.tolist()} for name, each in lasting.items()},
         "covariance_unconstrained": modes[0].covariance.tolist(),
-        "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
+        "noise_coordinates": np.flatnonzero(np.asarray(optima.search.noise)).tolist(),
         "optima": [
-            {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
-            for weight, mode in zip(weights, modes, strict=True)
+            {"weight": 1.0 / len(modes), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
+            for mode in modes
         ],
         "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
     }
@@ -631,66 +599,65 @@ def _details(
 def _with_scales(
     whole: Hierarchy,
     problem: Problem,
-    held: Mapping[str, float],
+    fixed: Mapping[str, float],
     modes: Sequence[Laplace],
     config: LaplaceConfig,
     key: PRNGKeyArray,
-) -> tuple[Draws, list[Laplace], Float[np.ndarray, " mode"]]:
-    """Draws of a hierarchy whose modes were found with its standard deviations held; the modes in the order of their
-    evidence once these are integrated out, and the weights of their mixture."""
-    members = [[problem.names.index(name) for name in whole.scales[scale]] for scale in held]
+) -> tuple[Draws, list[Laplace]]:
+    """Draws of a hierarchy whose modes were found at fixed standard deviations, and the modes in the order of their
+    evidence once these are integrated out."""
+    members = [[problem.names.index(name) for name in whole.scales[scale]] for scale in fixed]
     order_key, *keys = jax.random.split(key, len(modes) + 1)
-    values = np.array(list(held.values()))
+    values = np.array(list(fixed.values()))
     mixed = [
         integrate_scales(mode, values, members, whole.scale_log_prior, config.draws, k)
         for mode, k in zip(modes, keys, strict=True)
     ]
     order = np.argsort([-each.log_evidence for each in mixed])
-    weights = mixture_weights(config.mixture, [mixed[i].log_evidence for i in order])
-    ends = np.diff(np.round(np.cumsum(weights) * config.draws).astype(int), prepend=0)
+    ends = shares(len(order), config.draws)
     shuffled = np.asarray(jax.random.permutation(order_key, config.draws))
     position = np.concatenate([mixed[i].position[:n] for i, n in zip(order, ends, strict=True)])[shuffled]
     scales = np.concatenate([mixed[i].scales[:n] for i, n in zip(order, ends, strict=True)])[shuffled]
-    draws = chains(problem, [position]) | {name: scales[None, :, j] for j, name in enumerate(held)}
+    draws = chains(problem, [position]) | {name: scales[None, :, j] for j, name in enumerate(fixed)}
     integrated = [
         modes[i]._replace(log_density=modes[i].log_density + mixed[i].log_evidence - modes[i].log_evidence)
         for i in order
     ]
-    return {name: draws[name] for name in whole.names}, integrated, weights
+    return {name: draws[name] for name in whole.names}, integrated
 
 
-def _counted(problem: Problem, found: Modes, config: LaplaceConfig) -> tuple[Problem, Modes, dict[str, Lasting]]:
+def _counted(problem: Problem, optima: Modes, config: LaplaceConfig) -> tuple[Problem, Modes, dict[str, Lasting]]:
     """The problem with rows weighted by the residual correlation time, its modes, and the residual statistics.
 
     The new modes are optimised from the given modes; see `modes.lasting`.
     """
-    modes, climbs = found.modes, found.climbs
+    modes, search = optima.modes, optima.search
     if not isinstance(problem, CountedProblem):
-        return problem, found, {}
+        return problem, optima, {}
 
     def target_of(problem: CountedProblem) -> Target:
         derivatives = prior_derivatives(problem)
-        at, noise = modes[0].mean, climbs.noise
-        return make_target(problem, problem.n_rows, climbs.ledger, at, derivatives, config.jacobian, noise)
+        at, noise = modes[0].mean, search.noise
+        return make_target(problem, problem.n_rows, search.ledger, at, derivatives, config.jacobian, noise)
 
     lasting = lasting_residuals(problem, target_of(problem), modes[0])
     shares = {name: each.share for name, each in lasting.items() if each.share < 1.0}
     if not shares:
-        return problem, found, lasting
+        return problem, optima, lasting
     counted = problem.counting(shares)
     target, moved = target_of(counted), []
     for waiting, mode in zip(range(len(modes), 0, -1), modes, strict=True):
         steps = config.max_steps
         if config.rollouts is not None:
-            grid, step = climb_cost(len(mode.mean), int(target.noise.sum()))
-            left = (config.rollouts - climbs.ledger.rollouts) / waiting
-            steps = int(np.clip((left - grid) / step, 0, steps))
+            grid, step = optimisation_cost(len(mode.mean), int(target.noise.sum()))
+            affordable = (config.rollouts - search.ledger.rollouts) / waiting
+            steps = int(np.clip((affordable - grid) / step, 0, steps))
         state, _ = maximise(target, mode.mean, max_steps=steps, tolerance=config.tolerance)
         moved.append((laplace(target, state), state.converged))
     moved.sort(key=lambda each: -each[0].log_evidence)
     again = lasting_residuals(counted, target, moved[0][0])
     lasting = {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
-    return counted, Modes([mode for mode, _ in moved], climbs, _unfinished(moved[0][1])), lasting
+    return counted, Modes([mode for mode, _ in moved], search, _unfinished(moved[0][1])), lasting
 
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:

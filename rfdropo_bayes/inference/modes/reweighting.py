@@ -4,7 +4,7 @@ The first candidates come from the approximations. A normal has little density o
 reveal regions without candidates. So the next rounds come from Student-t distributions with the weighted covariance of
 all earlier candidates, added to the normal's covariance (adaptive multiple importance sampling, Cornuet et al. 2012).
 All together have the density ``q``. A candidate's weight for optimum k is ``p(u) / q(u)`` times the share of k in
-``q(u)``; the weights of one optimum are scaled to the share that the mixture gives to it. Draws of equal weight are
+``q(u)``; the weights of each optimum are scaled to the same sum. Draws of equal weight are
 then resampled, and the effective number ``(sum w)^2 / sum w^2`` measures the number of effective candidates.
 
 If the first candidates have nearly equal weights, the normals describe the posterior: the draws are then unweighted,
@@ -25,8 +25,8 @@ from scipy.stats import multivariate_normal, multivariate_t
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.climb import Laplace
-from rfdropo_bayes.inference.modes.mixture import draw_mixture
+from rfdropo_bayes.inference.modes.mixture import draw_mixture, shares
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.smc.moves import host_generator
 
 CANDIDATE_SHARE = 0.25  # of a budget that optimisations leave to candidates
@@ -40,42 +40,27 @@ LIKE = 0.1  # share of the candidates that counts if the normal describes the po
 
 
 class Reweighted(NamedTuple):
-    """Draws of equal weight.
+    """Draws of equal weight."""
 
-    Attributes:
-        position: unconstrained.
-        rows: log density of each data row at each of them; None for draws of the normals, which no rollout has seen.
-        effective: number of independent draws that they are worth.
-        candidates: number of candidates with a posterior density.
-    """
-
-    position: Float[np.ndarray, "draw d"]
+    position: Float[np.ndarray, "draw d"]  # unconstrained
+    # log density of each data row at each of them; None for draws of the normals, which no rollout has seen
     rows: Float[np.ndarray, "draw row"] | None
-    effective: float
-    candidates: int
+    effective: float  # number of independent draws that they are worth
+    candidates: int  # number of candidates with a posterior density
 
 
 def reweighted(
-    problem: Problem,
-    modes: Sequence[Laplace],
-    weights: Float[np.ndarray, " mode"],
-    candidates: int,
-    key: PRNGKeyArray,
-    ledger: Ledger,
-    count: int,
-    by_evidence: bool = False,
+    problem: Problem, modes: Sequence[Laplace], candidates: int, key: PRNGKeyArray, ledger: Ledger, count: int
 ) -> Reweighted | None:
     """Draws from a mixture of approximations, as the exact posterior has them.
 
     Args:
         problem: problem with this posterior.
         modes: normal approximations.
-        weights: weights of the mixture.
         candidates: number of rollouts, at most.
         key: random key.
         ledger: counts rollouts, and candidates without a likelihood.
         count: number of draws.
-        by_evidence: let the exact posterior decide between the optima, and not the weights.
 
     Returns:
         None if there are too few candidates, or none has a posterior density.
@@ -88,20 +73,20 @@ def reweighted(
     u, rows, posterior = np.empty((0, len(modes[0].mean))), np.empty((0, problem.n_rows)), np.empty(0)
     for widened, size in _batches(candidates):
         if widened:
-            by_mode = _weights(posterior, weights, sources, u)
+            by_mode = _weights(posterior, sources, u)
             sources.append([_widened(mode, u, by_mode[:, k]) for k, mode in enumerate(modes)])
-        sizes = zip(sources[-1], _counts(weights, size), strict=True)
+        sizes = zip(sources[-1], shares(len(modes), size), strict=True)
         drawn = [np.reshape(source.rvs(int(n), random_state=generator), (n, -1)) for source, n in sizes if n]
         more_rows, more = _exact(problem, np.concatenate(drawn), ledger)
         u, rows = np.concatenate([u, *drawn]), np.concatenate([rows, more_rows])
         posterior = np.concatenate([posterior, more])
         if len(u) == size and size >= FEWEST_CANDIDATES and np.isfinite(posterior).all():
-            worth = _effective(_by_share(_weights(posterior, weights, sources, u), weights, by_evidence)) / len(u)
+            worth = _effective(_by_share(_weights(posterior, sources, u))) / len(u)
             if worth >= ALIKE:
-                return Reweighted(draw_mixture(modes, weights, count, order_key), None, worth * count, len(u))
+                return Reweighted(draw_mixture(modes, count, order_key), None, worth * count, len(u))
     if not np.isfinite(posterior).any():
         return None
-    weight = _by_share(_weights(posterior, weights, sources, u), weights, by_evidence)
+    weight = _by_share(_weights(posterior, sources, u))
     chosen = _systematic(weight, count, order_key)
     return Reweighted(u[chosen], rows[chosen], _effective(weight), candidates)
 
@@ -115,14 +100,11 @@ def _batches(candidates: int) -> list[tuple[bool, int]]:
     return narrow + [(True, size) for size in rounds[1:]]
 
 
-def _by_share(
-    by_mode: Float[np.ndarray, "n mode"], weights: Float[np.ndarray, " mode"], by_evidence: bool
-) -> Float[np.ndarray, " n"]:
-    """Weights of candidates: each optimum gets its share of the mixture, or its share under the exact posterior."""
+def _by_share(by_mode: Float[np.ndarray, "n mode"]) -> Float[np.ndarray, " n"]:
+    """Weights of candidates: every optimum gets the same share."""
     mass = by_mode.sum(axis=0)
-    found = mass > 0.0
-    share = mass[found] if by_evidence else weights[found]
-    return by_mode[:, found] @ (share / share.sum() / mass[found])
+    reached = mass > 0.0
+    return by_mode[:, reached] @ (1.0 / reached.sum() / mass[reached])
 
 
 def _effective(weight: Float[np.ndarray, " n"]) -> float:
@@ -139,15 +121,12 @@ def _exact(
 
 
 def _weights(
-    posterior: Float[np.ndarray, " n"],
-    weights: Float[np.ndarray, " mode"],
-    sources: Sequence[Sequence[Any]],
-    u: Float[np.ndarray, "n d"],
+    posterior: Float[np.ndarray, " n"], sources: Sequence[Sequence[Any]], u: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "n mode"]:
     """``p / q`` times the share of each mode in ``q``, the largest of them 1; zero throughout if ``p`` is."""
     each = np.array([[source.logpdf(u) for source in of_round] for of_round in sources])
     with np.errstate(divide="ignore"):
-        parts = np.log(weights) + logsumexp(np.reshape(each, (len(sources), len(weights), -1)), axis=0).T
+        parts = logsumexp(np.reshape(each, (len(sources), len(sources[0]), -1)), axis=0).T - np.log(len(sources[0]))
     logs = posterior[:, None] + parts - 2.0 * logsumexp(parts, axis=1, keepdims=True)
     return np.exp(logs - logs.max()) if np.isfinite(logs).any() else np.zeros_like(logs)
 
@@ -157,13 +136,8 @@ def _widened(mode: Laplace, u: Float[np.ndarray, "n d"], weight: Float[np.ndarra
     if weight.sum() == 0.0:
         return multivariate_t(mode.mean, 2.0 * mode.covariance, DEGREES)
     mean = weight @ u / weight.sum()
-    spread = (weight * (u - mean).T) @ (u - mean) / weight.sum()
-    return multivariate_t(mean, spread + mode.covariance, DEGREES)
-
-
-def _counts(weights: Float[np.ndarray, " mode"], count: int) -> Int[np.ndarray, " mode"]:
-    """Candidates of each mode, in proportion up to one."""
-    return np.diff(np.round(np.cumsum(weights / weights.sum()) * count).astype(int), prepend=0)
+    covariance = (weight * (u - mean).T) @ (u - mean) / weight.sum()
+    return multivariate_t(mean, covariance + mode.covariance, DEGREES)
 
 
 def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) -> Int[np.ndarray, " draw"]:
@@ -174,14 +148,18 @@ def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) 
     return np.minimum(chosen, len(weight) - 1)[np.asarray(jax.random.permutation(order_key, count))]
 
 
-def reweighting_cautions(found: Reweighted | None) -> list[Caution]:
+def reweighting_cautions(comparison: Reweighted | None) -> list[Caution]:
     """Cautions from the comparison of the normal approximation with the exact posterior; None means no comparison."""
-    remedy = "allow more rollouts, or use the bridge or SMC"
-    if found is None:
+    remedy = "allow more rollouts, or use SMC"
+    if comparison is None:
         sentence = f"no rollouts were left to check the normal approximation that the draws are from: {remedy}"
         return [Caution(Code.NORMAL_DIFFERS, sentence)]
-    if found.effective >= ENOUGH:
+    if comparison.effective >= ENOUGH:
         return []
-    unlike = ": a normal distribution does not describe this posterior" * (found.effective < LIKE * found.candidates)
-    sentence = f"the draws are worth {found.effective:.0f} of {found.candidates} independent ones{unlike}; {remedy}"
-    return [Caution(Code.NORMAL_DIFFERS, sentence, grave=found.effective < TOO_FEW)]
+    unlike = ": a normal distribution does not describe this posterior" * (
+        comparison.effective < LIKE * comparison.candidates
+    )
+    sentence = (
+        f"the draws are worth {comparison.effective:.0f} of {comparison.candidates} independent ones{unlike}; {remedy}"
+    )
+    return [Caution(Code.NORMAL_DIFFERS, sentence, grave=comparison.effective < TOO_FEW)]

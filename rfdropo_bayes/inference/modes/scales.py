@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 
 DRAWS = 4000  # of the proposal, from which the scales are resampled
 FREEDOM = 5.0  # of the proposal, a Student-t around the mode of the scales' logarithms: it has to have their tails
@@ -28,22 +28,16 @@ WIDEST = 2.0  # deviation of the proposal's logarithms: beyond it the prior is a
 
 
 class Mixed(NamedTuple):
-    """A normal approximation with its scales integrated out.
+    """A normal approximation with its scales integrated out."""
 
-    Attributes:
-        scales: draws of the standard deviations.
-        position: draws of the coordinates, given each.
-        log_evidence: log evidence with the scales integrated out.
-    """
-
-    scales: Float[np.ndarray, "draw scale"]
-    position: Float[np.ndarray, "draw d"]
-    log_evidence: float
+    scales: Float[np.ndarray, "draw scale"]  # draws of the standard deviations
+    position: Float[np.ndarray, "draw d"]  # draws of the coordinates, given each
+    log_evidence: float  # log evidence with the scales integrated out
 
 
 def integrate_scales(
     mode: Laplace,
-    held: Float[np.ndarray, " scale"],
+    fixed: Float[np.ndarray, " scale"],
     members: Sequence[Sequence[int]],
     log_prior: Callable[[Float[np.ndarray, "n scale"]], Float[np.ndarray, " n"]],
     draws: int,
@@ -52,8 +46,8 @@ def integrate_scales(
     """Draws of standard deviations and coordinates.
 
     Args:
-        mode: found with the standard deviations held.
-        held: their values there.
+        mode: optimum at the fixed standard deviations.
+        fixed: standard deviations at the mode.
         members: coordinates of each scale whose prior is Normal(0, scale).
         log_prior: log density of the standard deviations' prior, for rows of them.
         draws: number of draws to return.
@@ -63,9 +57,9 @@ def integrate_scales(
     index = np.concatenate([np.asarray(m, dtype=int) for m in members])
     # The rest of the quadratic form is unchanged; it is integrated out once in its coordinates other than the members'.
     precision = np.linalg.inv(mode.covariance)
-    precision[index, index] -= 1.0 / held[owner] ** 2
+    precision[index, index] -= 1.0 / fixed[owner] ** 2
     slope = np.zeros(len(mode.mean))
-    slope[index] = mode.mean[index] / held[owner] ** 2
+    slope[index] = mode.mean[index] / fixed[owner] ** 2
     other = np.setdiff1d(np.arange(len(slope)), index)
     solved = np.linalg.solve(precision[np.ix_(other, other)], precision[np.ix_(other, index)])
     reduced = precision[np.ix_(index, index)] - precision[np.ix_(index, other)] @ solved
@@ -83,12 +77,12 @@ def integrate_scales(
         return 0.5 * jnp.sum(white**2) - 0.5 * jnp.sum(weight * centre**2) + half
 
     def density(logarithm: np.ndarray) -> np.ndarray:
-        found = np.asarray(gain(logarithm)) + np.asarray(log_prior(np.exp(logarithm))) + logarithm.sum(axis=1)
-        return np.where(np.isfinite(found), found, -np.inf)
+        density_at = np.asarray(gain(logarithm)) + np.asarray(log_prior(np.exp(logarithm))) + logarithm.sum(axis=1)
+        return np.where(np.isfinite(density_at), density_at, -np.inf)
 
     choice_key, normal_key = jax.random.split(key)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(choice_key)))
-    logarithm, log_mean = _drawn(density, np.log(held), draws, rng)
+    logarithm, log_mean = _drawn(density, np.log(fixed), draws, rng)
     position = np.empty((draws, len(mode.mean)))
     normal = np.asarray(jax.random.normal(normal_key, position.shape))
     for i, scale in enumerate(np.exp(logarithm)):
@@ -97,7 +91,7 @@ def integrate_scales(
         pull[index] -= mode.mean[index] / scale[owner] ** 2
         factor = np.linalg.cholesky(whole)
         position[i] = mode.mean + np.linalg.solve(factor.T, np.linalg.solve(factor, pull) + normal[i])
-    before = float(np.asarray(gain(np.log(held)[None]))[0])
+    before = float(np.asarray(gain(np.log(fixed)[None]))[0])
     return Mixed(np.exp(logarithm), position, mode.log_evidence + log_mean - before)
 
 
@@ -106,8 +100,8 @@ def _drawn(
 ) -> tuple[Float[np.ndarray, "draw scale"], float]:
     """Draws of a density in a few dimensions by resampling, and the logarithm of its integral."""
     k = len(start)
-    found = minimize(lambda x: -float(density(x[None])[0]), start, method="Nelder-Mead")
-    mode, unit = found.x, DIFFERENCE * np.eye(k)
+    optimum = minimize(lambda x: -float(density(x[None])[0]), start, method="Nelder-Mead")
+    mode, unit = optimum.x, DIFFERENCE * np.eye(k)
     corners = [mode + a * p + b * q for p in unit for q in unit for a in (1, -1) for b in (1, -1)]
     value = density(np.stack(corners)).reshape(k, k, 2, 2)
     curvature = -(value[..., 0, 0] - value[..., 0, 1] - value[..., 1, 0] + value[..., 1, 1]) / (4.0 * DIFFERENCE**2)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.bayes.problem import BatchedResiduals, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.climb import positive_part
+from rfdropo_bayes.inference.modes.optimisation import positive_part
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order 1
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
@@ -34,35 +34,26 @@ UNBOUNDED = (-np.inf, np.inf)
 
 
 class Target(NamedTuple):
-    """A posterior at one horizon, as functions of one unconstrained point (batched if marked).
+    """A posterior at one horizon, as functions of one unconstrained point (batched if marked)."""
 
-    Attributes:
-        density: log posterior of a batch (n, d).
-        likelihood: log likelihood of a batch (n, d).
-        prior_gradient, prior_hessian: derivatives of the log prior.
-        linearise: residuals (m,) and their Jacobian (m, d).
-        residuals: residuals (n, m) of a batch (n, d); zero for missing data.
-        noise: coordinates along which the log determinant changes.
-        differences: residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if
-            derivatives are not recomputed.
-        beside: gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is
-            neglected; None if these terms depend on noise coordinates only.
-        bounds: lowest and highest value of each coordinate.
-    """
-
-    density: Callable[[np.ndarray], np.ndarray]
-    likelihood: Callable[[np.ndarray], np.ndarray]
+    density: Callable[[np.ndarray], np.ndarray]  # log posterior of a batch (n, d)
+    likelihood: Callable[[np.ndarray], np.ndarray]  # log likelihood of a batch (n, d)
+    # prior_gradient, prior_hessian: derivatives of the log prior
     prior_gradient: Callable[[np.ndarray], np.ndarray]
     prior_hessian: Callable[[np.ndarray], np.ndarray]
-    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-    residuals: Callable[[np.ndarray], np.ndarray]
-    noise: Bool[np.ndarray, " d"]
+    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # residuals (m,) and their Jacobian (m, d)
+    residuals: Callable[[np.ndarray], np.ndarray]  # residuals (n, m) of a batch (n, d); zero for missing data
+    noise: Bool[np.ndarray, " d"]  # coordinates along which the log determinant changes
+    # residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if derivatives are
+    # not recomputed
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    # gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is neglected; None if
+    # these terms depend on noise coordinates only
     beside: Callable[[np.ndarray], np.ndarray] | None = None
-    bounds: tuple[Any, Any] = UNBOUNDED
+    bounds: tuple[Any, Any] = UNBOUNDED  # lowest and highest value of each coordinate
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
-        """See `Climbable.along`."""
+        """See `Optimisable.along`."""
         differences = self.differences
         if differences is None:
             return None
@@ -77,7 +68,7 @@ class Target(NamedTuple):
         return self._replace(linearise=linearise)
 
     def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
-        """See `Climbable.quadratic`."""
+        """See `Optimisable.quadratic`."""
         residual, jacobian = self.linearise(u)
         jacobian = _known(jacobian)
         gradient = -jacobian.T @ residual
@@ -92,7 +83,7 @@ class Target(NamedTuple):
         return gradient + self.prior_gradient(u), curvature + positive_part(-self.prior_hessian(u))
 
     def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-        """See `Climbable.information`: Gauss-Newton, with second differences for noise parameters."""
+        """See `Optimisable.information`: Gauss-Newton, with second differences for noise parameters."""
         curvature = self.quadratic(u)[1] - positive_part(-self.prior_hessian(u))
         if self.noise.any():
             exact = -_noise_hessian(self.likelihood, u, self.noise)

@@ -19,25 +19,15 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 
 
 class ScorePlan(NamedTuple):
-    """Sizes fixed at the start.
+    """Sizes fixed at the start."""
 
-    Attributes:
-        space: search space.
-        population: candidates per generation.
-        horizons: horizon of every generation, in rows.
-        finalists: number of candidates scored again.
-        fixed: values of fixed parameters.
-        scale: unit of the features [unit of the problem's features].
-        floor: added to the variance of each feature, in squares of that unit.
-    """
-
-    space: SearchSpace
-    population: int
-    horizons: tuple[int, ...]
-    finalists: int
-    fixed: dict[str, float]
-    scale: float
-    floor: Float[np.ndarray, " f"]
+    space: SearchSpace  # search space
+    population: int  # candidates per generation
+    horizons: tuple[int, ...]  # horizon of every generation, in rows
+    finalists: int  # number of candidates scored again
+    fixed: dict[str, float]  # values of fixed parameters
+    scale: float  # unit of the features [unit of the problem's features]
+    floor: Float[np.ndarray, " f"]  # added to the variance of each feature, in squares of that unit
 
 
 def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:
@@ -77,17 +67,17 @@ def simulate(
 
 
 def row_scores(
-    problem: RolloutProblem, plan: ScorePlan, found: CandidateRollouts, horizon: int
+    problem: RolloutProblem, plan: ScorePlan, rollouts: CandidateRollouts, horizon: int
 ) -> Float[np.ndarray, "c horizon"]:
     """Log likelihood (eq. 3) of each row under every candidate; minus infinity if half of its rollouts failed."""
     mask = np.asarray(problem.observed_mask)[:horizon]
     observed = np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale
-    c, m = found.alive.shape
+    c, m = rollouts.alive.shape
     rows = np.full((c, horizon), -np.inf)
     for index in range(c):
-        if found.alive[index].sum() >= max(2, m / 2):
-            features = found.features[index, :, :horizon]
-            rows[index] = step_log_likelihood(features, found.alive[index], observed, mask, plan.floor)
+        if rollouts.alive[index].sum() >= max(2, m / 2):
+            features = rollouts.features[index, :, :horizon]
+            rows[index] = step_log_likelihood(features, rollouts.alive[index], observed, mask, plan.floor)
     return rows
 
 

@@ -32,6 +32,11 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 
 OPTIMISERS = ("cma", "cem")
 HORIZONS = ("paper", "linear", "full")
+STEP = 0.3  # initial step of an optimiser, as a share of the search range
+LEVELS = 8  # rollouts are simulated to one of this many horizons, the shortest sufficient horizon
+# Added to the variances, in squared units of the trajectory's root mean square motion; unless the published pipeline is
+# asked for, the observation noise at the prior's medians is also added.
+FLOOR = 1e-5
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
 
@@ -45,11 +50,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         evaluations: number of candidates if there is no budget (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
         optimiser: "cma" or "cem".
-        sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
-        levels: rollouts are simulated to one of this many horizons, the shortest sufficient horizon.
-        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion. If
-            ``mended``, the observation noise at the prior's medians is also added.
         finalists: number of candidates scored again at the full horizon.
         parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
@@ -62,10 +63,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
     evaluations: int = 5000
     rollouts_per_candidate: int = 100
     optimiser: str = "cma"
-    sigma: float = 0.3
     horizon: str = "paper"
-    levels: int = 8
-    variance_floor: float = 1e-5
     finalists: int = 10
     parameters: tuple[str, ...] = ()
     search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -78,25 +76,18 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
             raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"use one of {OPTIMISERS}")
         if self.horizon not in HORIZONS:
             raise InputError(f"unknown horizon {self.horizon!r}", where=where, remedy=f"use one of {HORIZONS}")
-        least = {"evaluations": 1, "rollouts_per_candidate": 4, "levels": 1, "finalists": 1, "draws": 1}
+        least = {"evaluations": 1, "rollouts_per_candidate": 4, "finalists": 1, "draws": 1}
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
                 raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
-        if self.variance_floor <= 0.0 or self.sigma <= 0.0:
-            raise InputError("variance_floor and sigma must be positive", where=where)
 
 
 class SearchState(NamedTuple):
-    """History of the search; the optimiser's state is a function of it.
+    """History of the search; the optimiser's state is a function of it."""
 
-    Attributes:
-        candidates: candidates of every finished generation.
-        losses: their losses, each generation at its own horizon.
-        ledger, trace, seconds: as in every method.
-    """
-
-    candidates: Float[np.ndarray, "generation population k"]
-    losses: Float[np.ndarray, "generation population"]
+    candidates: Float[np.ndarray, "generation population k"]  # candidates of every finished generation
+    losses: Float[np.ndarray, "generation population"]  # their losses, each generation at its own horizon
+    # ledger, trace, seconds: as in every method
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float
@@ -119,7 +110,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     if config.rollouts is not None:
         generations = _affordable_generations(problem.n_rows, population, finalists, config)
     horizons = _horizons(generations, problem.n_rows, config)
-    floor = np.full(np.asarray(problem.observed_mask).shape[1], config.variance_floor)
+    floor = np.full(np.asarray(problem.observed_mask).shape[1], FLOOR)
     if config.mended:
         middle = {name: float(np.median(values)) for name, values in prior.items()}
         floor = floor + (np.asarray(problem.noise_deviation(middle), dtype=float) / scale) ** 2
@@ -134,10 +125,10 @@ def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int
     return tuple(paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
 
 
-def _simulated(horizon: int, n_rows: int, levels: int) -> int:
-    """The shortest of ``levels`` even horizons that covers one: few shapes, so that little is compiled."""
-    level = -(-horizon * levels // n_rows)
-    return min(n_rows, -(-level * n_rows // levels))
+def _simulated(horizon: int, n_rows: int) -> int:
+    """The shortest of `LEVELS` even horizons that covers one: few shapes, so that little is compiled."""
+    level = -(-horizon * LEVELS // n_rows)
+    return min(n_rows, -(-level * n_rows // LEVELS))
 
 
 def _affordable_generations(n_rows: int, population: int, finalists: int, config: RfdropoConfig) -> int:
@@ -147,7 +138,7 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
 
     def cost(generations: int) -> float:
         taus = _horizons(generations, n_rows, config)
-        return population * sum(_simulated(tau, n_rows, config.levels) for tau in taus) / n_rows
+        return population * sum(_simulated(tau, n_rows) for tau in taus) / n_rows
 
     if cost(1) > budget:
         least = config.rollouts_per_candidate * (finalists + cost(1))
@@ -178,9 +169,9 @@ def step(
     i = len(state.losses)
     m, d, horizon = config.rollouts_per_candidate, len(plan.space.names), plan.horizons[i]
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
-    simulated = _simulated(horizon, problem.n_rows, config.levels)
-    found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
-    values = -row_scores(problem, plan, found, horizon).sum(axis=1)
+    simulated = _simulated(horizon, problem.n_rows)
+    rollouts = simulate(problem, plan, asked, uniform, simulated, state.ledger)
+    values = -row_scores(problem, plan, rollouts, horizon).sum(axis=1)
     facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
     return state._replace(
@@ -205,12 +196,7 @@ def choose_finalists(state: SearchState, plan: ScorePlan, centre: Float[np.ndarr
     return np.stack(chosen[: max(1, plan.finalists)] if plan.finalists > 1 else chosen[1:2])
 
 
-def run(
-    problem: Problem,
-    config: RfdropoConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: RfdropoConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Search phi and draw from the distribution found.
 
     Raises:
@@ -240,7 +226,7 @@ def run(
         cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
-        held=dict(plan.fixed),
+        fixed=dict(plan.fixed),
         details=details,
     )
 
@@ -256,9 +242,7 @@ def _search(
     """All generations; a resumed optimiser is given its history again."""
     k = plan.space.dimension
     seed = int(host_generator(key).integers(2**31))
-    optimiser = make_optimiser(
-        config.optimiser, k, high=WIDTH, sigma=config.sigma, population=plan.population, seed=seed
-    )
+    optimiser = make_optimiser(config.optimiser, k, high=WIDTH, sigma=STEP, population=plan.population, seed=seed)
     saved = checkpoint.load()
     nothing = np.empty((0, plan.population, k)), np.empty((0, plan.population))
     empty = SearchState(*nothing, Ledger(), [], 0.0)
@@ -290,8 +274,8 @@ def _choose(
     finalists = choose_finalists(state, plan, centre)
     m, n = config.rollouts_per_candidate, problem.n_rows
     uniform = uniforms(jax.random.fold_in(key, FINAL), m, len(plan.space.names), stratified=True)
-    found = simulate(problem, plan, finalists, uniform, n, state.ledger)
-    scores = -row_scores(problem, plan, found, n).sum(axis=1)
+    rollouts = simulate(problem, plan, finalists, uniform, n, state.ledger)
+    scores = -row_scores(problem, plan, rollouts, n).sum(axis=1)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     return finalists[int(np.argmin(scores))], details
@@ -380,11 +364,11 @@ class CrossEntropy:
         return np.minimum(folded, 2.0 * self.high - folded)
 
     def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
-        """Refit to the elite; the spread is taken about the OLD mean, so that it cannot collapse on the way."""
+        """Refit to the elite. Deviations are taken from the OLD mean, so that the width does not collapse early."""
         best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
-        spread = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
+        deviation = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
         self.mean = self.smoothing * best.mean(axis=0) + (1.0 - self.smoothing) * self.mean
-        self.sd = self.smoothing * spread + (1.0 - self.smoothing) * self.sd
+        self.sd = self.smoothing * deviation + (1.0 - self.smoothing) * self.sd
 
     @property
     def centre(self) -> Float[np.ndarray, " d"]:

@@ -78,27 +78,24 @@ class SearchSpace(NamedTuple):
 
     def edge_cautions(self, vector: Float[np.ndarray, " k"], edge: float = 0.01) -> list[Caution]:
         """A caution for every mean or standard deviation within ``edge`` of its range from an end of it."""
-        d, found = len(self.names), []
+        d, cautions = len(self.names), []
         for j, name in enumerate(self.names):
             for what, value in (("mean", vector[j]), ("standard deviation", vector[d + j])):
                 side = "lower" if value < edge * WIDTH else "upper" if value > (1.0 - edge) * WIDTH else None
                 if side and not (what == "standard deviation" and side == "lower"):
                     sentence = f"the {what} of {name} sits on the {side} end of its search range"
-                    found.append(Caution(Code.SEARCH_EDGE, sentence))
+                    cautions.append(Caution(Code.SEARCH_EDGE, sentence))
                 elif side:
                     sentence = (
                         f"the standard deviation of {name} sits on its smallest value: the data do not ask for any "
                         "spread, which one trajectory never does"
                     )
-                    found.append(Caution(Code.NO_SPREAD, sentence, grave=True))
-        return found
+                    cautions.append(Caution(Code.NO_SPREAD, sentence, grave=True))
+        return cautions
 
 
 def search_space(
-    problem: Problem,
-    names: tuple[str, ...],
-    ranges: Mapping[str, tuple[float, float]],
-    prior: Values,
+    problem: Problem, names: tuple[str, ...], ranges: Mapping[str, tuple[float, float]], prior: Values
 ) -> SearchSpace:
     """Search ranges: the given ranges, else the central 99 % of the prior, which lie inside the bounds, like the
     paper's.

@@ -17,7 +17,7 @@ and covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -29,10 +29,9 @@ from scipy.special import gammaln, logsumexp
 from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.method_options import MethodOptions
-from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
-from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, mode_values
-from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
+from rfdropo_bayes.inference.modes.mode_search import Modes, mode_values
+from rfdropo_bayes.inference.modes.optimisation import SAME, Laplace, divergence
+from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import (
     Draws,
     InferenceResult,
@@ -51,39 +50,6 @@ PRIOR_SHARE = 0.05  # of the particles that start at prior draws, for modes that
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
-
-
-@dataclass(frozen=True, repr=False)
-class BridgeConfig(MethodOptions, called="Bridge"):
-    """Bridge: posterior and an evidence of small variance, by SMC from the optima to the posterior.
-
-    Attributes:
-        climb: settings of the search for optima.
-        rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
-        particles: number per replicate; None takes the largest number that the budget allows.
-        replicates: independent repetitions.
-        target_ess: share of effective particles kept from one target to the next.
-        draws: see `SmcConfig`.
-    """
-
-    climb: LaplaceConfig = field(default_factory=LaplaceConfig)
-    rollouts: float | None = None
-    particles: int | None = 500
-    replicates: int = 4
-    target_ess: float = 0.5
-    draws: int = 400
-
-    @property
-    def sampling(self) -> sampler.SmcConfig:
-        """The same as settings of the sampler."""
-        return sampler.SmcConfig(
-            rollouts=self.rollouts,
-            particles=self.particles,
-            replicates=self.replicates,
-            blocks=1,
-            target_ess=self.target_ess,
-            draws=self.draws,
-        )
 
 
 class BridgedProblem(ProblemDefaults):
@@ -126,72 +92,44 @@ class BridgedProblem(ProblemDefaults):
         density = evaluate_prior(self.problem, u) + np.asarray(rows).sum(axis=1)
         return (density - self.mixture.log_density(u))[:, None], np.asarray(status)
 
-    def carried_back(self, draws: Draws, names: tuple[str, ...]) -> tuple[Float[np.ndarray, "chain draw d"], Draws]:
-        """Draws from the bridge as points of the other problem, and as draws of its parameters, or of the parameters it
-        is a view of.
-        """
+    def carried_back(self, draws: Draws) -> Draws:
+        """Draws from the bridge as draws of the other problem's parameters."""
         u = np.stack([draws[name] for name in self.names], axis=-1)
         values = self.problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
-        return u, {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in names}
-
-
-def run(
-    problem: Problem,
-    config: BridgeConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
-    """Find the optima, then sample from around them to the posterior."""
-    climb_key, sample_key = jax.random.split(key)
-    digest = run_digest(problem, "bridge", config, key)
-    checkpoint = logbook.checkpoint("bridge_climbs", digest)
-    found = find_modes(problem, config.climb, climb_key, checkpoint, logbook.part(0.0, 0.5))
-    return sample_from_modes(problem, config, found, sample_key, logbook.part(0.5, 1.0))
+        return {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in self.problem.names}
 
 
 def sample_from_modes(
-    problem: Problem,
-    config: BridgeConfig,
-    found: Modes,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
+    problem: ResidualProblem, config: sampler.SmcConfig, optima: Modes, key: PRNGKeyArray, logbook: Logbook = UNRECORDED
 ) -> InferenceResult:
     """Sample from around optima that are known to the posterior; the result includes the cost of the optimisations."""
     moment_key, run_key = jax.random.split(key)
-    view: Problem = problem
-    modes, ledger, sampling = found.modes, found.climbs.ledger, config.sampling
-    if isinstance(problem, ResidualProblem):
-        view = straight = StraightProblem(problem, moment_key)
-        modes = [straight.mode(mode) for mode in modes]
-    bridged = BridgedProblem(view, covering(view, modes, moment_key))
-    sampled = sampler.run(bridged, sampling, run_key, logbook)
-    _, draws = bridged.carried_back(sampled.draws, problem.names)
-    spent = ledger + sampled.spent
+    straight = StraightProblem(problem, moment_key)
+    modes = [straight.mode(mode) for mode in optima.modes]
+    bridged = BridgedProblem(straight, covering(straight, modes, moment_key))
+    sampled = sampler.run(bridged, config, run_key, logbook)
+    draws = bridged.carried_back(sampled.draws)
+    spent = optima.search.ledger + sampled.spent
     # Several optima are normal for the mixture: no caution here, unlike in Laplace alone. The sampler's cautions about
     # coordinates and its share of rollouts are restated below for parameters and the total.
-    kept = stage_cautions(sampled.trace, sampling.rollouts)
+    kept = stage_cautions(sampled.trace, config.rollouts)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
-    first = found.climbs.trace[0]["horizon"]
-    kept += unseen_modes(sampling.chains, sum(row["horizon"] == first for row in found.climbs.trace))
-    kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
+    first = optima.search.trace[0]["horizon"]
+    kept += unseen_modes(config.chains, sum(row["horizon"] == first for row in optima.search.trace))
+    kept += [caution for caution in optima.cautions if caution.code is Code.OPTIMISATION_UNFINISHED]
     return replace(
         sampled,
-        method="bridge",
         draws=draws,
         prefix_log_evidence=None,
         block_scores=[],
         log_likelihood=None,
-        trace=[*found.climbs.trace, *sampled.trace],
+        trace=[*optima.search.trace, *sampled.trace],
         **spent.record(),
         cautions=[*kept, *prior_cautions(problem, draws), *exclusion_cautions(spent.excluded, spent.evaluations)],
-        seconds=found.climbs.seconds + sampled.seconds,
-        optimum=mode_values(problem, found.modes[0]),
+        seconds=optima.search.seconds + sampled.seconds,
+        optimum=mode_values(problem, optima.modes[0]),
         details=sampled.details
-        | {
-            "algorithm": "bridge",
-            "laplace_log_evidence": [mode.log_evidence for mode in found.modes],
-            "modes": len(found.modes),
-        },
+        | {"laplace_log_evidence": [mode.log_evidence for mode in optima.modes], "modes": len(optima.modes)},
     )
 
 
@@ -222,8 +160,8 @@ class ModeMixture:
     def sample(self, key: PRNGKeyArray, n: int) -> Float[np.ndarray, "n d"]:
         """Draws in random order; components get their exact shares, up to one draw."""
         generator = host_generator(key)
-        spread = (np.arange(n) + generator.uniform()) / n
-        component = np.searchsorted(np.cumsum(self.share), spread)
+        quantile = (np.arange(n) + generator.uniform()) / n
+        component = np.searchsorted(np.cumsum(self.share), quantile)
         of_mode = np.minimum(component, len(self.share) - 1)
         z = generator.standard_normal((n, self.means.shape[1]))
         scale = generator.chisquare(self.degrees, n) / self.degrees
@@ -239,15 +177,15 @@ class ModeMixture:
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
         """Log density, normalised; minus infinity if coordinates are not finite."""
         u = np.asarray(u)
-        held = np.isfinite(u).all(axis=1)
-        u = np.where(held[:, None], u, 0.0)
+        finite = np.isfinite(u).all(axis=1)
+        u = np.where(finite[:, None], u, 0.0)
         parts = [
             np.log(share) + _student_t(u, mean, factor, self.degrees)
             for share, mean, factor in zip(self.share, self.means, self.factors, strict=True)
         ]
         if self.prior_share > 0.0:
             parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, u))
-        return np.where(held, logsumexp(np.stack(parts), axis=0), -np.inf)
+        return np.where(finite, logsumexp(np.stack(parts), axis=0), -np.inf)
 
 
 def _student_t(
@@ -267,11 +205,11 @@ def _student_t(
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
     """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
     mean, prior = prior_moments(problem, key)
-    found = []
+    components = []
     for mode in modes:
         wide = _with_prior_moments(mode, mean, prior)
-        found += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
-    return found
+        components += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
+    return components
 
 
 def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:

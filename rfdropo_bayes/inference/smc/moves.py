@@ -19,21 +19,16 @@ from scipy.linalg import solve_triangular
 
 from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.problem import ProblemDefaults, ResidualProblem, Values
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 
 POSITIVE_DRAWS = 1000  # from the prior, which show the positive parameters
 
 
 class Reference(NamedTuple):
-    """Location and spread of a population, which shape its proposals.
+    """Location and spread of a population, which shape its proposals."""
 
-    Attributes:
-        mean: weighted mean.
-        cholesky: lower Cholesky factor of the weighted covariance.
-    """
-
-    mean: Float[np.ndarray, " d"]
-    cholesky: Float[np.ndarray, "d d"]
+    mean: Float[np.ndarray, " d"]  # weighted mean
+    cholesky: Float[np.ndarray, "d d"]  # lower Cholesky factor of the weighted covariance
 
 
 def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> Reference:
@@ -102,8 +97,8 @@ def propose(
     step = generator.standard_normal((n, d)) @ reference.cholesky.T
     centred = position - reference.mean
     distance = squared_distance(reference.cholesky, centred)
-    spread = 0.5 * (degrees + distance) / generator.standard_gamma(0.5 * (d + degrees), n)
-    moved = np.sqrt(1.0 - scale**2) * centred + scale * np.sqrt(spread)[:, None] * step
+    mixing = 0.5 * (degrees + distance) / generator.standard_gamma(0.5 * (d + degrees), n)
+    moved = np.sqrt(1.0 - scale**2) * centred + scale * np.sqrt(mixing)[:, None] * step
     change = np.log1p(squared_distance(reference.cholesky, moved) / degrees) - np.log1p(distance / degrees)
     return reference.mean + moved, 0.5 * (d + degrees) * change
 
@@ -119,8 +114,8 @@ def slowest_correlation(
     """Largest correlation, over the whitened directions, between a population before and after some moves."""
     first, second = (np.linalg.solve(reference.cholesky, (x - reference.mean).T) for x in (before, after))
     first, second = (x - x.mean(axis=1, keepdims=True) for x in (first, second))
-    spread = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
-    return float(np.max(np.sum(first * second, axis=1) / np.maximum(spread, 1e-300)))
+    norms = np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
+    return float(np.max(np.sum(first * second, axis=1) / np.maximum(norms, 1e-300)))
 
 
 def squared_distance(factor: Float[np.ndarray, "d d"], centred: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:

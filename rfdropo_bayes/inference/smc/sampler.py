@@ -20,7 +20,6 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import (
-    SPACINGS,
     Ledger,
     block_boundaries,
     evaluate_prior,
@@ -39,7 +38,7 @@ from rfdropo_bayes.inference.result import (
     unseen_modes,
 )
 from rfdropo_bayes.inference.smc.moves import initial_scale
-from rfdropo_bayes.inference.smc.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
+from rfdropo_bayes.inference.smc.tempering import MOST_MOVES, Population, StageInfo, prolong, refresh, stage
 
 PARTICLES_WITHOUT_BUDGET = 1000
 ROLLOUTS_PER_PARTICLE = 20.0
@@ -61,9 +60,6 @@ class SmcConfig(MethodOptions, called="SMC"):
         replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation. None
             takes up to four as the budget allows, or 1 without a budget: see `decided`.
         blocks: number of times the horizon is lengthened.
-        spacing: spacing of the blocks: "geometric" or "linear".
-        target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
-        max_moves: most moves in a stage.
         start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
         draws: least number of draws; fewer particles are moved further with the rest of a budget: see
             `tempering.prolong`.
@@ -73,9 +69,6 @@ class SmcConfig(MethodOptions, called="SMC"):
     particles: int | None = None
     replicates: int | None = None
     blocks: int = 6
-    spacing: str = "geometric"
-    target_ess: float = 0.5
-    max_moves: int = 20
     start: str = "auto"
     draws: int = 400
 
@@ -83,13 +76,7 @@ class SmcConfig(MethodOptions, called="SMC"):
         where = "[inference]"
         if self.start not in STARTS:
             raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"use one of {', '.join(STARTS)}")
-        if self.spacing not in SPACINGS:
-            raise InputError(
-                f"unknown spacing {self.spacing!r}", where=where, remedy=f"use one of {', '.join(SPACINGS)}"
-            )
-        if not 0.0 < self.target_ess < 1.0:
-            raise InputError(f"target_ess = {self.target_ess} is not between 0 and 1", where=where)
-        for name in ("replicates", "blocks", "max_moves", "draws"):
+        for name in ("replicates", "blocks", "draws"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
@@ -103,68 +90,46 @@ class SmcConfig(MethodOptions, called="SMC"):
         """Replicates that were asked for, or one."""
         return self.replicates or 1
 
-    @property
-    def tuning(self) -> Tuning:
-        """Settings of a stage."""
-        return Tuning(self.target_ess, self.max_moves)
-
 
 class ReplicatePlan(NamedTuple):
-    """Sizes that are fixed before a replicate starts.
+    """Sizes that are fixed before a replicate starts."""
 
-    Attributes:
-        particles: number of particles.
-        horizons: prefix lengths at the ends of the blocks.
-        budget: rollouts of this replicate; infinite for no limit.
-    """
-
-    particles: int
-    horizons: tuple[int, ...]
-    budget: float
+    particles: int  # number of particles
+    horizons: tuple[int, ...]  # prefix lengths at the ends of the blocks
+    budget: float  # rollouts of this replicate; infinite for no limit
+    most_moves: int = MOST_MOVES  # of a stage
 
 
 class SmcState(NamedTuple):
-    """State of a replicate between two stages.
+    """State of a replicate between two stages."""
 
-    Attributes:
-        population: particles; their rows reach to the end of the present block.
-        block: index of the present block; -1 before the first.
-        stage: number of stages done; random keys derive from it.
-        log_evidence: log p(rows passed).
-        prefix_log_evidence: log evidence at every prefix passed, NaN elsewhere.
-        ledger: cost and exclusions.
-        trace: one dictionary per stage.
-        seconds: time spent.
-        finished: the last stage is done.
-    """
-
-    population: Population
-    block: int
-    stage: int
-    log_evidence: float
-    prefix_log_evidence: Float[np.ndarray, " n_rows"]
-    ledger: Ledger
-    trace: list[dict[str, Any]]
-    seconds: float
-    finished: bool
+    population: Population  # particles; their rows reach to the end of the present block
+    block: int  # index of the present block; -1 before the first
+    stage: int  # number of stages done; random keys derive from it
+    log_evidence: float  # log p(rows passed)
+    prefix_log_evidence: Float[np.ndarray, " n_rows"]  # log evidence at every prefix passed, NaN elsewhere
+    ledger: Ledger  # cost and exclusions
+    trace: list[dict[str, Any]]  # one dictionary per stage
+    seconds: float  # time spent
+    finished: bool  # the last stage is done
 
 
 def decided(n_rows: int, config: SmcConfig) -> SmcConfig:
     """The settings with a number of replicates: the most that the budget allows with enough particles each."""
     if config.replicates is not None or config.rollouts is None:
         return config
-    looks = sum(block_boundaries(n_rows, config.blocks, config.spacing)) / n_rows
+    looks = sum(block_boundaries(n_rows, config.blocks)) / n_rows
     one = (config.particles or WORTH_A_REPLICATE) * max(ROLLOUTS_PER_PARTICLE, 2.0 * looks)
     return replace(config, replicates=int(np.clip(config.rollouts / one, 1, MOST_REPLICATES)))
 
 
-def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
-    """Fix particles and blocks so that the budget can be kept.
+def make_plan(problem: Problem, config: SmcConfig, horizons: tuple[int, ...] = ()) -> ReplicatePlan:
+    """Fix particles and blocks, which end at ``horizons`` if these are given, so that the budget can be kept.
 
     Raises:
         InputError: the budget is too small for one evaluation of every block and one last move per particle.
     """
-    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
+    horizons = horizons or block_boundaries(problem.n_rows, config.blocks)
     budget = np.inf if config.rollouts is None else config.rollouts / config.chains
     looks = sum(horizons) / problem.n_rows
     if config.particles is not None:
@@ -183,7 +148,7 @@ def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
     return ReplicatePlan(least, horizons, budget)
 
 
-def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan, config: SmcConfig) -> SmcState:
+def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan) -> SmcState:
     """Prior draws, before any rollout.
 
     Draws outside the range of their coordinates keep their share of the prior, with weight zero.
@@ -227,10 +192,9 @@ def step(
     horizon = plan.horizons[state.block]
     evaluate = partial(_evaluate, problem, horizon, state.ledger)
     moves = _affordable_moves(state, plan, horizon, problem.n_rows)
-    tuning = config.tuning
-    population, info = stage(key, state.population, float(horizon), evaluate, tuning, moves)
+    population, info = stage(key, state.population, float(horizon), evaluate, min(moves, plan.most_moves))
     if not np.isfinite(info.log_evidence_increment):
-        raise _nothing_left(state, horizon)
+        raise _no_remainder(state, horizon)
     finished = population.progress == problem.n_rows
     evidence = state.log_evidence + info.log_evidence_increment
     prefix = state.prefix_log_evidence.copy()
@@ -240,10 +204,12 @@ def step(
     if finished:
         moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
         last_key = jax.random.fold_in(key, 1)
-        population, done = refresh(last_key, population, info, evaluate, tuning, moves)
-        left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
-        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
-        population = prolong(jax.random.fold_in(key, 2), population, evaluate, tuning, done.moves, rounds)
+        population, done = refresh(last_key, population, info, evaluate, min(moves, plan.most_moves))
+        affordable = (
+            _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
+        )
+        rounds = min(affordable // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
+        population = prolong(jax.random.fold_in(key, 2), population, evaluate, done.moves, rounds)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
         population=population,
@@ -275,11 +241,11 @@ def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows
     if not np.isfinite(plan.budget):
         return 10**9
     looks = sum(plan.horizons[state.block + 1 :]) / n_rows
-    left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
+    remaining = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
     cost = plan.particles * horizon / n_rows
-    if left < cost:
+    if remaining < cost:
         return 0
-    return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
+    return max(1, int((remaining if last else 0.5 * remaining) / cost + 1e-9))
 
 
 def _facts(info: StageInfo) -> dict[str, Any]:
@@ -287,7 +253,7 @@ def _facts(info: StageInfo) -> dict[str, Any]:
     return {name: getattr(info, name) for name in kept}
 
 
-def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
+def _no_remainder(state: SmcState, horizon: int) -> NoLikelihoodError:
     return NoLikelihoodError(
         "the prior excludes the data: no parameter set has a positive likelihood "
         f"up to row {horizon} ({state.ledger.reasons})",
@@ -296,12 +262,7 @@ def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
     )
 
 
-def run(
-    problem: Problem,
-    config: SmcConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Sample a problem's posterior with independent replicates.
 
     Raises:
@@ -332,7 +293,7 @@ def _replicate(
 ) -> SmcState:
     init_key, stage_key = jax.random.split(key)
     saved = checkpoint.load()
-    state = init(init_key, problem, plan, config) if saved is None else unpack(*saved)
+    state = init(init_key, problem, plan) if saved is None else unpack(*saved)
     while not state.finished:
         state, _ = step(stage_key, state, problem, plan, config)
         checkpoint.save(*pack(state))

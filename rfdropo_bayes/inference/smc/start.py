@@ -30,28 +30,28 @@ from scipy.special import logsumexp
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, WarmStart
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
-from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, screened
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, starts_of_draws
+from rfdropo_bayes.inference.modes.optimisation import Laplace, laplace, maximise
 from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
-from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
+from rfdropo_bayes.inference.smc.tempering import EFFECTIVE, log_effective_sample_size
 
 FROM_OPTIMA = "smc_from_optima"
-CLIMBING = 0.25  # share of the budget for optimisations
-SURVEY_OF_ALL = 0.4  # and the survey before them
-PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
+OPTIMISING = 0.25  # share of the budget for optimisations
+PILOT_SHARE = 0.4  # and the pilot run before them
+PER_PILOT_PARTICLE = 32.0  # rollouts that a particle of the pilot run takes, typically
 # With fewer, more than half of the pilot runs on a rugged ridge missed the optimum.
-MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
-SURVEYED_STEPS = 7.0  # typical cost of an optimisation after a pilot run, in rollouts of the whole recording
+MOST_PILOT_PARTICLES, FEWEST_PILOT_PARTICLES = 128, 64
+PILOT_STEPS = 7.0  # typical cost of an optimisation after a pilot run, in rollouts of the whole recording
 CLOSE = 1e-2  # nats below its optimum at which an optimisation may end: the sampler starts from a wider distribution
 STEPS = 12.0  # typical steps of an optimisation at each horizon
-CLIMBED = 0.6  # share of the work that is done after the optimisations, for a progress bar
+OPTIMISED = 0.6  # share of the work that is done after the optimisations, for a progress bar
 SCORING = 0.1  # share of the budget for the evidence of the blocks
-SCREEN = 64  # prior draws; the likelihood's information is taken at the best
+PRIOR_DRAWS = 64  # prior draws; the likelihood's information is taken at the best
 MARGIN = 3.0  # cost of real posteriors over the estimate, which assumes normality and even data
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
 MOVES = 4.0  # of a stage: about 3 if the posterior is normal, otherwise more
@@ -61,72 +61,67 @@ MOST_STEPS = 12  # of the optimisation from the optimum of all rows to the optim
 MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
-def run(
-    problem: Problem,
-    config: SmcConfig,
-    key: PRNGKeyArray,
-    logbook: Logbook = UNRECORDED,
-) -> InferenceResult:
+def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
     """Sample a posterior, from the start that ``config.start`` names or that the budget allows.
 
     Raises:
         InputError: as `sampler.run`; or a start at the optima of a problem without residuals.
     """
-    if config.start == "prior" or (config.start == "auto" and not _worth_judging(problem, config)):
+    if config.start == "prior" or (config.start == "auto" and not _worth_comparing(problem, config)):
         return sampler.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
         raise InputError(
             'start = "optimum" needs residuals, but this problem has no residuals',
             where="[inference] start",
-            remedy='start = "prior", or method = "bridge"',
+            remedy='start = "prior"',
         )
-    judge_key, climb_key, sample_key = jax.random.split(key, 3)
+    way_key, search_key, sample_key = jax.random.split(key, 3)
     spent = Ledger()
-    way = found = None
+    way = optima = None
     try:
         if config.start == "auto":
-            way = expected_way(problem, config, judge_key, spent)
-        if way is None or not _affordable(way, config, _left(config, spent)):
-            checkpoint = logbook.checkpoint("smc_climbs", run_digest(problem, "smc_climbs", config, key))
-            climbing, climbs_log = _climbing(problem, config), logbook.part(0.0, CLIMBED)
-            found = find_modes(problem, climbing, climb_key, checkpoint, climbs_log, spent)
+            way = expected_way(problem, config, way_key, spent)
+        if way is None or not _affordable(way, config, _remaining(config, spent)):
+            checkpoint = logbook.checkpoint("smc_optimisations", run_digest(problem, "smc_optimisations", config, key))
+            search, search_log = _optimising(problem, config), logbook.part(0.0, OPTIMISED)
+            optima = find_modes(problem, search, search_key, checkpoint, search_log, spent)
     except NoLikelihoodError:
         if config.start == "optimum":
             raise
         # No draw had a likelihood for an optimisation: more particles must show whether the prior excludes the data.
-        left = replace(config, rollouts=_left(config, spent))
-        return _with_cost(sampler.run(problem, left, key, logbook), spent)
-    if found is not None:
-        return _from_optima(problem, config, found, way, sample_key, logbook.part(CLIMBED, 1.0))
+        remaining = replace(config, rollouts=_remaining(config, spent))
+        return _with_cost(sampler.run(problem, remaining, key, logbook), spent)
+    if optima is not None:
+        return _from_optima(problem, config, optima, way, sample_key, logbook.part(OPTIMISED, 1.0))
     assert way is not None
-    result = sampler.run(problem, _several(way, config, _left(config, spent)), sample_key, logbook)
+    result = sampler.run(problem, _several(way, config, _remaining(config, spent)), sample_key, logbook)
     facts = {"expected_stages": way.stages, "information_nats": way.information}
     return replace(_with_cost(result, spent), details=result.details | facts)
 
 
-def _left(config: SmcConfig, spent: Ledger) -> float | None:
+def _remaining(config: SmcConfig, spent: Ledger) -> float | None:
     return None if config.rollouts is None else config.rollouts - spent.rollouts
 
 
-def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
+def _optimising(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     """Settings of the search for optima. A pilot run is made if the budget allows it and no earlier posterior gives
     starts. The number of optimisations is limited so that each can converge: an unconverged optimum misleads the
     sampler.
     """
     if config.rollouts is None:
         return LaplaceConfig()
-    surveyors = min(int(SURVEY_OF_ALL * config.rollouts / PER_SURVEYOR), MOST_SURVEYORS)
-    if surveyors < FEWEST_SURVEYORS or (isinstance(problem, WarmStart) and problem.earlier):
-        surveyors = 0
-    budget = CLIMBING * config.rollouts
+    pilot_particles = min(int(PILOT_SHARE * config.rollouts / PER_PILOT_PARTICLE), MOST_PILOT_PARTICLES)
+    if pilot_particles < FEWEST_PILOT_PARTICLES or (isinstance(problem, WarmStart) and problem.earlier):
+        pilot_particles = 0
+    budget = OPTIMISING * config.rollouts
     # Three horizons that double cost 1.75 times the last. A step is a Jacobian by differences and 6 dampings.
-    steps = SURVEYED_STEPS if surveyors else 1.75 * STEPS
+    steps = PILOT_STEPS if pilot_particles else 1.75 * STEPS
     starts = int(np.clip(budget / (steps * (4.0 * len(problem.names) + 7.0)), 1, LaplaceConfig().starts))
-    limit = budget + surveyors * PER_SURVEYOR
-    return LaplaceConfig(starts=starts, survey=surveyors, tolerance=CLOSE, rollouts=limit)
+    limit = budget + pilot_particles * PER_PILOT_PARTICLE
+    return LaplaceConfig(starts=starts, pilot_particles=pilot_particles, tolerance=CLOSE, rollouts=limit)
 
 
-def _worth_judging(problem: Problem, config: SmcConfig) -> bool:
+def _worth_comparing(problem: Problem, config: SmcConfig) -> bool:
     """Without a budget a start at the prior never leaps; a small budget is better spent on particles than on
     optimisations.
     """
@@ -135,21 +130,21 @@ def _worth_judging(problem: Problem, config: SmcConfig) -> bool:
     return config.rollouts >= 40.0 * config.chains * max(FEWEST_PARTICLES, len(problem.names))
 
 
-def _affordable(way: Way, config: SmcConfig, left: float | None) -> bool:
-    if left is None:
+def _affordable(way: Way, config: SmcConfig, remaining: float | None) -> bool:
+    if remaining is None:
         return True
-    return MARGIN * max(config.particles or ENOUGH, FEWEST_PARTICLES) * config.chains * way.rollouts <= left
+    return MARGIN * max(config.particles or ENOUGH, FEWEST_PARTICLES) * config.chains * way.rollouts <= remaining
 
 
-def _several(way: Way, config: SmcConfig, left: float | None) -> SmcConfig:
+def _several(way: Way, config: SmcConfig, remaining: float | None) -> SmcConfig:
     """Settings of a start at the prior: with the largest affordable number of replicates, unless given."""
-    config = replace(config, rollouts=left)
-    if config.replicates is not None or left is None:
+    config = replace(config, rollouts=remaining)
+    if config.replicates is not None or remaining is None:
         return config
     one = MARGIN * max(config.particles or WORTH_A_REPLICATE, FEWEST_PARTICLES) * way.rollouts
-    replicates = int(np.clip(left / one, 1, MOST_REPLICATES))
+    replicates = int(np.clip(remaining / one, 1, MOST_REPLICATES))
     if replicates > 1 and config.particles is None:
-        config = replace(config, particles=int(left / (replicates * MARGIN * way.rollouts)))
+        config = replace(config, particles=int(remaining / (replicates * MARGIN * way.rollouts)))
     return replace(config, replicates=replicates)
 
 
@@ -159,27 +154,17 @@ def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
 
 
 def _from_optima(
-    problem: ResidualProblem,
-    config: SmcConfig,
-    found: Modes,
-    way: Way | None,
-    key: PRNGKeyArray,
-    logbook: Logbook,
+    problem: ResidualProblem, config: SmcConfig, optima: Modes, way: Way | None, key: PRNGKeyArray, logbook: Logbook
 ) -> InferenceResult:
     sample_key, score_key = jax.random.split(key)
-    left = _left(config, found.climbs.ledger)
-    prefixed = len(block_boundaries(problem.n_rows, config.blocks, config.spacing)) > 1
-    scoring = None if left is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
-    sampling = None if left is None else left - scoring  # type: ignore[operator]
-    settings = bridge.BridgeConfig(
-        rollouts=sampling,
-        particles=config.particles,
-        replicates=sampler.decided(1, replace(config, rollouts=sampling, blocks=1)).chains,
-        target_ess=config.target_ess,
-        draws=config.draws,
-    )
-    result = bridge.sample_from_modes(problem, settings, found, sample_key, logbook)
-    prefixes, ledger = _prefixes(problem, config, found, scoring, score_key)
+    remaining = _remaining(config, optima.search.ledger)
+    prefixed = len(block_boundaries(problem.n_rows, config.blocks)) > 1
+    scoring = None if remaining is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
+    sampling = None if remaining is None else remaining - scoring  # type: ignore[operator]
+    once = replace(config, rollouts=sampling, blocks=1)
+    settings = replace(once, replicates=sampler.decided(1, once).chains)
+    result = bridge.sample_from_modes(problem, settings, optima, sample_key, logbook)
+    prefixes, ledger = _prefixes(problem, config, optima, scoring, score_key)
     value, sd = result.log_evidence or (np.nan, np.nan)
     whole = PrefixEvidence(problem.n_rows, value, 0.0 if np.isnan(sd) else sd, 1.0)
     every = np.full(problem.n_rows, np.nan)
@@ -201,33 +186,27 @@ def _from_optima(
 
 
 def _prefixes(
-    problem: ResidualProblem, config: SmcConfig, found: Modes, scoring: float | None, key: PRNGKeyArray
+    problem: ResidualProblem, config: SmcConfig, optima: Modes, scoring: float | None, key: PRNGKeyArray
 ) -> tuple[list[PrefixEvidence], Ledger]:
     """Evidence at the ends of all blocks but the last, whose evidence is the sampler's."""
     ledger = Ledger()
-    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)[:-1]
-    assert found.climbs.noise is not None
+    horizons = block_boundaries(problem.n_rows, config.blocks)[:-1]
+    assert optima.search.noise is not None
     if not horizons:
         return [], ledger
-    return prefix_evidence(problem, found.modes[0], found.climbs.noise, horizons, scoring, key, ledger), ledger
+    return prefix_evidence(problem, optima.modes[0], optima.search.noise, horizons, scoring, key, ledger), ledger
 
 
 class Way(NamedTuple):
-    """From the prior to the posterior.
+    """From the prior to the posterior."""
 
-    Attributes:
-        stages: expected number of targets in between.
-        rollouts: full-length rollouts that each particle needs for it.
-        information: entropy lost on the way if both ends are normal [nat].
-    """
-
-    stages: float
-    rollouts: float
-    information: float
+    stages: float  # expected number of targets in between
+    rollouts: float  # full-length rollouts that each particle needs for it
+    information: float  # entropy lost on the way if both ends are normal [nat]
 
 
 def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray, ledger: Ledger) -> Way:
-    """The way to a posterior that is as sharp as the likelihood at the best of `SCREEN` prior draws.
+    """The way to a posterior that is as sharp as the likelihood at the best of `PRIOR_DRAWS` prior draws.
 
     Noise is taken at its prior's median: with the noise that fits such a draw the likelihood would be far too flat.
     About log scales of noise, m residuals hold the information 2 m.
@@ -242,7 +221,7 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
         NoLikelihoodError: none of the draws has a positive likelihood.
     """
     draw_key, prior_key, way_key = jax.random.split(key, 3)
-    best = screened(problem, SCREEN, block_boundaries(problem.n_rows, 3)[0], 1, draw_key, ledger)[0][0]
+    best = starts_of_draws(problem, PRIOR_DRAWS, block_boundaries(problem.n_rows, 3)[0], 1, draw_key, ledger)[0][0]
     target = make_target(problem, problem.n_rows, ledger, best, prior_derivatives(problem))
     mean, covariance = bridge.prior_moments(problem, prior_key)
     point = np.where(target.noise, mean, best)
@@ -250,20 +229,18 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
     jacobian = np.where(target.noise | ~np.isfinite(jacobian).all(axis=0), 0.0, jacobian)
     information = jacobian.T @ jacobian + np.diag(np.where(target.noise, 2.0 * np.count_nonzero(residuals), 0.0))
     mode = Laplace(point, bridge.joint_covariance(information, covariance), 0.0)
-    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
-    return way_from_prior(problem, mode, horizons, config.target_ess, way_key)
+    horizons = block_boundaries(problem.n_rows, config.blocks)
+    return way_from_prior(problem, mode, horizons, way_key)
 
 
-def way_from_prior(
-    problem: Problem, mode: Laplace, horizons: tuple[int, ...], target_ess: float, key: PRNGKeyArray, n: int = 1000
-) -> Way:
+def way_from_prior(problem: Problem, mode: Laplace, horizons: tuple[int, ...], key: PRNGKeyArray, n: int = 1000) -> Way:
     """Expected stages and rollouts of a sampler that starts at the prior and adds the data at ``horizons``."""
     prior = np.asarray(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
     information, offset = _whitened(prior.mean(axis=0), np.atleast_2d(np.cov(prior.T)), mode)
     share = np.geomspace(1e-3 / max(float(information.max()), 1.0), 1.0, 2000)
     growth = 1.0 + share[:, None] * information
     speed = 0.5 * (information / growth) ** 2 + (information * offset) ** 2 / growth**3
-    rate = np.sqrt(speed.sum(axis=1) / np.log(1.0 / target_ess))
+    rate = np.sqrt(speed.sum(axis=1) / np.log(1.0 / EFFECTIVE))
     stages = 0.5 * (rate[1:] + rate[:-1]) * np.diff(share)
     prefix = np.asarray(horizons) / problem.n_rows
     cost = prefix[np.minimum(np.searchsorted(prefix, share[1:] - 1e-12), len(prefix) - 1)]
@@ -318,7 +295,7 @@ def prefix_evidence(
     steps, draws = _affordable_scores(problem, noise, horizons, budget)
     if steps < 1 or draws < FEWEST_DRAWS:
         return []
-    prior, start, found = prior_derivatives(problem), mode.mean, []
+    prior, start, estimates = prior_derivatives(problem), mode.mean, []
     for horizon in sorted(horizons, reverse=True):
         target = make_target(problem, horizon, ledger, start, prior, "auto", noise)
         state, _ = maximise(target, start, max_steps=steps, tolerance=1e-2)
@@ -326,8 +303,8 @@ def prefix_evidence(
         mixture = ModeMixture(problem, [laplace(target, state)], INFLATION, DEGREES, PRIOR_SHARE)
         u = mixture.sample(jax.random.fold_in(key, horizon), draws)
         density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
-        found.append(_estimate(horizon, density - mixture.log_density(u)))
-    return found[::-1]
+        estimates.append(_estimate(horizon, density - mixture.log_density(u)))
+    return estimates[::-1]
 
 
 def _affordable_scores(

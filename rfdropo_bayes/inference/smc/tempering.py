@@ -31,6 +31,8 @@ from rfdropo_bayes.inference.smc.moves import (
 )
 
 DEGREES = 8.0  # of freedom of the Student-t behind proposals
+EFFECTIVE = 0.5  # share of the live particles that stays effective from one target to the next
+MOST_MOVES = 20  # of a stage
 ACCEPTANCE = 0.3  # that step sizes are adapted to
 CORRELATION = 0.3  # moves continue until no direction has a larger correlation with the start of the stage
 
@@ -38,61 +40,30 @@ Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Population(NamedTuple):
-    """Weighted particles on their way along a path.
+    """Weighted particles on their way along a path."""
 
-    Attributes:
-        position: unconstrained particles.
-        base: log density of the path's starting target.
-        rows: log density still to come in, and already in, row by row; minus infinity is a dead particle.
-        log_weights: normalised.
-        progress: position s on the path, in rows.
-        scale: step size of the proposals, carried from stage to stage.
-    """
-
-    position: Float[np.ndarray, "n d"]
-    base: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n d"]  # unconstrained particles
+    base: Float[np.ndarray, " n"]  # log density of the path's starting target
+    # log density still to come in, and already in, row by row; minus infinity is a dead particle
     rows: Float[np.ndarray, "n h"]
-    log_weights: Float[np.ndarray, " n"]
-    progress: float
-    scale: float
-
-
-class Tuning(NamedTuple):
-    """Settings of a stage's moves.
-
-    Attributes:
-        target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        max_moves: most moves in a stage.
-    """
-
-    target_ess: float
-    max_moves: int
+    log_weights: Float[np.ndarray, " n"]  # normalised
+    progress: float  # position s on the path, in rows
+    scale: float  # step size of the proposals, carried from stage to stage
 
 
 class StageInfo(NamedTuple):
-    """Facts about one stage.
+    """Facts about one stage."""
 
-    Attributes:
-        progress: position on the path at its end.
-        log_evidence_increment: its increment of the log evidence.
-        row_log_evidence: log evidence, relative to the start of the stage, at each whole row it passed.
-        passed: these rows, as prefix lengths.
-        ess: effective sample size before resampling, as a share of all particles.
-        moves: number of moves of every particle, 0 if weights were kept instead.
-        acceptance: mean acceptance over the moves.
-        scale: step size at the end.
-        correlation: slowest remaining correlation after the moves.
-    """
-
-    progress: float
-    log_evidence_increment: float
+    progress: float  # position on the path at its end
+    log_evidence_increment: float  # its increment of the log evidence
+    # log evidence, relative to the start of the stage, at each whole row it passed
     row_log_evidence: Float[np.ndarray, " passed"]
-    passed: Int[np.ndarray, " passed"]
-    ess: float
-    moves: int
-    acceptance: float
-    scale: float
-    correlation: float
+    passed: Int[np.ndarray, " passed"]  # these rows, as prefix lengths
+    ess: float  # effective sample size before resampling, as a share of all particles
+    moves: int  # number of moves of every particle, 0 if weights were kept instead
+    acceptance: float  # mean acceptance over the moves
+    scale: float  # step size at the end
+    correlation: float  # slowest remaining correlation after the moves
 
 
 def path_density(rows: Float[np.ndarray, "n h"], progress: float) -> Float[np.ndarray, " n"]:
@@ -103,14 +74,11 @@ def path_density(rows: Float[np.ndarray, "n h"], progress: float) -> Float[np.nd
     return total + share * rows[:, whole] if share > 0.0 else total
 
 
-def advance(
-    population: Population, target_ess: float, stop: float, *, leap: bool
-) -> tuple[Population, StageInfo, bool]:
+def advance(population: Population, stop: float, *, leap: bool) -> tuple[Population, StageInfo, bool]:
     """Reweight to the next target of the path, at most to ``stop``.
 
     Args:
         population: particles at ``population.progress``.
-        target_ess: share of effective particles to keep.
         stop: end of the path.
         leap: go to the end with any weights (for an exhausted budget).
 
@@ -138,7 +106,7 @@ def advance(
     if leap:
         step, kept = stop - start, False
     else:
-        step, kept = next_step(log_weights_at, stop - start, target_ess)
+        step, kept = next_step(log_weights_at, stop - start, EFFECTIVE)
     progress = stop if step >= stop - start else start + step
     weights = log_weights_at(progress - start)
     increment = float(logsumexp(weights))
@@ -162,12 +130,12 @@ def cross_references(population: Population) -> tuple[Reference, Reference]:
     weights = np.exp(population.log_weights)
     halves = (slice(n // 2, n), slice(0, n // 2))
     whole = fit_reference(population.position, weights / weights.sum())
-    found = []
+    references = []
     for half in halves:
         share = weights[half].sum()
         usable = share > 0.0 and distinct_size(population.position[half], weights[half]) > 2.0
-        found.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
-    return found[0], found[1]
+        references.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
+    return references[0], references[1]
 
 
 def resample(key: PRNGKeyArray, population: Population) -> tuple[Population, Int[np.ndarray, " n"]]:
@@ -190,7 +158,6 @@ def move(
     references: tuple[Reference, Reference],
     second: Bool[np.ndarray, " n"],
     evaluate: Evaluate,
-    tuning: Tuning,
     moves: int,
 ) -> tuple[Population, dict[str, Any]]:
     """Metropolis moves of equal-weight particles under the target at ``population.progress``.
@@ -201,7 +168,6 @@ def move(
         references: location and spread that shape the proposals of the two halves.
         second: particles that belong to the second half.
         evaluate: proposals to (base, rows).
-        tuning: proposals and stopping rule.
         moves: most moves the budget allows; at least one is made.
 
     Returns:
@@ -210,7 +176,7 @@ def move(
     first, scale, rates = population.position, population.scale, []
     density = population.base + path_density(population.rows, population.progress)
     correlation = 1.0
-    for count in range(max(1, min(moves, tuning.max_moves))):
+    for count in range(max(1, moves)):
         generator = host_generator(jax.random.fold_in(key, count))
         proposal, ratio = _by_halves(generator, population.position, references, second, scale)
         base, rows = evaluate(proposal)
@@ -245,30 +211,20 @@ def _by_halves(
 
 
 def stage(
-    key: PRNGKeyArray,
-    population: Population,
-    stop: float,
-    evaluate: Evaluate,
-    tuning: Tuning,
-    moves: int,
+    key: PRNGKeyArray, population: Population, stop: float, evaluate: Evaluate, moves: int
 ) -> tuple[Population, StageInfo]:
     """Reweight towards ``stop``; resample and move unless the end was reached with enough effective particles.
 
     ``moves`` = 0 means that the budget is spent: the stage leaps to the end of the path and only resamples.
     """
-    population, info, kept = advance(population, tuning.target_ess, stop, leap=moves == 0)
+    population, info, kept = advance(population, stop, leap=moves == 0)
     if kept or not np.isfinite(info.log_evidence_increment):
         return population, info
-    return refresh(key, population, info, evaluate, tuning, moves)
+    return refresh(key, population, info, evaluate, moves)
 
 
 def refresh(
-    key: PRNGKeyArray,
-    population: Population,
-    info: StageInfo,
-    evaluate: Evaluate,
-    tuning: Tuning,
-    moves: int,
+    key: PRNGKeyArray, population: Population, info: StageInfo, evaluate: Evaluate, moves: int
 ) -> tuple[Population, StageInfo]:
     """Resample to equal weights and move under the present target."""
     resample_key, move_key = jax.random.split(key)
@@ -278,13 +234,11 @@ def refresh(
     halves = index >= len(index) // 2
     if moves == 0:
         return population, info
-    population, done = move(move_key, population, references, halves, evaluate, tuning, moves)
+    population, done = move(move_key, population, references, halves, evaluate, moves)
     return population, info._replace(**done)
 
 
-def prolong(
-    key: PRNGKeyArray, population: Population, evaluate: Evaluate, tuning: Tuning, moves: int, rounds: int
-) -> Population:
+def prolong(key: PRNGKeyArray, population: Population, evaluate: Evaluate, moves: int, rounds: int) -> Population:
     """Equal-weight particles, with their positions after each round of moves under the same target.
 
     All are draws of the target; a hundred particles give coarse quantiles, even more so with copies from resampling.
@@ -292,13 +246,15 @@ def prolong(
     The key must differ from the key of the `refresh` before: ``fold_in(key, i)`` is the i-th part of ``split(key)``,
     and moves with the same random numbers end near their start.
     """
-    found = [population]
+    populations = [population]
     for index in range(rounds):
         second = np.arange(len(population.base)) >= len(population.base) // 2
         round_key = jax.random.fold_in(key, 1 + index)
-        found.append(move(round_key, found[-1], cross_references(found[-1]), second, evaluate, tuning, moves)[0])
+        populations.append(
+            move(round_key, populations[-1], cross_references(populations[-1]), second, evaluate, moves)[0]
+        )
     joined: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in found]) for name in ("position", "base", "rows")
+        name: np.concatenate([getattr(p, name) for p in populations]) for name in ("position", "base", "rows")
     }
     count = len(joined["base"])
     return population._replace(log_weights=np.full(count, -np.log(count)), **joined)

@@ -98,11 +98,11 @@ def _made(adapter: Any, name: str, options: Mapping[str, Any]) -> BlackBox:
         remedy = "leave [adapter] out" if isinstance(adapter, BlackBox) else "see docs/your_simulator.md"
         raise InputError(f"{name!r} takes no arguments", where="[adapter]", remedy=remedy)
     try:
-        found = adapter(**options)
+        box = adapter(**options)
     except TypeError as error:
         raise InputError(f"{name}: {error}", where="[adapter]", remedy="see docs/your_simulator.md") from None
-    if not isinstance(found, BlackBox):
+    if not isinstance(box, BlackBox):
         raise InputError(
-            f"{name!r} gives {type(found).__name__}, no BlackBox", where="robot", remedy="see docs/your_simulator.md"
+            f"{name!r} gives {type(box).__name__}, no BlackBox", where="robot", remedy="see docs/your_simulator.md"
         )
-    return found
+    return box

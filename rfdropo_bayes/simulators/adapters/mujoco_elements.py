@@ -23,24 +23,17 @@ TURNING, SLIDING = "rotational", "linear"
 
 
 class Attribute(NamedTuple):
-    """An attribute of a kind of element.
+    """An attribute of a kind of element."""
 
-    Attributes:
-        fields: its fields of MjModel, each with a column (None for all of them) and the sign it enters with; all of
-            them change by the same factor.
-        unit: SI unit; one for linear and one for rotational motion if these differ.
-        signed: whether it may be negative.
-        sigma: standard deviation of its logarithm under the default prior.
-        typical: scale of the default prior if its nominal value is zero or it may be negative; in ``unit``.
-        words: its description.
-    """
-
+    # its fields of MjModel, each with a column (None for all of them) and the sign it enters with; all of them change
+    # by the same factor
     fields: tuple[tuple[str, int | None, float], ...]
-    unit: str | tuple[str, str]
-    signed: bool
-    sigma: float
+    unit: str | tuple[str, str]  # SI unit; one for linear and one for rotational motion if these differ
+    signed: bool  # whether it may be negative
+    sigma: float  # standard deviation of its logarithm under the default prior
+    # scale of the default prior if its nominal value is zero or it may be negative; in ``unit``
     typical: float | tuple[float, float]
-    words: str
+    words: str  # its description
 
 
 def _plain(field: str, unit: str | tuple[str, str], sigma: float, typical: Any, words: str) -> Attribute:
@@ -145,18 +138,12 @@ class Place(NamedTuple):
 
 
 class Edit(NamedTuple):
-    """Effect of one parameter on a model.
+    """Effect of one parameter on a model."""
 
-    Attributes:
-        places: changed entries.
-        nominal: value in the model.
-        form: "value"; "factor" on the model's value; or "offset", added to it.
-        elements: (kind, number, attribute) of the changed elements, for the file of a calibrated model.
-    """
-
-    places: tuple[Place, ...]
-    nominal: float
-    form: str
+    places: tuple[Place, ...]  # changed entries
+    nominal: float  # value in the model
+    form: str  # "value"; "factor" on the model's value; or "offset", added to it
+    # (kind, number, attribute) of the changed elements, for the file of a calibrated model
     elements: tuple[tuple[str, int, str], ...]
 
     def apply(self, model: Any, value: float) -> None:
@@ -178,8 +165,8 @@ def field_of(model: Any, name: str) -> Any:
     owner, _, attribute = name.rpartition(".")
     if not owner:
         return getattr(model, name)
-    found = getattr(getattr(model, owner), attribute)
-    return found if isinstance(found, np.ndarray) else _Scalar(getattr(model, owner), attribute)
+    field = getattr(getattr(model, owner), attribute)
+    return field if isinstance(field, np.ndarray) else _Scalar(getattr(model, owner), attribute)
 
 
 class _Scalar:
@@ -275,7 +262,7 @@ def _nominal(model: Any, places: Sequence[Place], where: str) -> float:
 
 def places_of(model: Any, kind: str, number: int, attribute: Attribute) -> tuple[Place, ...]:
     """Entries of all fields in which an attribute of an element stands."""
-    found = []
+    places = []
     for field, column, sign in attribute.fields:
         rows: Any = number
         if kind == "joint" and field.startswith(("dof_", "qpos_")):
@@ -288,8 +275,8 @@ def places_of(model: Any, kind: str, number: int, attribute: Attribute) -> tuple
             index: tuple[Any, ...] = () if column is None else (column,)
         else:
             index = (rows,) if column is None else (rows, column)
-        found.append(Place(field, index, sign))
-    return tuple(found)
+        places.append(Place(field, index, sign))
+    return tuple(places)
 
 
 def _joint_rows(model: Any, number: int, field: str) -> slice:

@@ -79,10 +79,10 @@ def _edited(
 
 def _elements_of(root: ET.Element) -> dict[str, list[ET.Element]]:
     """Elements of each kind in the order of the compiled model."""
-    found: dict[str, list[ET.Element]] = {"body": [], "joint": [], "geom": [], "site": []}
+    elements: dict[str, list[ET.Element]] = {"body": [], "joint": [], "geom": [], "site": []}
 
     def visit(body: ET.Element) -> None:
-        found["body"].append(body)
+        elements["body"].append(body)
         inner: list[ET.Element] = []
 
         def own(element: ET.Element) -> None:
@@ -93,7 +93,7 @@ def _elements_of(root: ET.Element) -> dict[str, list[ET.Element]]:
                     inner.append(child)
                 for kind, tags in IN_BODIES.items():
                     if child.tag in tags:
-                        found[kind].append(child)
+                        elements[kind].append(child)
 
         own(body)
         for child in inner:
@@ -105,8 +105,8 @@ def _elements_of(root: ET.Element) -> dict[str, list[ET.Element]]:
         whole.extend(list(world))
     visit(whole)
     for kind, section in SECTIONS.items():
-        found[kind] = [child for part in root.findall(section) for child in part]
-    return found
+        elements[kind] = [child for part in root.findall(section) for child in part]
+    return elements
 
 
 def _words(values: Any) -> str:
@@ -205,13 +205,13 @@ def _write_option(root: ET.Element, model: Any, attribute: str) -> None:
 def _find_files(root: ET.Element, folder: Path) -> None:
     """Name meshes and textures such that they are found from any folder."""
     compiler = root.find("compiler")
-    told = {} if compiler is None else compiler.attrib
-    places = [folder / told.get(key, "") for key in ("meshdir", "texturedir", "assetdir")] + [folder]
+    settings = {} if compiler is None else compiler.attrib
+    places = [folder / settings.get(key, "") for key in ("meshdir", "texturedir", "assetdir")] + [folder]
     for element in root.iter():
         name = element.get("file")
         if name is not None and element.tag != "include":
-            found = next((place / name for place in places if (place / name).is_file()), None)
-            element.set("file", name if found is None else str(found.resolve()))
+            file = next((place / name for place in places if (place / name).is_file()), None)
+            element.set("file", name if file is None else str(file.resolve()))
 
 
 def _same(rollouts: Any, model: Any, text: str) -> bool:

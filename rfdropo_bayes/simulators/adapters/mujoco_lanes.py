@@ -37,8 +37,8 @@ class MuJoCoLanes:
         """See `BodyLanes`."""
         self._take_values(rows, np.stack([np.asarray(given.material[name], float) for name in self.rollouts.edits], 1))
         first = np.asarray(given.start, float)
-        state, found = self.rollouts.begun([self._models[row] for row in rows], self._ctrl(first[:, None])[:, 0])
-        self._state[rows], self._failed[rows] = state, ~found
+        state, valid = self.rollouts.begun([self._models[row] for row in rows], self._ctrl(first[:, None])[:, 0])
+        self._state[rows], self._failed[rows] = state, ~valid
         return self._moved(rows, np.zeros((len(rows), 0, first.shape[1])), first)
 
     def advance(self, displacement: Float[np.ndarray, "lane step channel"]) -> Motion:
@@ -68,14 +68,11 @@ class MuJoCoLanes:
         return ctrl
 
     def _moved(
-        self,
-        rows: np.ndarray,
-        commands: Float[np.ndarray, "row step channel"],
-        held: Float[np.ndarray, "row channel"],
+        self, rows: np.ndarray, commands: Float[np.ndarray, "row step channel"], last: Float[np.ndarray, "row channel"]
     ) -> Motion:
-        """Take a step for each command, and one more under ``held`` that shows the state before it."""
+        """Take a step for each command, and one more under ``last`` that shows the state before it."""
         steps, clock = commands.shape[1], self.rollouts.model.opt.timestep
-        ctrl = self._ctrl(np.concatenate([commands, held[:, None]], axis=1))
+        ctrl = self._ctrl(np.concatenate([commands, last[:, None]], axis=1))
         begun = self._state[rows, 0]
         states, seen = self.rollouts.rolled([self._models[row] for row in rows], self._state[rows], ctrl)
         if steps:

@@ -44,8 +44,7 @@ PERIOD, LONGEST, STILL = 10, 4000, 1e-7
 """Settling: steps between looks at the kinetic energy, most such periods, and the speed below which a body is at rest
 [m/s or rad/s]."""
 SHAKES = 20  # periods that a body has to stay at rest over, as speed is small wherever it turns round as well
-MARKED = ("site", "body", "geom")
-"""Elements that may be markers, in the order in which a bare name is looked up."""
+MARKED = ("site", "body", "geom")  # elements that may be markers, in the order in which a bare name is looked up
 
 
 def MuJoCo(
@@ -155,7 +154,7 @@ def _markers(spec: Any, markers: Mapping[str, str] | Sequence[str] | None) -> di
             "the model has no named site: state the elements of the markers", where="markers", remedy=remedy
         )
     given = dict(markers) if isinstance(markers, Mapping) else {each: each for each in markers}
-    found = {}
+    markers_found = {}
     for marker, place in given.items():
         kind, _, rest = place.partition("/")
         if kind in MARKED and rest:
@@ -166,8 +165,8 @@ def _markers(spec: Any, markers: Mapping[str, str] | Sequence[str] | None) -> di
         if not kind:
             remedy = nearest(name, [each for k in kinds for each in names[k]])
             raise InputError(f"no {' or '.join(kinds)} {name!r}", where=f"marker {marker!r}", remedy=remedy)
-        found[marker] = kind, name
-    return found
+        markers_found[marker] = kind, name
+    return markers_found
 
 
 def _elements(spec: Any, kind: str) -> Sequence[Any]:
@@ -289,8 +288,8 @@ class MuJoCoRollouts:
     @property
     def command_unit(self) -> str:
         """Unit of the commands: of a length or an angle that actuators follow, of a force or a torque, else "-"."""
-        found = {self._unit_of(number) for number in self.actuators.values()}
-        return found.pop() if len(found) == 1 else "-"
+        units = {self._unit_of(number) for number in self.actuators.values()}
+        return units.pop() if len(units) == 1 else "-"
 
     def _unit_of(self, number: int) -> str:
         import mujoco
@@ -326,8 +325,8 @@ class MuJoCoRollouts:
         content = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, content)
         edits = sorted((name, edit.form, edit.elements) for name, edit in self.edits.items())
-        told = repr((self.start, sorted(self.channels.items()), sorted(self.cables.items()), edits))
-        return hashlib.sha256(content.tobytes() + told.encode()).hexdigest()
+        settings = repr((self.start, sorted(self.channels.items()), sorted(self.cables.items()), edits))
+        return hashlib.sha256(content.tobytes() + settings.encode()).hexdigest()
 
     def _first_state(self) -> tuple[np.ndarray, np.ndarray]:
         """Whole state, and commands, that a rollout begins with."""
@@ -356,13 +355,13 @@ class MuJoCoRollouts:
         models = self.models(values, len(commands))
         ctrl = np.tile(self.first[1], (*commands.shape[:2], 1))
         ctrl[:, :, list(self.channels.values())] = commands
-        state, found = self.begun(models, ctrl[:, 0])
+        state, valid = self.begun(models, ctrl[:, 0])
         # MuJoCo's sensors refer to the state before a step: one step more than rows shows the last row.
         played = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
         states, sensed = self.rolled(models, state, played)
-        found &= self._arrived(states[:, -1], len(commands[0]))
+        valid &= self._arrived(states[:, -1], len(commands[0]))
         position, pull = self.shown(sensed)
-        position[~found], pull[~found] = np.nan, np.nan
+        position[~valid], pull[~valid] = np.nan, np.nan
         return {"position": position, "tension": pull} if self.cables else {"position": position}
 
     def models(self, values: Mapping[str, Float[np.ndarray, " n"]], count: int) -> list[Any]:
@@ -435,27 +434,27 @@ class MuJoCoRollouts:
     ) -> tuple[Float[np.ndarray, "n state"], Bool[np.ndarray, " n"]]:
         """Initial states under the first commands, and which of them were found."""
         state = np.tile(self.first[0], (len(models), 1))
-        found = np.ones(len(models), dtype=bool)
+        valid = np.ones(len(models), dtype=bool)
         if self.start != SETTLED:
-            return state, found
+            return state, valid
         speed = slice(1 + self.model.nq, 1 + self.model.nq + self.model.nv)
         before, still = np.zeros(len(models)), np.zeros(len(models), dtype=int)
-        held = np.repeat(ctrl[:, None], PERIOD, axis=1)
+        constant = np.repeat(ctrl[:, None], PERIOD, axis=1)
         for _ in range(LONGEST):
-            moving = found & (still < SHAKES)
+            moving = valid & (still < SHAKES)
             if not moving.any():
                 break
             rows = np.flatnonzero(moving)
             state[rows, 0] = self.first[0][0]
-            state[rows] = self.rolled([models[k] for k in rows], state[rows], held[rows])[0][:, -1]
-            found[rows] = self._arrived(state[rows], PERIOD)
+            state[rows] = self.rolled([models[k] for k in rows], state[rows], constant[rows])[0][:, -1]
+            valid[rows] = self._arrived(state[rows], PERIOD)
             energy = np.sum(state[:, speed] ** 2, axis=1)
             still = np.where(np.abs(state[:, speed]).max(axis=1, initial=0.0) < STILL, still + 1, 0)
             turned = moving & (energy < before)
             state[turned, speed] = 0.0
             before = np.where(turned, 0.0, energy)
         state[:, 0] = self.first[0][0]
-        return state, found & (still >= SHAKES)
+        return state, valid & (still >= SHAKES)
 
 
 @contextmanager

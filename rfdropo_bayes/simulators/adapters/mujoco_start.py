@@ -10,13 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.adapters.mujoco_elements import (
-    ATTRIBUTES,
-    element_names,
-    field_of,
-    places_of,
-    plain_name,
-)
+from rfdropo_bayes.simulators.adapters.mujoco_elements import ATTRIBUTES, element_names, field_of, places_of, plain_name
 
 INFERRED = (
     ("body", "mass"),
@@ -46,13 +40,13 @@ def adapter_tables(
     """
     placed, assumed = _markers(model, markers)
     sent, more = _channels(model, channels)
-    found: dict[str, Any] = {"markers": placed, "channels": sent, "parameters": {}}
+    table: dict[str, Any] = {"markers": placed, "channels": sent, "parameters": {}}
     for kind, attribute in INFERRED:
         numbers = range(len(element_names(model, kind)))
         places = [places_of(model, kind, k, ATTRIBUTES[kind][attribute])[0] for k in numbers]
         if any(np.any(field_of(model, place.field)[place.entries]) for place in places):
-            found["parameters"][f"{kind}_{attribute}"] = f"{kind}/*/{attribute}"
-    return found, assumed + more
+            table["parameters"][f"{kind}_{attribute}"] = f"{kind}/*/{attribute}"
+    return table, assumed + more
 
 
 def _markers(model: Any, markers: Mapping[str, np.ndarray | None]) -> tuple[dict[str, str], list[str]]:
@@ -64,34 +58,34 @@ def _markers(model: Any, markers: Mapping[str, np.ndarray | None]) -> tuple[dict
     named = {(kind, name): k for kind in places for k, name in enumerate(element_names(model, kind))}
     if not markers:
         return _all_markers(model, named)
-    found: dict[str, str] = {}
+    elements: dict[str, str] = {}
     for marker in markers:
         for kind, name in named:
-            if plain_name(name).lower() == plain_name(marker).lower() and marker not in found:
-                found[marker] = f"{kind}/{name}"
-    left = [marker for marker in markers if marker not in found]
-    free = [key for key in named if key[0] in ("site", "body") and f"{key[0]}/{key[1]}" not in found.values()]
+            if plain_name(name).lower() == plain_name(marker).lower() and marker not in elements:
+                elements[marker] = f"{kind}/{name}"
+    unnamed = [marker for marker in markers if marker not in elements]
+    free = [key for key in named if key[0] in ("site", "body") and f"{key[0]}/{key[1]}" not in elements.values()]
     free = [key for key in free if key != ("body", "world") and not key[1].isdigit()]
     sites = [key for key in free if key[0] == "site"]
-    chosen = sites if len(sites) >= len(left) else free
-    if len(chosen) < len(left):
+    chosen = sites if len(sites) >= len(unnamed) else free
+    if len(chosen) < len(unnamed):
         raise InputError(
-            f"{len(left)} markers ({', '.join(left)}) for {len(chosen)} named sites and bodies",
+            f"{len(unnamed)} markers ({', '.join(unnamed)}) for {len(chosen)} named sites and bodies",
             where="--recording",
             remedy="name sites in the model's file",
         )
     assumed = []
-    if left:
-        seen = [markers[marker] for marker in left]
+    if unnamed:
+        seen = [markers[marker] for marker in unnamed]
         at = np.stack([places[kind][named[kind, name]] for kind, name in chosen])
         far = np.stack([np.linalg.norm(at - (0.0 if place is None else place), axis=1) for place in seen])
         for row, column in zip(*linear_sum_assignment(far), strict=True):
             kind, name = chosen[column]
-            found[left[row]] = f"{kind}/{name}"
+            elements[unnamed[row]] = f"{kind}/{name}"
             assumed.append(
-                f"marker {left[row]} is the {kind} {name}, {1e3 * far[row, column]:.3g} mm from its first row"
+                f"marker {unnamed[row]} is the {kind} {name}, {1e3 * far[row, column]:.3g} mm from its first row"
             )
-    return {marker: found[marker] for marker in markers}, assumed
+    return {marker: elements[marker] for marker in markers}, assumed
 
 
 def _all_markers(model: Any, named: Mapping[tuple[str, str], int]) -> tuple[dict[str, str], list[str]]:
@@ -108,8 +102,8 @@ def _all_markers(model: Any, named: Mapping[tuple[str, str], int]) -> tuple[dict
         raise InputError(
             "no site and no moving body has a name", where="markers", remedy="name sites in the model's file"
         )
-    told = f"markers are all bodies that move, {', '.join(bodies)}: keep the measured bodies"
-    return {name: f"body/{name}" for name in bodies}, [told]
+    assumption = f"markers are all bodies that move, {', '.join(bodies)}: keep the measured bodies"
+    return {name: f"body/{name}" for name in bodies}, [assumption]
 
 
 def _channels(model: Any, channels: Sequence[str]) -> tuple[dict[str, str | int], list[str]]:

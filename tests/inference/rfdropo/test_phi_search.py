@@ -162,9 +162,10 @@ class Deceptive(Spring):
 
 
 @pytest.mark.parametrize("optimiser", ["cma", "cem"])
-def test_finalists_are_scored_again_at_the_full_horizon(optimiser):
+def test_finalists_are_scored_again_at_the_full_horizon(optimiser, monkeypatch):
     """The lowest loss ever belongs to a short horizon and to the wrong frequency; as published it is returned."""
-    settings = {"rollouts": 20000.0, "rollouts_per_candidate": 20, "variance_floor": 1e-3, "optimiser": optimiser}
+    monkeypatch.setattr(rfdropo, "FLOOR", 1e-3)
+    settings = {"rollouts": 20000.0, "rollouts_per_candidate": 20, "optimiser": optimiser}
     published = rfdropo.run(Deceptive(), RfdropoConfig(**settings, mended=False), KEY)
     mended = rfdropo.run(Deceptive(), RfdropoConfig(**settings), KEY)
     for result in (published, mended):

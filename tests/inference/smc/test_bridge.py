@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import ortho_group
 
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.smc.bridge import NARROWEST, ModeMixture, covering, joint_covariance, prior_moments
 
 from ..toys import LinearGaussian

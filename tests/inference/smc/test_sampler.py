@@ -189,7 +189,7 @@ def test_a_budget_that_allows_nothing_is_refused():
         sampler.run(LinearGaussian(), SmcConfig(rollouts=20.0), KEY)
 
 
-@pytest.mark.parametrize("wrong", [{"spacing": "log"}, {"target_ess": 1.5}, {"replicates": 0}, {"rollouts": -1.0}])
+@pytest.mark.parametrize("wrong", [{"start": "middle"}, {"replicates": 0}, {"rollouts": -1.0}])
 def test_settings_are_checked(wrong):
     with pytest.raises(InputError, match=str(next(iter(wrong)))):
         SmcConfig(**wrong)

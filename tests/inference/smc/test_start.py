@@ -11,7 +11,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes import mode_search as laplace
-from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc import start as starts
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
@@ -115,20 +115,21 @@ def test_a_ridge_between_two_bounds_is_filled_from_end_to_end():
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.3)
 
 
-def test_a_small_budget_finishes_one_climb_rather_than_beginning_four():
+def test_a_small_budget_finishes_one_optimisation_rather_than_beginning_four():
     problem = LinearGaussian(d=6)
-    small, large = (starts._climbing(problem, SmcConfig(rollouts=budget)) for budget in (3000.0, 40000.0))
+    small, large = (starts._optimising(problem, SmcConfig(rollouts=budget)) for budget in (3000.0, 40000.0))
     assert (small.starts, large.starts) == (1, 4)
-    assert (small.survey, large.survey) == (0, 128)
+    assert (small.pilot_particles, large.pilot_particles) == (0, 128)
     assert small.rollouts == 750.0
 
 
 @pytest.mark.slow
-def test_a_survey_finds_the_highest_of_many_summits():
-    """Climbs from the best of screened draws end eight nats or more below it. The evidence of 2 replicates of about 150
-    scatters by 0.1."""
+def test_a_pilot_run_finds_the_highest_of_many_modes():
+    """Optimisations from the best of starts_of_draws draws end eight nats or more below it. The evidence of 2
+    replicates of about 150 scatters by 0.1.
+    """
     problem = Washboard()
-    near = methods.run(problem, "laplace", {"screen": 64, "blocks": 2}, KEY)
+    near = methods.run(problem, "laplace", {"prior_draws": 64, "blocks": 2}, KEY)
     result = methods.run(problem, "smc", {"rollouts": 12000, "start": "optimum", "blocks": 2}, KEY)
     assert near.log_evidence[0] < problem.log_evidence() - 7.0
     assert result.log_evidence[0] == pytest.approx(problem.log_evidence(), abs=0.4)
@@ -137,17 +138,17 @@ def test_a_survey_finds_the_highest_of_many_summits():
     assert result.rollouts <= 12000
 
 
-def test_climbs_expect_half_of_their_number_at_the_next_horizon():
-    """Four climbs at a quarter of the rows, two at half, one at all: each of the first has a quarter of a third."""
-    climbs = laplace.begin(np.zeros((4, 3)), np.zeros(4), Ledger(), 0.0)
+def test_optimisations_expect_half_of_their_number_at_the_next_horizon():
+    """Four optimisations at a quarter of the rows, two at half, one at all: each of the first gets a twelfth."""
+    optimisations = laplace.begin(np.zeros((4, 3)), np.zeros(4), Ledger(), 0.0)
     config = laplace.LaplaceConfig(rollouts=1200.0, max_steps=10**6)
-    steps = laplace._affordable_steps(40, config, climbs, (10, 20, 40), 0)
+    steps = laplace._affordable_steps(40, config, optimisations, (10, 20, 40), 0)
     assert steps == int(1200.0 / 3.0 / 4.0 * 4.0 / 19.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", [2500, 4000])
-def test_the_budget_covers_climbs_sampler_and_scores(budget):
+def test_the_budget_covers_optimisations_sampler_and_scores(budget):
     """The whole is within the budget, whatever the parts take; scores are left out before it is exceeded."""
     problem = LinearGaussian(n_rows=40, d=6, noise=1e-2)
     result = methods.run(problem, "smc", {"rollouts": budget, "blocks": 2, "start": "optimum"}, KEY)
@@ -156,7 +157,7 @@ def test_the_budget_covers_climbs_sampler_and_scores(budget):
 
 
 class Deaf(LinearGaussian):
-    """Loses every rollout of the first look at a quarter of the rows, which would tell where climbs may start."""
+    """Loses every rollout of the first look at a quarter of the rows, which would give the starts."""
 
     heard = False
 
@@ -187,7 +188,7 @@ def test_the_estimated_way_grows_with_the_logarithm_of_the_sharpness():
     for noise in (1e-1, 1e-3, 1e-5):
         problem = LinearGaussian(n_rows=40, noise=noise)
         mean, covariance = problem.posterior()
-        ways.append(way_from_prior(problem, Laplace(mean, covariance, 0.0), (10, 20, 40), 0.5, KEY))
+        ways.append(way_from_prior(problem, Laplace(mean, covariance, 0.0), (10, 20, 40), KEY))
         _, prior = np.linalg.slogdet(np.diag(problem.sd**2))
         lost = 0.5 * (prior - np.linalg.slogdet(covariance)[1])
         assert ways[-1].information == pytest.approx(lost, abs=0.2)
@@ -213,11 +214,11 @@ def test_the_mixture_is_a_density_that_its_draws_have():
 
 
 @pytest.mark.slow
-def test_climbs_keep_their_budget():
+def test_optimisations_keep_their_budget():
     problem = Decay(n_rows=40, traceable=False)
-    result = methods.run(problem, "laplace", {"rollouts": 120, "screen": 16}, KEY)
+    result = methods.run(problem, "laplace", {"rollouts": 120, "prior_draws": 16}, KEY)
     assert result.trace[-1]["rollouts"] <= 120  # normal approximations of the optima come on top
-    free = methods.run(Decay(n_rows=40, traceable=False), "laplace", {"screen": 16}, KEY)
+    free = methods.run(Decay(n_rows=40, traceable=False), "laplace", {"prior_draws": 16}, KEY)
     assert free.rollouts > result.rollouts
 
 
@@ -242,5 +243,4 @@ def test_a_budget_decides_on_replicates_and_without_one_there_is_one():
     assert sampler.decided(30, SmcConfig(rollouts=1000.0)).chains == 1
     assert sampler.decided(30, SmcConfig(rollouts=5000.0)).chains == 2
     assert sampler.decided(30, SmcConfig(rollouts=1e5)).chains == 4
-    assert sampler.decided(200, SmcConfig(rollouts=5000.0, spacing="linear", blocks=200)).chains == 1
     assert sampler.decided(30, SmcConfig()).chains == 1

@@ -14,19 +14,16 @@ from rfdropo_bayes.prediction.model_error import ADAPTED_TO
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class DayDeviation(NamedTuple):
-    """Normal distribution of a day's deviation of one parameter, for every draw, in the parameter's unit.
+class SessionDeviation(NamedTuple):
+    """Normal distribution of a session's deviation of one parameter, for every draw, in the parameter's unit."""
 
-    Attributes:
-        shift: its mean: the deviation of the day that a posterior was adapted to; zero for any other day.
-        spread: its standard deviation: that between days for a day that no fit has seen; zero for the adapted one.
-    """
-
+    # its mean: the deviation of the session that a posterior was adapted to; zero for any other session
     shift: Float[np.ndarray, " draw"]
+    # its standard deviation: that between sessions for a session that no fit has seen; zero for the adapted one
     spread: Float[np.ndarray, " draw"]
 
 
-def day_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> dict[str, DayDeviation]:
+def session_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> dict[str, SessionDeviation]:
     """Deviations of the session that a posterior describes: the adapted session, else any unseen session.
 
     Args:
@@ -37,14 +34,14 @@ def day_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> d
         deviations by parameter; empty if no parameter varies between sessions.
     """
     values = {info.name: record.flat(info.name) for info in record.free}
-    known, day = {spec.name for spec in specs} & set(values), record.attrs.get(ADAPTED_TO, "")
-    deviations: dict[str, DayDeviation] = {}
+    known, session = {spec.name for spec in specs} & set(values), record.attrs.get(ADAPTED_TO, "")
+    deviations: dict[str, SessionDeviation] = {}
     for info in (each for each in record.free if each.scope.added_to in known):
         nothing = np.zeros(len(values[info.name]))
-        if info.scope.owner == day:
-            deviations[info.scope.added_to] = DayDeviation(values[info.name], nothing)
+        if info.scope.owner == session:
+            deviations[info.scope.added_to] = SessionDeviation(values[info.name], nothing)
         else:
-            deviations.setdefault(info.scope.added_to, DayDeviation(nothing, info.spread_of(values, len(nothing))))
+            deviations.setdefault(info.scope.added_to, SessionDeviation(nothing, info.spread_of(values, len(nothing))))
     return deviations
 
 

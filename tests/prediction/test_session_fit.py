@@ -11,8 +11,8 @@ import pytest
 from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.posteriors import RecordingPrediction
-from rfdropo_bayes.prediction.day import fit_day
 from rfdropo_bayes.prediction.model_error import model_error
+from rfdropo_bayes.prediction.session_fit import fit_session
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPREAD, SIGMA, ROWS = 0.7, 0.5, 6
@@ -38,7 +38,7 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
     model = SimpleNamespace(markers=SimpleNamespace(valid=np.ones(ROWS, dtype=bool)))
     problem = SimpleNamespace(model=model, n_rows=ROWS, residual_batch=residual_batch)
     own = [p for p in space.parameters if p.scope.added_to]
-    found = fit_day(problem, body, own, jax.random.key(0))
+    found = fit_session(problem, body, own, jax.random.key(0))
     design = np.stack([command, np.ones(ROWS)], axis=1) / SIGMA
     precision = design.T @ design + np.diag([0.3**-2, SPREAD**-2])
     covariance = np.linalg.inv(precision)
@@ -75,7 +75,7 @@ def test_coordinates_that_err_together_count_as_fewer():
 
         problem = SimpleNamespace(model=model, n_rows=1, residual_batch=residual_batch)
         for counted in inside:
-            found = fit_day(problem, {"zero": np.zeros(100)}, own, jax.random.key(number), share=counted)
+            found = fit_session(problem, {"zero": np.zeros(100)}, own, jax.random.key(number), share=counted)
             low, high = np.quantile(found.values["zero_deviation@day"], [0.05, 0.95])
             inside[counted] += bool(low <= truth <= high)
     assert inside[share] >= 0.8 * 120

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, command_openings
-from rfdropo_bayes.report.day_baselines import day_baselines
 from rfdropo_bayes.report.scores import MeasuredPath, measured_paths
+from rfdropo_bayes.report.session_baselines import session_baselines
 
 ROWS, SHOWN, STEP = 40, 10, 0.25
 RNG = np.random.default_rng(0)
@@ -30,7 +30,7 @@ def of_a_day(command=COMMAND):
     late = np.arange(ROWS)[:, None] > SHOWN
     shown, rest = day.slice_rows(0, SHOWN), recorded("july", day.position, command, late)
     openings = {earlier.name: command_openings(earlier)}
-    return day, late[:, 0], day_baselines(shown, [rest], measured_paths([earlier]), openings)
+    return day, late[:, 0], session_baselines(shown, [rest], measured_paths([earlier]), openings)
 
 
 def test_a_day_that_is_an_earlier_one_scaled_is_predicted_by_the_scaled_copy():
@@ -53,5 +53,5 @@ def test_recordings_of_other_commands_are_not_copied():
 def test_a_marker_that_was_lost_in_an_earlier_day_is_not_copied():
     day = recorded("july", PATH)
     lost = MeasuredPath("june", day.time, PATH, np.zeros((ROWS, 1), bool), ("tip",))
-    found = day_baselines(day, [day], [lost], {"june": command_openings(day)})
+    found = session_baselines(day, [day], [lost], {"june": command_openings(day)})
     assert "tip was lost" in found["copied"].reason

@@ -17,7 +17,7 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_error
 
-DAY_ERROR = "day_error"  # among the attributes of a posterior
+SESSION_ERROR = "session_error"  # among the attributes of a posterior
 
 # The prior of `times`, used if no session was left out, and worth FREEDOM sessions otherwise. It rests on the sessions
 # of two robots in docs/days.md.
@@ -27,36 +27,27 @@ CORRELATION_TIME = 1.0  # [s] of the rest: bands do not depend on it
 SMALLEST_REACH = 1e-6  # [m]
 
 
-class DayError(NamedTuple):
-    """The slow error of a model in an unseen session.
+class SessionError(NamedTuple):
+    """The slow error of a model in an unseen session."""
 
-    Attributes:
-        markers: names of the markers.
-        left: root mean square residual [m] of each marker in the fitted recordings.
-        reach: root mean square of each marker's largest distance from its start [m]; empty if unknown: a recording is
-            then assumed to move as far as the fitted recordings.
-        times: scale of the error in units of ``left``, for a marker at the distance ``reach``.
-        freedom: degrees of freedom: the error is Student's t.
-        constant: share of its variance that is constant over a recording.
-        correlation_time: correlation time of the other share [s].
-        days: error of the last marker [m] in each session left out, by group; empty without such sessions.
-        held: share of the coordinates of these sessions in the 90 % bands, each widened by the other sessions; None
-            without such sessions.
-        shown: distance of each marker in the fitted recording of this session [m]: only motion beyond it adds error;
-            empty without such a recording.
-        missed: sessions that could not be left out, because the others cannot be fitted without them.
-    """
-
-    markers: tuple[str, ...]
-    left: tuple[float, ...]
+    markers: tuple[str, ...]  # names of the markers
+    residual: tuple[float, ...]  # root mean square residual [m] of each marker in the fitted recordings
+    # root mean square of each marker's largest distance from its start [m]; empty if unknown: a recording is then
+    # assumed to move as far as the fitted recordings
     reach: tuple[float, ...]
-    times: float = TIMES
-    freedom: float = FREEDOM
-    constant: float = CONSTANT
-    correlation_time: float = CORRELATION_TIME
-    days: Mapping[str, float] = {}
-    held: float | None = None
+    times: float = TIMES  # scale of the error in units of ``residual``, for a marker at the distance ``reach``
+    freedom: float = FREEDOM  # degrees of freedom: the error is Student's t
+    constant: float = CONSTANT  # share of its variance that is constant over a recording
+    correlation_time: float = CORRELATION_TIME  # correlation time of the other share [s]
+    # error of the last marker [m] in each session left out, by group; empty without such sessions
+    sessions: Mapping[str, float] = {}
+    # share of the coordinates of these sessions in the 90 % bands, each widened by the other sessions; None without
+    # such sessions
+    covered: float | None = None
+    # distance of each marker in the fitted recording of this session [m]: only motion beyond it adds error; empty
+    # without such a recording
     shown: tuple[float, ...] = ()
+    # sessions that could not be left out, because the others cannot be fitted without them
     missed: tuple[str, ...] = ()
 
     def unit(
@@ -73,14 +64,10 @@ class DayError(NamedTuple):
         known = np.array(self.shown)[index] if self.shown else 0.0
         whole = np.array(self.reach)[index] if self.reach else np.maximum(far[-1], SMALLEST_REACH)
         beyond = np.sqrt(np.maximum(far**2 - known**2, 0.0))
-        return beyond * np.array(self.left)[index] / (whole * np.sqrt(3.0))
+        return beyond * np.array(self.residual)[index] / (whole * np.sqrt(3.0))
 
     def draw(
-        self,
-        key: PRNGKeyArray,
-        count: int,
-        time: Float[np.ndarray, " time"],
-        unit: Float[np.ndarray, "time marker"],
+        self, key: PRNGKeyArray, count: int, time: Float[np.ndarray, " time"], unit: Float[np.ndarray, "time marker"]
     ) -> Float[np.ndarray, "draw time marker 3"]:
         """Realisations [m]: each draw has one scale for all markers, and a constant and a slow part for each axis."""
         rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
@@ -96,12 +83,12 @@ class DayError(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values; `from_dict` undoes it."""
-        return {**self._asdict(), "days": dict(self.days)}
+        return {**self._asdict(), "sessions": dict(self.sessions)}
 
     @classmethod
-    def from_dict(cls, given: Mapping[str, Any]) -> DayError:
+    def from_dict(cls, given: Mapping[str, Any]) -> SessionError:
         """From plain values."""
-        tuples = {name: tuple(given[name]) for name in ("markers", "left", "reach", "shown", "missed")}
+        tuples = {name: tuple(given[name]) for name in ("markers", "residual", "reach", "shown", "missed")}
         return cls(**{**given, **tuples})
 
 
@@ -110,7 +97,7 @@ def reach_of(path: Float[np.ndarray, "time marker 3"]) -> Float[np.ndarray, "tim
     return np.maximum.accumulate(np.linalg.norm(path - path[0], axis=-1), axis=0)
 
 
-def prior_day_error(model_error: ModelError, fitted: Sequence[RecordingPrediction]) -> DayError:
+def prior_session_error(model_error: ModelError, fitted: Sequence[RecordingPrediction]) -> SessionError:
     """The slow error of a session if no session was left out of the fit.
 
     Args:
@@ -119,50 +106,50 @@ def prior_day_error(model_error: ModelError, fitted: Sequence[RecordingPredictio
     """
     scale = tuple(np.linalg.norm(np.reshape(model_error.scale, (-1, 3)), axis=1).tolist())
     if not fitted:
-        return DayError(model_error.markers, scale, ())
+        return SessionError(model_error.markers, scale, ())
     squares = np.concatenate([reach_of(p.central) ** 2 for p in fitted])
     reach = np.maximum(np.sqrt(squares.mean(axis=0)), SMALLEST_REACH)
-    return DayError(model_error.markers, scale, tuple(reach.tolist()))
+    return SessionError(model_error.markers, scale, tuple(reach.tolist()))
 
 
-def day_error(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]]) -> DayError:
-    """The slow error of a day by days that were left out of a fit each.
+def session_error(prior: SessionError, sessions: Mapping[str, Sequence[RecordingPrediction]]) -> SessionError:
+    """The slow error of a session by sessions that were left out of a fit each.
 
-    Each day's scale is the excess of its squared error over the variance of its draws. The prior counts as `FREEDOM`
-    days of `TIMES` (a scaled inverse chi-square distribution, to which days add).
+    Each session's scale is the excess of its squared error over the variance of its draws. The prior counts as
+    `FREEDOM` sessions of `TIMES` (a scaled inverse chi-square distribution, to which sessions add).
 
     Args:
-        prior: without any.
-        days: predictions of recordings of each day by a fit without it, their slow error left out, by group.
+        prior: error without left-out sessions.
+        sessions: predictions of recordings of each session by a fit without it, their slow error left out, by group.
     """
-    squares = {group: _squared_times(prior, recordings) for group, recordings in days.items()}
+    squares = {group: _squared_times(prior, recordings) for group, recordings in sessions.items()}
     if not squares:
         return prior
     return _with_times(prior, list(squares.values()))._replace(
-        days={group: _tip_error(recordings) for group, recordings in days.items()},
-        constant=_constant_share(prior, [p for recordings in days.values() for p in recordings]),
-        held=_held(prior, days, squares),
+        sessions={group: _tip_error(recordings) for group, recordings in sessions.items()},
+        constant=_constant_share(prior, [p for recordings in sessions.values() for p in recordings]),
+        covered=_covered(prior, sessions, squares),
     )
 
 
-def recorded_day_error(record: PosteriorRecord) -> DayError | None:
+def recorded_session_error(record: PosteriorRecord) -> SessionError | None:
     """The error from a fit's file, or its prior; None if the file has neither error nor residuals."""
-    given = record.attrs.get(DAY_ERROR)
+    given = record.attrs.get(SESSION_ERROR)
     if given is not None:
-        return DayError.from_dict(given)
+        return SessionError.from_dict(given)
     model_error = recorded_model_error(record)
     if model_error is None:
         return None
-    return prior_day_error(model_error, [p for p in record.recordings if p.split == "fit"])
+    return prior_session_error(model_error, [p for p in record.recordings if p.split == "fit"])
 
 
-def _with_times(prior: DayError, squares: Sequence[float]) -> DayError:
+def _with_times(prior: SessionError, squares: Sequence[float]) -> SessionError:
     freedom = FREEDOM + len(squares)
     times = float(np.sqrt((FREEDOM * TIMES**2 + sum(squares)) / freedom))
     return prior._replace(times=times, freedom=freedom)
 
 
-def _squared_times(prior: DayError, predictions: Sequence[RecordingPrediction]) -> float:
+def _squared_times(prior: SessionError, predictions: Sequence[RecordingPrediction]) -> float:
     """Mean over markers of the squared error less the variance of the draws, in squared units."""
     excess, units = np.zeros(len(predictions[0].marker_names)), np.zeros(len(predictions[0].marker_names))
     for p in predictions:
@@ -172,7 +159,7 @@ def _squared_times(prior: DayError, predictions: Sequence[RecordingPrediction]) 
     return max(float(np.mean(excess / np.maximum(units, SMALLEST_REACH**2))), 0.0)
 
 
-def _constant_share(prior: DayError, predictions: Sequence[RecordingPrediction]) -> float:
+def _constant_share(prior: SessionError, predictions: Sequence[RecordingPrediction]) -> float:
     """Share of the squared error, in units, that is constant over each recording."""
     constant, total = 0.0, 0.0
     for p in predictions:
@@ -190,10 +177,12 @@ def _tip_error(predictions: Sequence[RecordingPrediction]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
-def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]) -> float:
+def _covered(
+    prior: SessionError, sessions: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]
+) -> float:
     """Share of the coordinates of left-out sessions in 90 % bands from the other sessions."""
     inside = []
-    for number, (group, recordings) in enumerate(days.items()):
+    for number, (group, recordings) in enumerate(sessions.items()):
         other = _with_times(prior, [square for name, square in squares.items() if name != group])
         for place, p in enumerate(recordings):
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), number), place)
@@ -203,10 +192,10 @@ def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], sq
     return float(np.mean(np.concatenate(inside)))
 
 
-def day_sentence(error: DayError) -> str:
+def session_sentence(error: SessionError) -> str:
     """Sentence on the error in a session without a recording."""
     begin = "No recording of this session was seen."
-    if not error.days:
+    if not error.sessions:
         return (
             f"{begin} This run left no session out of its fit: its bands are widened by {error.times:.2g} "
             "times the residuals of fitted sessions, as found on two other robots."
@@ -214,12 +203,12 @@ def day_sentence(error: DayError) -> str:
     return f"{begin} {left_out_sentence(error)}"
 
 
-def left_out_sentence(error: DayError) -> str:
+def left_out_sentence(error: SessionError) -> str:
     """Sentence on errors and coverage in sessions left out of the fit; empty without such sessions."""
     missed = f" It could not be fitted without {', '.join(error.missed)}." if error.missed else ""
-    if not error.days:
+    if not error.sessions:
         return missed.lstrip()
-    low, high = 1e3 * min(error.days.values()), 1e3 * max(error.days.values())
-    errors = f"{low:.2g}" if len(error.days) == 1 else f"{low:.2g} to {high:.2g}"
-    coverage = "" if error.held is None else f"; its 90 % bands held {100.0 * error.held:.0f} %"
+    low, high = 1e3 * min(error.sessions.values()), 1e3 * max(error.sessions.values())
+    errors = f"{low:.2g}" if len(error.sessions) == 1 else f"{low:.2g} to {high:.2g}"
+    coverage = "" if error.covered is None else f"; its 90 % bands held {100.0 * error.covered:.0f} %"
     return f"In sessions left out of its fit this model was {errors} mm off{coverage}.{missed}"

@@ -21,7 +21,7 @@ SAME = 0.05  # nats between two normal distributions that are taken for one
 
 
 @runtime_checkable
-class Climbable(Protocol):
+class Optimisable(Protocol):
     """A log posterior with the derivatives that an optimisation needs."""
 
     @property
@@ -47,7 +47,7 @@ class Climbable(Protocol):
         """Approximation of minus the Hessian of the log likelihood at a mode."""
         ...
 
-    def along(self, axes: Float[np.ndarray, "d d"]) -> Climbable | None:
+    def along(self, axes: Float[np.ndarray, "d d"]) -> Optimisable | None:
         """The same log posterior with central differences along each column of ``axes``.
 
         None if derivatives are exact.
@@ -66,23 +66,16 @@ class Climbable(Protocol):
 
 
 class LevenbergState(NamedTuple):
-    """State of an optimisation.
+    """State of an optimisation."""
 
-    Attributes:
-        position: unconstrained point.
-        log_density: log posterior there.
-        damping: Levenberg-Marquardt damping, relative to the diagonal of the Hessian.
-        converged: whether the predicted gain of the last step was below the tolerance, or slightly above with a smaller
-            actual gain.
-    """
-
-    position: Float[np.ndarray, " d"]
-    log_density: float
-    damping: float
+    position: Float[np.ndarray, " d"]  # unconstrained point
+    log_density: float  # log posterior there
+    damping: float  # Levenberg-Marquardt damping, relative to the diagonal of the Hessian
+    # whether the predicted gain of the last step was below the tolerance, or slightly above with a smaller actual gain
     converged: bool
 
 
-class ClimbStep(NamedTuple):
+class OptimisationStep(NamedTuple):
     """One step: the gain in log posterior, and the predicted gain of the quadratic model."""
 
     gain: float
@@ -113,7 +106,7 @@ class Laplace(NamedTuple):
         return self.log_density + 0.5 * d * np.log(2.0 * np.pi) + 0.5 * float(np.linalg.slogdet(self.covariance)[1])
 
 
-def init(target: Climbable, u: Float[np.ndarray, " d"]) -> LevenbergState:
+def init(target: Optimisable, u: Float[np.ndarray, " d"]) -> LevenbergState:
     """State at a starting point."""
     return LevenbergState(u, float(target.density(u[None])[0]), 1e-3, False)
 
@@ -126,7 +119,7 @@ def _solved(matrix: Float[np.ndarray, "d d"], right: Float[np.ndarray, " d"]) ->
         return np.linalg.lstsq(matrix, right)[0]
 
 
-def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, ClimbStep]:
+def step(target: Optimisable, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, OptimisationStep]:
     """One Levenberg-Marquardt step; damping grows until the log posterior rises.
 
     Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
@@ -134,10 +127,10 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     """
     gradient, curvature = target.quadratic(state.position)
     low, high = target.bounds
-    held = ((state.position <= low) & (gradient < 0.0)) | ((state.position >= high) & (gradient > 0.0))
-    if held.any():
-        gradient = np.where(held, 0.0, gradient)
-        curvature = np.where(held[:, None] | held, np.diag(np.diag(curvature)), curvature)
+    at_bound = ((state.position <= low) & (gradient < 0.0)) | ((state.position >= high) & (gradient > 0.0))
+    if at_bound.any():
+        gradient = np.where(at_bound, 0.0, gradient)
+        curvature = np.where(at_bound[:, None] | at_bound, np.diag(np.diag(curvature)), curvature)
     diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
     dampings = state.damping * DAMPINGS
     moves = np.stack([_solved(curvature + damping * diagonal, gradient) for damping in dampings])
@@ -146,7 +139,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     newton = _solved(curvature + 1e-12 * diagonal, gradient)
     promised = 0.5 * float(gradient @ newton)
     if promised < tolerance:
-        return state._replace(converged=True), ClimbStep(0.0, promised)
+        return state._replace(converged=True), OptimisationStep(0.0, promised)
     tried = np.clip(state.position + moves, low, high)
     densities = target.density(tried)
     best = int(np.argmax(densities))
@@ -159,10 +152,10 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
         moved = LevenbergState(position, density, state.damping * 1e5, stuck)
     else:
         moved = LevenbergState(position, density, float(np.clip(dampings[best], 1e-9, 1e9)), False)
-    return moved, ClimbStep(gain, promised)
+    return moved, OptimisationStep(gain, promised)
 
 
-def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
+def with_fitting_noise(target: Optimisable, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
     """The point with its noise coordinates, one after the other, at the best of a wide grid.
 
     A start drawn from the prior, or the optimum of a shorter horizon, may have a noise that makes its residuals look
@@ -179,7 +172,7 @@ def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: flo
 
 
 def maximise(
-    target: Climbable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
+    target: Optimisable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
     """Optimise from one start, noise first, until the predicted gain of a step is below ``tolerance`` nats, or steps
     are `FLAT`.
@@ -199,28 +192,30 @@ def maximise(
     return state, trace
 
 
-def climb_cost(d: int, noise: int) -> tuple[float, float]:
+def optimisation_cost(d: int, noise: int) -> tuple[float, float]:
     """Rollouts for the start of an optimisation and for each of its steps, with ``d`` coordinates and ``noise`` noise
     coordinates: the grid of the noise; the value, a Jacobian by central differences, two more per noise, all dampings.
     """
     return float(NOISE_GRID * noise), 4.0 * d + 1.0 + len(DAMPINGS)
 
 
-def laplace(target: Climbable, state: LevenbergState) -> Laplace:
+def laplace(target: Optimisable, state: LevenbergState) -> Laplace:
     """Normal approximation at a mode; finite differences are taken along its own axes at the end."""
-    found = normal_at(target, state)
+    approximation = normal_at(target, state)
     for _ in range(ROUNDS):
-        nearer = target.along(_axes(found.covariance, target.noise))
+        nearer = target.along(_axes(approximation.covariance, target.noise))
         if nearer is None:
             break
-        moved, _ = step(nearer, state._replace(position=found.mean, log_density=found.log_density), SAME**2)
-        before, found = found, normal_at(nearer, moved)
-        if divergence(before, found) < SAME:
+        moved, _ = step(
+            nearer, state._replace(position=approximation.mean, log_density=approximation.log_density), SAME**2
+        )
+        before, approximation = approximation, normal_at(nearer, moved)
+        if divergence(before, approximation) < SAME:
             break
-    return found
+    return approximation
 
 
-def normal_at(target: Climbable, state: LevenbergState) -> Laplace:
+def normal_at(target: Optimisable, state: LevenbergState) -> Laplace:
     """Normal approximation from the derivatives of the optimisation."""
     u = state.position
     information = positive_part(target.information(u))

@@ -10,8 +10,8 @@ from scipy.stats import norm
 import rfdropo_bayes as rb
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
-from rfdropo_bayes.prediction.day_spread import day_deviations, draw_deviation
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO
+from rfdropo_bayes.prediction.session_deviation import draw_deviation, session_deviations
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
 
@@ -70,7 +70,7 @@ def test_predictions_deviate_by_the_same_spread() -> None:
     deviation = next(info for info in record.free if info.scope.added_to)
     values = {info.name: record.flat(info.name) for info in record.free}
     drawn = draw_deviation(deviation, values, jax.random.key(0), ROWS)
-    ratio = drawn / day_deviations(record, SIMULATOR.parameters)["young_modulus"].spread
+    ratio = drawn / session_deviations(record, SIMULATOR.parameters)["young_modulus"].spread
     assert ratio.mean() == pytest.approx(0.0, abs=4 / np.sqrt(ROWS))
     assert ratio.var() == pytest.approx(1.0, abs=4 * np.sqrt(2 / ROWS))
 

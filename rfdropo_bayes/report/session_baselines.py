@@ -1,4 +1,6 @@
-"""Predictors of a new day without a model: its first row, earlier days with the same commands, and scaled copies."""
+"""Predictors of a new session without a model: its first row, earlier sessions with the same commands, and scaled
+copies.
+"""
 
 from __future__ import annotations
 
@@ -13,31 +15,35 @@ from rfdropo_bayes.report.baselines import BaselineErrors, Predictor, scored
 from rfdropo_bayes.report.scores import MeasuredPath
 
 
-def day_baselines(
+def session_baselines(
     shown: Trajectory,
     tested: Sequence[Trajectory],
     earlier: Sequence[MeasuredPath],
     openings: Mapping[str, Mapping[str, str]],
 ) -> dict[str, BaselineErrors]:
-    """Errors of predictions of a day without a model.
+    """Errors of predictions of a session without a model.
 
     Args:
-        shown: the known part of the day.
+        shown: the known part of the session.
         tested: the predicted part.
         earlier: fitted recordings.
         openings: first commands of each, see `command_openings`.
     """
     scaled = scaled_copy(shown, earlier, openings)
     predictors: dict[str, tuple[str, str, Predictor]] = {
-        "first_row": ("first row of the day held", "the first known pose of the day, held constant", _held(shown)),
+        "first_row": (
+            "first row of the session held",
+            "the first known pose of the session, held constant",
+            _held(shown),
+        ),
         "copied": (
-            "earlier days copied",
+            "earlier sessions copied",
             "mean of the fitted recordings of the same commands at the same time",
             lambda recording: copied(recording, earlier, openings),
         ),
         "scaled_copy": (
-            "earlier days copied and scaled",
-            "the same copy, with a scale and a shift of each marker fitted to the known part of the day",
+            "earlier sessions copied and scaled",
+            "the same copy, with a scale and a shift of each marker fitted to the known part of the session",
             scaled,
         ),
     }
@@ -82,7 +88,7 @@ def copied(
 def scaled_copy(
     shown: Trajectory, earlier: Sequence[MeasuredPath], openings: Mapping[str, Mapping[str, str]]
 ) -> Predictor:
-    """`copied`, with a scale and a shift of each marker by least squares on the known part of the day."""
+    """`copied`, with a scale and a shift of each marker by least squares on the known part of the session."""
 
     def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
         copy, scaled = copied(shown, earlier, openings), copied(recording, earlier, openings)

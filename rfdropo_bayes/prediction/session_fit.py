@@ -29,29 +29,19 @@ from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
 Batch = dict[str, Float[np.ndarray, " n"]]
 
 
-class DayFit(NamedTuple):
-    """Joint draws of body and session parameters.
+class SessionFit(NamedTuple):
+    """Joint draws of body and session parameters."""
 
-    Attributes:
-        values: draws of all parameters, resampled by the evidence of their body.
-        chosen: index of each draw's body.
-        log_evidence: log evidence of each body, up to a constant.
-        power: exponent of the evidences that keeps an effective tenth of the draws; 1 if no less remains.
-        excess: ratio of the noise in the residuals to the stated noise; at least 1.
-        unconverged: number of draws whose fit did not converge.
-        steps: steps of the fits.
-    """
-
-    values: Batch
-    chosen: Int[np.ndarray, " n"]
-    log_evidence: Float[np.ndarray, " n"]
-    power: float
-    excess: float
-    unconverged: int
-    steps: int
+    values: Batch  # draws of all parameters, resampled by the evidence of their body
+    chosen: Int[np.ndarray, " n"]  # index of each draw's body
+    log_evidence: Float[np.ndarray, " n"]  # log evidence of each body, up to a constant
+    power: float  # exponent of the evidences that keeps an effective tenth of the draws; 1 if no less remains
+    excess: float  # ratio of the noise in the residuals to the stated noise; at least 1
+    unconverged: int  # number of draws whose fit did not converge
+    steps: int  # steps of the fits
 
 
-def fit_day(
+def fit_session(
     problem: CalibrationProblem,
     body: Batch,
     own: Sequence[InferredParameter],
@@ -59,7 +49,7 @@ def fit_day(
     report: Callable[[int, float], None] = lambda step, share: None,
     *,
     share: float = 1.0,
-) -> DayFit:
+) -> SessionFit:
     """Draws of a session's parameters and of the body, given one recording of the session.
 
     Args:
@@ -99,7 +89,9 @@ def fit_day(
     power, _ = next_step(partial(np.multiply, evidence), 1.0, LEAST_SHARE)
     chosen = np.asarray(resampling.systematic(choice_key, softmax(power * evidence), count))
     unconverged = int((~fit.converged).sum())
-    return DayFit(values_at(fit.point[chosen], chosen), chosen, evidence, float(power), excess, unconverged, fit.steps)
+    return SessionFit(
+        values_at(fit.point[chosen], chosen), chosen, evidence, float(power), excess, unconverged, fit.steps
+    )
 
 
 def physical_of_normal(

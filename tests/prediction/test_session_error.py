@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.prediction.day_error import (
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, error_memory, recorded_model_error
+from rfdropo_bayes.prediction.predictive import with_session_error
+from rfdropo_bayes.prediction.session_error import (
     FREEDOM,
     TIMES,
-    DayError,
-    day_error,
-    day_sentence,
+    SessionError,
     left_out_sentence,
-    prior_day_error,
+    prior_session_error,
     reach_of,
+    session_error,
+    session_sentence,
 )
-from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, error_memory, recorded_model_error
-from rfdropo_bayes.prediction.predictive import with_day_error
 
 TIME = 0.1 * np.arange(100)
 LEFT = ModelError(("tip",), (0.003, 0.003, 0.003), 0.5)
@@ -36,7 +36,7 @@ def predicted(rng, error, draws=400, noise=0.003, name="a"):
 
 @pytest.fixture(scope="module")
 def prior():
-    return prior_day_error(LEFT, [predicted(np.random.default_rng(0), 0.0)])
+    return prior_session_error(LEFT, [predicted(np.random.default_rng(0), 0.0)])
 
 
 def slow(prior, rng, times):
@@ -53,10 +53,10 @@ def test_bands_of_unseen_days_hold_what_days_do(prior):
     rng, inside = np.random.default_rng(1), []
     for number in range(40):
         days = {f"day {k}": [predicted(rng, slow(prior, rng, 2.0))] for k in range(4)}
-        found = day_error(prior, days)
+        found = session_error(prior, days)
         for k in range(8):
             new = predicted(rng, slow(prior, rng, 2.0))
-            wide = with_day_error(new, found, jax.random.key(100 * number + k))
+            wide = with_session_error(new, found, jax.random.key(100 * number + k))
             low, high = np.quantile(wide.predicted, [0.05, 0.95], axis=0)
             inside.append(np.mean((new.observed >= low) & (new.observed <= high)))
     assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
@@ -68,12 +68,12 @@ def test_bands_of_unseen_days_hold_what_days_do(prior):
 def test_days_add_to_the_prior_as_a_scaled_inverse_chi_square(prior):
     rng = np.random.default_rng(2)
     days = {f"day {k}": [predicted(rng, slow(prior, rng, 3.0), noise=1e-6)] for k in range(50)}
-    found = day_error(prior, days)
+    found = session_error(prior, days)
     assert found.freedom == FREEDOM + 50
     assert found.times == pytest.approx(3.0, rel=0.25)  # of 50 days of three axes: standard error 6 %
-    assert day_error(prior, {}) is prior
+    assert session_error(prior, {}) is prior
     exact = {"a": [predicted(rng, 0.0, noise=1e-9)]}
-    assert day_error(prior, exact).times == pytest.approx(TIMES * np.sqrt(FREEDOM / (FREEDOM + 1.0)), rel=1e-3)
+    assert session_error(prior, exact).times == pytest.approx(TIMES * np.sqrt(FREEDOM / (FREEDOM + 1.0)), rel=1e-3)
 
 
 def test_errors_of_a_day_are_student_s_t_and_last(prior):
@@ -99,18 +99,18 @@ def test_a_day_whose_motion_was_shown_has_no_slow_error(prior):
 
 def test_it_is_read_back_from_plain_values(prior):
     days = {"monday": [predicted(np.random.default_rng(3), 0.002)]}
-    found = day_error(prior, days)
-    assert DayError.from_dict(found.as_dict()) == found
+    found = session_error(prior, days)
+    assert SessionError.from_dict(found.as_dict()) == found
 
 
 def test_the_sentences(prior):
-    error = prior._replace(days={"monday": 0.0071, "tuesday": 0.016}, held=0.88)
-    assert day_sentence(error) == (
+    error = prior._replace(sessions={"monday": 0.0071, "tuesday": 0.016}, covered=0.88)
+    assert session_sentence(error) == (
         "No recording of this session was seen. In sessions left out of its fit this model was 7.1 to "
         "16 mm off; its 90 % bands held 88 %."
     )
     assert left_out_sentence(prior) == ""
-    assert day_sentence(prior).startswith(
+    assert session_sentence(prior).startswith(
         "No recording of this session was seen. This run left no session out of its fit"
     )
 
@@ -160,4 +160,4 @@ def test_an_error_that_the_draws_expect_is_none_of_the_day_s(prior):
     day = RecordingPrediction(
         "a", "test", TIME, ("tip",), PATH + aside, MASK, np.stack([PATH + aside, PATH - aside]), PATH
     )
-    assert day_error(prior, {"day": [day]}).times == pytest.approx(TIMES * np.sqrt(FREEDOM / (FREEDOM + 1)))
+    assert session_error(prior, {"day": [day]}).times == pytest.approx(TIMES * np.sqrt(FREEDOM / (FREEDOM + 1)))
