@@ -43,7 +43,6 @@ from rfdropo_bayes.fem.components import (
     transposed,
     transposed_times,
 )
-from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.sections import Inner
 
 Six = Float[Array, "6 ..."]
@@ -146,8 +145,8 @@ def taut_resultant(elements: Elements, taut: TautCables, rates: Six) -> Six:
     return jnp.concatenate([transposed_times(elements.frame, force), transposed_times(elements.frame, moment)])
 
 
-def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six, share: Scalar) -> Stiffness:
-    """The stiffness with a share of how the forces of sections and of cables beside them turn with the middles of the
+def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six) -> Stiffness:
+    """The stiffness with the rotation of the forces of sections and of cables beside them with the middles of the
     elements, in leading order; it is symmetric.
 
     Args:
@@ -155,10 +154,9 @@ def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six,
         stiffness: their stiffness without it.
         resultant: forces and moments between the stations in the elements' frames.
         pull: forces and moments of the cables in space.
-        share: 1 for all of it.
     """
-    force = 0.5 * share * (pull[:3] + times(elements.frame, resultant[:3]))
-    moment = 0.5 * share * (pull[3:] + times(elements.frame, resultant[3:]))
+    force = 0.5 * (pull[:3] + times(elements.frame, resultant[:3]))
+    moment = 0.5 * (pull[3:] + times(elements.frame, resultant[3:]))
     lean = force[:, None] * elements.way[None]
     swing = 0.25 * (lean + transposed(lean)) - 0.5 * diagonal(jnp.stack([dot(force, elements.way)] * 3))
     tilt, roll = skew(force), skew(moment)

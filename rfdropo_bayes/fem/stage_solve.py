@@ -53,13 +53,6 @@ from rfdropo_bayes.fem.rod_elements import Elements, Six
 from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
 
 
-class Turning(NamedTuple):
-    """Forces that turn with the sections in the matrix of an equilibrium."""
-
-    resultant: Six  # forces and moments between the stations in the elements' frames
-    share: Scalar  # 0 without them, 1 with them
-
-
 class StageBody(NamedTuple):
     """A rod in a stage; arrays have their components first."""
 
@@ -80,7 +73,7 @@ class StageBody(NamedTuple):
     gain: Scalar | None = None  # stiffness of a Prony branch, relative
     branch: Six | None = None  # strains of its dashpot
     blown: Six | None = None  # forces and moments that chambers take from the sections [N], [N m]
-    turning: Turning | None = None  # of an equilibrium
+    turning: Six | None = None  # forces and moments between the stations that turn, in an equilibrium's matrix
 
 
 class Bonds(NamedTuple):
@@ -195,14 +188,14 @@ def matrix(body: StageBody, line: Linearised) -> Chain:
     taut = TautCables(*(body.span**2 * part for part in line.taut))
     stretch, bending = scale * line.slope.stretch, scale * line.slope.bending
     if body.turning is not None:
-        axial = body.turning.share * body.turning.resultant[2]
+        axial = body.turning[2]
         bow, none = axial * body.length**2 / 12.0, jnp.zeros_like(axial)
         bow = jnp.stack([bow, bow, none])
         stretch = stretch + jnp.stack([*(2.0 * axial * body.section.inner.shear), none])
         bending = bending + (bow if bending.ndim == bow.ndim else diagonal(bow))
     element = rod_elements.tangent(line.elements, stretch, bending, taut)
     if body.turning is not None and line.pull is not None:
-        element = rod_elements.turning(line.elements, element, body.turning.resultant, line.pull, body.turning.share)
+        element = rod_elements.turning(line.elements, element, body.turning, line.pull)
     grown = 1.0 + body.span * body.loss
     straight = jnp.eye(3).reshape(3, 3, *[1] * body.mass.ndim) * (grown * body.mass)
     if body.added is not None:

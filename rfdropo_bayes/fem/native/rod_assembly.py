@@ -392,13 +392,13 @@ def _less_turn(rows, matrix, token):
 
 
 @kernel
-def _turning(rows, factor, token):
+def _turning(rows, token):
     """How the forces of a section and of its cables turn with it: force by rotation of the middle, moment by that
     (lower half), and moment by the rotations of both sections; in leading order."""
     force = plus(load3(rows, NET, token), combined(rows, DIRECTOR, load3(rows, STRESS, token), token))
     moment = plus(load3(rows, NET + 3, token), combined(rows, DIRECTOR, load3(rows, STRESS + 3, token), token))
-    force, moment = scaled(force, 0.5 * factor), scaled(moment, 0.5 * factor)
-    chord, zero = load3(rows, CHORD, token), factor - factor
+    half = fill(0.5, rows, token)
+    force, moment, chord, zero = scaled(force, half), scaled(moment, half), load3(rows, CHORD, token), half - half
     ball = -0.5 * dot(force, chord)
     swing = _sum(_both(force, scaled(chord, 0.25)), (ball, zero, zero, ball, zero, ball))
     return _skew(force), _columns(swing), _skew(moment)
@@ -417,9 +417,7 @@ def add_element_tangent(tables, samples, factors, element, work, whole, held, la
     of the lower one; ``held`` by cables; ``lawful``: with a bending law; ``still``: of an equilibrium."""
     rows, upper, elasticity = work.element, (element + 1) * BLOCK, load(factors.elasticity, 0, token)
     lower, tile, (first, second) = upper - BLOCK, upper + PANEL, _levers(rows, token)
-    axial = elasticity - elasticity
-    if still:
-        axial = load(factors.turning, 0, token) * load(rows, STRESS + 2, token)
+    axial = load(rows, STRESS + 2, token) if still else elasticity - elasticity
     force = _section_force(samples, element, rows, elasticity, axial, token)
     bow = axial * (tables.length[element] / 12.0)
     bent = _columns(_section_moment(rows, elasticity, bow, lawful, token))
@@ -437,7 +435,7 @@ def add_element_tangent(tables, samples, factors, element, work, whole, held, la
     turned, bent = _plus(_back_product(second, b), turned), _plus(_back_product(first, a), bent)
     across = _plus(_back_product(first, b), across)
     if still:
-        tilt, swing, roll = _turning(rows, load(factors.turning, 0, token), token)
+        tilt, swing, roll = _turning(rows, token)
         a, b, turned, bent = _minus(a, tilt), _minus(b, tilt), _plus(turned, swing), _plus(bent, swing)
         across = _plus(_plus(across, swing), roll)
     _put_lower(work.pivot, upper, force, True, token)

@@ -61,7 +61,6 @@ class Factors(NamedTuple):
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
     held: Float[np.ndarray, "1 lanes"]  # of the stiffness of taut cables
-    turning: Float[np.ndarray, "1 lanes"]  # of how forces turn with the sections there, for equilibria
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
@@ -109,6 +108,8 @@ class RodWork(NamedTuple):
     sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
     largest: Float[np.ndarray, "1 lanes"]  # increment of the static iteration before [m]
+    shift: Float[np.ndarray, "1 lanes"]  # share of M in the matrix of an equilibrium [1/s2]
+    least: Float[np.ndarray, "1 lanes"]  # its least value but zero
     pace: Float[np.ndarray, "1 lanes"]  # share of it that was gone; 0 if the matrix has changed its kind since
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]

@@ -96,8 +96,8 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
     )  # fmt: skip
     state = dict.fromkeys(("velocity", "solution", "field", "before", "sudden", "branch", "stress"), stations * SIZE)
     once = (
-        "unsolved", "accepted", "lost", "failed", "moving", "largest", "pace", "solves", "imbalance", "softness",
-        "firmness", "loss",
+        "unsolved", "accepted", "lost", "failed", "moving", "largest", "shift", "least", "pace", "solves",
+        "imbalance", "softness", "firmness", "loss",
     )  # fmt: skip
     work = rows(
         turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
