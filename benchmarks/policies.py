@@ -23,8 +23,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rfdropo_bayes.fem.integrators import Integrator
-from rfdropo_bayes.policies.algorithms import algorithm_options
 from rfdropo_bayes.policies.building import make_episodes
+from rfdropo_bayes.policies.ppo import ppo_options
 from rfdropo_bayes.policies.randomisation import Uniform
 from rfdropo_bayes.policies.spaces import spaces_of
 from rfdropo_bayes.policies.tasks import EPISODE, task_named
@@ -128,7 +128,7 @@ def rows_of(task: str, lanes: int, seconds: float, learn: int, integrator: Integ
         return found
     gamma = task_named(PUSH if task == EMPTY else task).gamma
     model = PPO("MlpPolicy", VecNormalize(venv, gamma=gamma), device="cpu", seed=0,
-                **algorithm_options("PPO", "continuous", gamma, {}, lanes))  # fmt: skip
+                **ppo_options("continuous", gamma, {}, lanes))  # fmt: skip
     model.learn(16 * lanes)
 
     def learning() -> int:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
-from rfdropo_bayes.policies.algorithms import algorithm_options
 from rfdropo_bayes.policies.evaluation import draw_cases, play
+from rfdropo_bayes.policies.ppo import ppo_options
 from rfdropo_bayes.policies.training import EVALUATION_SEED, LEAST_SPREAD
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
@@ -47,7 +47,7 @@ def learnt(venv: TrunkVecEnv, table: TrainingTable, seed: int) -> tuple[Any, Vec
     torch.set_num_threads(1)
     gamma = venv.episodes.task.gamma
     given = {"policy_kwargs": {"lstm_hidden_size": UNITS}}
-    options = algorithm_options("PPO", venv.layout.kind, gamma, given, venv.num_envs)
+    options = ppo_options(venv.layout.kind, gamma, given, venv.num_envs)
     around = VecNormalize(venv, gamma=gamma, epsilon=LEAST_SPREAD**2)
     model = RecurrentPPO("MlpLstmPolicy", around, seed=seed, device="cpu", **options)
     cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)

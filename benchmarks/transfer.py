@@ -48,7 +48,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "twice as wide as the posterior": {"width": 2.0},
     "the posterior's middle alone": {"width": 1e-3},
     "entropy bonus of 0.005": {"options": {"ent_coef": 0.005}},
-    "a critic that sees the parameters": {"critic": "parameters"},
     "input floor of 0.1 mm": {},
     RECURRENT: {},
 }

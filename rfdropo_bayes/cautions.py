@@ -82,7 +82,7 @@ class Caution:
     Attributes:
         code: its topic.
         sentence: the same for people, with numbers and a remedy.
-        grave: the method did not arrive at its answer; the draws must not be used as they are.
+        grave: the method failed, and the draws must not be used.
     """
 
     code: Code

@@ -24,7 +24,7 @@ def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]
 
     Args:
         pattern: the name or glob.
-        base: folder that it is relative to.
+        base: folder to which ``path`` is relative.
         folders: whether a folder may replace the files in it.
 
     Raises:
@@ -88,7 +88,7 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     with whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -98,16 +98,17 @@ def write_json(path: Path, content: Any, *, finite: bool = False) -> None:
     """Write plain values as a JSON file, completely or not at all; with ``finite``, NaN is an error.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     write_text(path, json.dumps(plain(content), indent=2, ensure_ascii=False, allow_nan=not finite) + "\n")
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a file of JSON lines, whose folder is made; a last line that a kill has cut is taken away first.
+    """Add a line to a file of JSON lines, and make its folder. An incomplete last line of a killed program is removed
+    first.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +120,7 @@ def append_line(path: Path, line: str) -> None:
 
 
 def _end_last_line(file: BinaryIO) -> None:
-    """Take away the last line of a file of JSON lines if it was cut; add a missing newline."""
+    """Remove an incomplete last line of a file of JSON lines, and add a missing newline."""
     size = file.seek(0, os.SEEK_END)
     if size == 0:  # or a device, which ends nowhere
         return

@@ -1,4 +1,4 @@
-"""Recordings that belong together: of one day, one robot, one set-up."""
+"""Groups of recordings, for example of one day, one robot or one set-up."""
 
 from __future__ import annotations
 

@@ -57,8 +57,8 @@ def answer_interrupt() -> None:
 
 
 def stop_if_asked_twice() -> None:
-    """Raise KeyboardInterrupt if Ctrl-C was pressed more than once: for long steps, since compiled code that calls back
-    may have lost the exception of the second press.
+    """Raise KeyboardInterrupt if Ctrl-C was pressed more than once. Long steps call this function, since compiled code
+    with callbacks may lose the exception of the second press.
     """
     if _pressed > 1:
         raise KeyboardInterrupt

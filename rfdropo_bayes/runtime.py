@@ -33,7 +33,7 @@ def limit_blas_threads() -> None:
 def keep_callback_threads() -> None:
     """Give XLA's pool at least `CALLBACK_THREADS` threads, unless the user chose otherwise.
 
-    A callback waits, in a thread of that pool, for a copy of its arguments by another thread of it. The pool has one
+    A callback occupies one thread of the pool, and waits for another thread to copy its arguments. The pool has one
     thread for each processor: on one processor two callbacks of one program wait forever. The variable is read when
     JAX first makes an array, and engines that use JAX do so when they are imported.
     """
@@ -42,7 +42,7 @@ def keep_callback_threads() -> None:
 
 
 class _Fork:
-    """Whether this process was forked off after JAX had started its threads, which a fork leaves behind."""
+    """Whether this process was forked after JAX had started threads, which do not exist in the fork."""
 
     without_threads = False
 
@@ -75,9 +75,9 @@ def refuse_lost_threads() -> None:
 def configure_jax() -> None:
     """Make float64 the default of JAX, and let it finish one operation before the next.
 
-    Stiff finite-element solves are wrong in float32. Operations that run ahead of a callback into the compiled
-    engines can take the threads that the callback waits for: on two processors a rollout outside ``jax.jit`` then
-    hangs forever.
+    Stiff finite-element solves are wrong in float32. Asynchronous operations before a callback into the compiled
+    engines can occupy the threads that the callback needs. A rollout outside ``jax.jit`` on two processors then waits
+    forever.
     """
     import jax
 

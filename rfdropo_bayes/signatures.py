@@ -1,4 +1,4 @@
-"""Keywords that a function hands on, shown as its own: by help, by tab completion, and by the error on a typo."""
+"""Keywords that a function passes on, shown in its help, tab completion and errors on typos."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def with_keys_of(schema: type[BaseModel], *, without: Container[str] = ()) -> Ca
 
     Args:
         schema: the table that the keywords are handed on to.
-        without: keys that the function does not take, or takes under its own name.
+        without: keys that the function does not take, or has as named arguments.
     """
 
     def decorate(function: Called) -> Called:
@@ -107,7 +107,7 @@ def see_keywords(
     """See that ``source`` can be called with these keywords.
 
     Raises:
-        InputError: a keyword that it does not have, with the nearest that it has; or keywords that are missing.
+        InputError: a keyword that the function lacks (the message offers the nearest), or missing keywords.
     """
     known = {name: entry for name, entry in inspect.signature(source).parameters.items() if name not in without}
     for name in given:

@@ -17,7 +17,7 @@ Parsed = TypeVar("Parsed", bound=BaseModel)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A remedy for a mistyped name: the closest known one, or the list of all."""
+    """A remedy for a mistyped name: the closest known name, or the list of all names."""
     known = sorted(known)
     close = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
@@ -27,7 +27,7 @@ def read_toml(text: str) -> dict[str, Any]:
     """Tables of a TOML text.
 
     Raises:
-        tomllib.TOMLDecodeError: it is not TOML; the message has a remedy for Windows paths.
+        tomllib.TOMLDecodeError: the text is not TOML; the message has a remedy for Windows paths.
     """
     try:
         return tomllib.loads(text)
@@ -93,7 +93,7 @@ def parse_assignment(assignment: str) -> tuple[list[str], Any]:
     """Keys and value of ``table.key=value``; a bare word is a string, so that names need no quotes on a command line.
 
     Raises:
-        InputError: it has another form.
+        InputError: the table has another form.
     """
     name, equals, text = assignment.partition("=")
     keys = [key.strip() for key in name.split(".")]

@@ -42,7 +42,7 @@ def in_chunks(
         given: the tree.
         sizes: chunk sizes, ascending. All chunks but the last have the largest size; the last is padded to the smallest
             sufficient size. The padding repeats the last entry.
-        before: called before every chunk; it may raise.
+        before: function called before every chunk; may raise an exception.
         after: called with the number of entries after every chunk.
     """
     count, parts = len(jax.tree.leaves(given)[0]), []

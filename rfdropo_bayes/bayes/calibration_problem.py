@@ -91,12 +91,10 @@ class CalibrationProblem:
 
     @property
     def scales(self) -> Mapping[str, tuple[str, ...]]:
-        """See `Hierarchy`."""
         return self.model.scopes.scales
 
     @property
     def typical_scales(self) -> dict[str, float]:
-        """See `Hierarchy`."""
         return self.model.scopes.typical_scales
 
     @cached_property
@@ -108,7 +106,7 @@ class CalibrationProblem:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Digest of data, parameters and simulator: a checkpoint belongs to the problem it was made for."""
+        """Digest of data, parameters and simulator: a checkpoint is valid for one problem only."""
         digest = hashlib.sha256()
         recordings = self.model.recordings
         data = self.measured.values()
@@ -187,7 +185,7 @@ class CalibrationProblem:
         return self.model.programs.prior_derivatives
 
     def steps_for(self, horizon: int) -> int:
-        """Time steps to simulate so that the first ``horizon`` rows of every recording are there."""
+        """Number of time steps that reach the first ``horizon`` rows of every recording."""
         commands = self.model.recordings.commands
         row = np.minimum(horizon, self.model.recordings.rows) - 1
         index = np.arange(self.n_recordings), row
@@ -296,7 +294,8 @@ class CalibrationProblem:
     ) -> dict[str, tuple[Float[np.ndarray, "*batch recording time column"], Bool[np.ndarray, "recording time column"]]]:
         """Residuals of all rows, as `residuals` lays them out, by channel; and which of them were measured.
 
-        Only of channels whose noise is independent from row to row. Columns that stand for sizes are left out.
+        Rows are allowed only for channels with independent noise between rows. Columns that stand for sizes are left
+        out.
         """
         values = {name: jax.ShapeDtypeStruct((), float) for name in self.names}
         steps = jnp.asarray(self.steps_for(self.n_rows))

@@ -1,7 +1,7 @@
-"""One parameter that is inferred: its prior, and the recordings that it holds for.
+"""An inferred parameter, its prior and its recordings.
 
-A parameter that differs between groups of recordings (days, robots) about a value that all share is pooled: each group
-has a deviation from the shared value, and the deviations have a standard deviation, the spread.
+A pooled parameter differs between groups of recordings (days, robots). Each group has a deviation from a shared value,
+and the standard deviation of these deviations is the spread.
 """
 
 from __future__ import annotations
@@ -69,11 +69,11 @@ class InferredParameter:
 
     @property
     def of_recording(self) -> bool:
-        """Whether it belongs to a single recording."""
+        """Whether the parameter belongs to a single recording."""
         return bool(self.scope.owner) and not self.scope.group
 
     def holds_for(self, recording: str) -> bool:
-        """Whether it is one of a recording's parameters."""
+        """Whether the parameter belongs to recordings."""
         return not self.scope.owner or recording in self.members
 
     @cached_property

@@ -45,7 +45,7 @@ class Lanes:
         marker_index: indices of its measured markers.
         width: lanes per call, with the last call of a batch padded.
         fields: parts of an observation that are data; if the pose of an object is included, its start is an input.
-        costly: parameters of which rollouts take longer than others.
+        costly: parameters whose rollouts are slow.
         physical: parameters that lanes are given; all of the simulator's by default. The others are nominal.
 
     Attributes:
@@ -85,7 +85,7 @@ class Lanes:
         lacking = [name for name in self.fields if parts[name] is None]
         if lacking:
             raise InputError(
-                f"the simulator does not tell its {lacking[0].replace('_', ' ')}",
+                f"the simulator does not return its {lacking[0].replace('_', ' ')}",
                 where=f"[model] {lacking[0]}",
                 remedy="leave it out, or let its rollout return it",
             )
@@ -105,7 +105,7 @@ class Lanes:
         return 0.0
 
     def with_difference(self, step: float) -> Self:
-        """The same with differences over another step."""
+        """The lanes with another step of differences."""
         changed = copy.copy(self)
         changed.difference = step
         return changed
@@ -174,8 +174,8 @@ class Lanes:
 
 
 def lanes_of(simulator: Simulator, marker_index: np.ndarray, physical: tuple[str, ...]) -> Lanes:
-    """Lanes of a simulator, given some of its parameters: one program for all models of it, such as copies under other
-    priors or of other recordings.
+    """Lanes of a simulator, given some of its parameters: all models of the simulator share one program, for example
+    with other priors or recordings.
     """
     for lanes in _RECENT:
         own = lanes.simulator is simulator and lanes.physical == physical
@@ -189,8 +189,8 @@ _RECENT: deque[Lanes] = deque(maxlen=8)
 
 
 class RoutedLanes(Lanes):
-    """Two compiled simulators of one model: a fast one for all that it can do, another for rollouts with further
-    candidates.
+    """Two compiled simulators of one model: a fast simulator, and another for rollouts with candidates that the fast
+    simulator lacks.
 
     Args:
         fast: lanes of the simulator without these candidates.
@@ -222,7 +222,6 @@ class RoutedLanes(Lanes):
         steps: int | None = None,
         width: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
-        """See `Lanes.roll`."""
         slow = self._needs_slow(theta)
         routes: list[tuple[np.ndarray, Lanes, Any]] = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
         order, results = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes]), []

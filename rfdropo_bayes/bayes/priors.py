@@ -1,5 +1,6 @@
-"""Prior distributions from the tables of an experiment file, confined to a parameter's hard bounds, and the tables of
-priors that are given as distributions of numpyro."""
+"""Prior distributions from the tables of an experiment file, truncated to a parameter's hard bounds; and the reverse,
+tables of numpyro's distributions.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from numpyro.distributions.truncated import (
     TwoSidedTruncatedDistribution,
 )
 from scipy import stats
+from scipy.special import ndtr
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
@@ -145,7 +147,7 @@ def log_density(spec: ParameterSpec, table: Mapping[str, Any], values: np.ndarra
     if family == "LogNormal":
         middle, at = math.log(table["median"]), np.log(values)
         low, high = (math.log(bound) if bound > 0.0 else -math.inf for bound in (low, high))
-    inside = stats.norm.cdf((high - middle) / scale) - stats.norm.cdf((low - middle) / scale)
+    inside = ndtr((high - middle) / scale) - ndtr((low - middle) / scale)
     density = -0.5 * ((at - middle) / scale) ** 2 - math.log(scale * math.sqrt(2.0 * math.pi) * inside)
     return density - at if family == "LogNormal" else density
 
@@ -159,7 +161,7 @@ def _number(name: str, value: Any, where: str) -> float:
 
 
 def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float], where: str) -> None:
-    """A range must lie inside the hard bounds; a bell must have at least half of its mass there."""
+    """A range must lie inside the hard bounds; a normal distribution must have at least half of its mass inside."""
     bounds = f"the hard bounds of {spec.name} are [{spec.low:g}, {spec.high:g}] {spec.unit}"
     low, high = numbers.get("low", -math.inf), numbers.get("high", math.inf)
     if low >= high:

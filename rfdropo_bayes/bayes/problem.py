@@ -108,7 +108,7 @@ class ResidualProblem(Problem, Protocol):
 
     Attributes:
         physical_names: parameters that the simulation depends on; the others are noise. All of ``names`` if unknown:
-            they are then identified numerically.
+        noise parameters are then identified numerically.
         jacobian: method of Jacobians: "forward", "central", or "auto".
         prior_derivatives: derivatives of the log prior.
     """
@@ -181,7 +181,7 @@ class Hierarchy(Problem, Protocol):
     def typical_scales(self) -> Mapping[str, float]: ...
 
     def holding(self, values: Mapping[str, float]) -> ResidualProblem:
-        """The same problem with some parameters fixed. A parameter whose standard deviation is fixed is its own
+        """The same problem with some parameters fixed. A parameter with a fixed standard deviation equals its
         unconstrained coordinate.
         """
         ...
@@ -285,7 +285,7 @@ def with_rollouts(problem: Problem) -> RolloutProblem:
     """A problem for a method that learns from rollouts.
 
     Raises:
-        InputError: the problem does not have them.
+        InputError: the problem has no such members.
     """
     if not isinstance(problem, RolloutProblem):
         raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
@@ -326,8 +326,7 @@ def check_problem(problem: object) -> None:
     """Check the members of a problem before a method runs.
 
     Raises:
-        InputError: it lacks a member of `Problem`, or of a protocol that it implements in part, which methods would
-            then not recognise.
+        InputError: the problem lacks a member of `Problem`, or of a protocol that the problem implements in part.
     """
     there = {*dir(problem)}
     wanted = [("", Problem), *((member, kind) for member, kind in CAPABILITIES.items() if member in there)]

@@ -36,7 +36,7 @@ class RecordingSet:
         return steps_of(self.time)
 
     def of(self, index: Sequence[int], rows: int | None = None) -> RecordingSet:
-        """Some recordings only, and of each the first rows."""
+        """The first rows of some recordings."""
         chosen = list(index)
         return RecordingSet(
             tuple(self.names[i] for i in chosen),

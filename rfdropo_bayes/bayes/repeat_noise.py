@@ -1,5 +1,6 @@
-"""Recordings of the same commands: which they are, their mean, the noise that they differ by, and constant shifts
-between them: a frame or a start that was not the same each time, which is no noise."""
+"""Repeats, recordings of the same commands: their groups, means, noise and constant shifts: a different frame or start
+of a repeat is not noise.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +84,7 @@ def mean_error(
 def deviations(
     errors: Float[np.ndarray, "recording time column"], valid: Bool[np.ndarray, "recording time column"], groups: Groups
 ) -> tuple[Float[np.ndarray, "repeat time column"], Bool[np.ndarray, "repeat time column"], float]:
-    """Errors of repeats about their means, which of them count, and their degrees of freedom per value."""
+    """Deviations of repeats from their means, a mask of valid values, and degrees of freedom per value."""
     parts, counted, freedom, values = [], [], 0.0, 0
     for group, mean in zip(groups, mean_error(errors, valid, groups), strict=True):
         if len(group) > 1:
@@ -102,7 +103,7 @@ def repeated(groups: Groups) -> list[int]:
 
 
 def with_noise_of_repeats(channel: Series, groups: Groups, steps: Float[np.ndarray, " recording"]) -> Series:
-    """The channel under the noise that its repeats differ by, in recordings whose rows are ``steps`` seconds apart.
+    """The channel under the noise between its repeats, in recordings with ``steps`` seconds between rows.
 
     Raises:
         InputError: nothing was repeated.

@@ -146,27 +146,27 @@ class Scopes:
         return {whole(name) for name in (*fitted, *(p.scope.owner for p in self.parameters if p.of_recording))}
 
     def holding(self, values: Mapping[str, float]) -> Scopes:
-        """The same without some parameters, which are known."""
+        """The scopes with some parameters known instead of inferred."""
         kept = [p for p in self.parameters if p.name not in values]
         kept = [p.scaled(values[p.scope.scaled_by]) if p.scope.scaled_by in values else p for p in kept]
         known = tuple(p for p in self.parameters if p.name in values)
         return replace(self, parameters=tuple(kept), fixed={**self.fixed, **values}, known=(*self.known, *known))
 
     def with_further(self, parameters: Iterable[InferredParameter]) -> Scopes:
-        """The same with parameters after all others."""
+        """The scopes with further parameters at the end."""
         return replace(self, parameters=(*self.parameters, *parameters))
 
     def extended(self, recordings: Sequence[str], fitted: Sequence[str], groups: Patterns) -> Extension:
         """The parameters of new recordings.
 
         A parameter that every fitted recording had separately takes, in a new recording, the value of any of them. A
-        parameter of some fitted recordings only, such as a payload, applies to them and their further pieces. A
-        parameter of some groups also applies to their new recordings. Each group, fitted or not, deviates from the
-        shared values.
+        parameter of some fitted recordings only, such as a payload, applies to these recordings and their further
+        pieces. A parameter of some groups also applies to their new recordings. Each group, fitted or not, deviates
+        from the shared values.
 
         Args:
             recordings: names of the new recordings; fitted: names of the fitted recordings.
-            groups: recordings that belong together; by default each is its own group.
+            groups: recordings that belong together; by default each recording is a group.
         """
         known, shared = self.recordings_known(fitted), [p for p in self.parameters if not p.scope.owner]
         like: dict[str, tuple[str, ...]] = {p.name: (p.name,) for p in shared}

@@ -52,10 +52,10 @@ class TrajectoryModel:
         """The model of marker positions alone.
 
         Args:
-            simulator: see above; scopes: of its parameters.
+            simulator: see above; scopes: scopes of the simulator's parameters.
             trajectories: the recordings.
             noise: name of the noise of the positions.
-            known: the noise of ``markers``, unless it is inferred.
+            known: noise of ``markers``; None for inferred noise.
 
         Raises:
             InputError: a marker whose noise is not known, or see `gather_recordings`.

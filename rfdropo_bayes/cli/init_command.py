@@ -151,11 +151,11 @@ Target = Annotated[
     Path,
     typer.Argument(
         metavar="FOLDER",
-        help="folder to write to, whose name the robot takes; or a MuJoCo model (.xml, .urdf): the experiment goes "
-        "into a folder of its name",
+        help="folder to write to, also the name of the robot; or a MuJoCo model (.xml, .urdf), whose name the folder "
+        "gets",
     ),
 ]
-Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing, take defaults and mark them ASSUMED")]
+Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing; take defaults, marked ASSUMED")]
 
 
 def init(

@@ -19,8 +19,8 @@ OutFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="folder to write to  [default: runs/NAME_COMMAND, for calibrate runs/NAME; NAME is the file's name, "
-        "or its folder's if the file is experiment.toml]",
+        help="folder to write to  [default: runs/NAME_COMMAND, for calibrate runs/NAME; NAME is the name of the "
+        "file, or of the folder of experiment.toml]",
     ),
 ]
 Overrides = Annotated[
@@ -62,7 +62,7 @@ def folder_for(
 
 
 def experiment_name(experiment: Path) -> str:
-    """The name that default folders have: the name of the file, or of its folder if the file has a default name."""
+    """Name of default folders: the name of the experiment file, or of its folder if the file has a default name."""
     folder = experiment.resolve().parent.name
     if not folder or experiment.stem not in WRITTEN:
         return experiment.stem

@@ -24,11 +24,11 @@ from rfdropo_bayes.errors import InputError
 
 def train(
     experiment: Annotated[
-        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; leave it out with --from")
+        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; not needed with --from")
     ] = None,
     fit: Annotated[
         Path | None,
-        typer.Option("--from", help="folder of a calibration: train on its model, under draws of its posterior"),
+        typer.Option("--from", help="folder of a calibration, whose model and posterior are used for training"),
     ] = None,
     task: Annotated[str | None, typer.Option("--task", help="reach or push; by default from the experiment")] = None,
     goal: Annotated[

@@ -31,7 +31,7 @@ def predict(
     ],
     commands: Annotated[str, typer.Option("--commands", help="file of commands, in the format of the experiment")],
     out: Annotated[Path, typer.Option("--out", help="folder to write to")],
-    fit: Annotated[Path | None, typer.Option("--from", help="folder of its calibration; DIR by default")] = None,
+    fit: Annotated[Path | None, typer.Option("--from", help="folder of the calibration; DIR by default")] = None,
     start: Annotated[
         str | None, typer.Option("--start", help="file whose first row is the start pose, if --commands has none")
     ] = None,
@@ -73,7 +73,8 @@ def adapt(
     recording: Annotated[str, typer.Option("--recording", help="file of observations, in the experiment's format")],
     out: Annotated[Path, typer.Option("--out", help="folder to write to")],
     commands: Annotated[
-        str | None, typer.Option("--commands", help="file of its commands, if the format has a separate file")
+        str | None,
+        typer.Option("--commands", help="file of the recording's commands, if the format has a separate file"),
     ] = None,
     episode: Episode = None,
     seconds: Annotated[float | None, typer.Option(help="seconds from the start that are used; all by default")] = None,

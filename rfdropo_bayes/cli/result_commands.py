@@ -65,13 +65,13 @@ def _say_results(folder: Path) -> list[str]:
 
 def view(
     source: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml|FILE.nc", help="experiment or recording to draw")],
-    out: Annotated[
-        Path, typer.Option("--out", help=".png, .svg, .pdf, .gif, .mp4; NAME.vtk for surfaces; a folder for frames")
-    ] = Path("runs/view.png"),
+    out: Annotated[Path, typer.Option("--out", help=".png, .svg, .pdf, .gif or .mp4")] = Path("runs/view.png"),
     recording: Annotated[
-        str | None, typer.Option(help="recording of the experiment to draw; the first by default")
+        str | None, typer.Option(help="recording to draw; the first of the experiment by default")
     ] = None,
-    robot: Annotated[Path | None, typer.Option(help="file of the robot, if a NetCDF file has none beside it")] = None,
+    robot: Annotated[
+        Path | None, typer.Option(help="robot file, for a NetCDF file without a robot file in its folder")
+    ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,15 +82,15 @@ def view(
     """Draw a motion. Simulates an experiment, or reads a NetCDF file of simulate or predict."""
     from rfdropo_bayes.verbs.view import run_view
 
-    written = run_view(source, out, overrides or [], recording, robot)
-    typer.echo(f"{written[0]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
+    run_view(source, out, overrides or [], recording, robot)
+    typer.echo(out)
 
 
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a calibration")],
     phi: Annotated[bool, typer.Option("--phi", help="the distribution to randomise over")] = False,
     model: Annotated[
-        bool, typer.Option("--model", help="the model of another simulator (MJCF), with posterior means in it")
+        bool, typer.Option("--model", help="write the model of another simulator (MJCF) with posterior means")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace files of an earlier export")] = False,

@@ -149,7 +149,7 @@ def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | 
     numbers, first = np.unique(recording.identity, return_index=True)
     where = f"{recording.table.path} with {commands}"
     if np.any(np.diff(recording.identity) < 0):
-        raise InputError("its rows are not in the order of their ID", where=where, remedy="sort them")
+        raise InputError("the rows are not in the order of the column ID", where=where, remedy="sort them")
     if commands is None or len(numbers) != len(command) or not np.array_equal(numbers, np.arange(len(command))):
         count = "no" if commands is None else str(len(command))
         raise InputError(
@@ -183,8 +183,7 @@ def _read_commands(path: Path) -> Float[np.ndarray, "rows 6"]:
 def command_columns(
     time: Float[np.ndarray, " k"], command: Float[np.ndarray, "k 6"], seconds: float
 ) -> dict[str, np.ndarray]:
-    """Commands [rad] that hold from their times [s] on, as the columns of a file of commands: a row every 10 ms of so
-    many seconds, in degrees."""
+    """Commands [rad] and the times [s] from which they are in force, from a file with a row of degrees every 10 ms."""
     row = np.arange(max(1, round(seconds * RATE)))
     held = np.rad2deg(command)[np.searchsorted(time, row / RATE + 1e-9, side="right") - 1]
     return {"ID": row, **dict(zip(_COMMANDS, held.T, strict=True))}

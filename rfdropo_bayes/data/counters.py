@@ -1,8 +1,8 @@
 """Detection of wrapped or restarted counters and angles, by jumps that no marker follows.
 
-A wrapped counter has short steps, and steps of nearly a turn against the motion before and after. A command that really
-jumps looks the same, so the markers decide: they are regressed on the commands with and without the jumps. A jump is
-doubtful if the regression is better without it.
+A wrapped counter has short steps, and steps of nearly a turn against the motion before and after. A real jump of the
+command looks the same, so the markers decide: their motion is regressed on the commands with and without the jumps. A
+jump is doubtful if the regression is better without it.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ def turns_of(unit: str, counts_per_turn: float | None, values: np.ndarray) -> li
 
 
 def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wraps | None:
-    """Jumps of about one turn, against the motion around them; None if there are none, or steps of every length.
+    """Jumps of about one turn relative to the motion before and after; None without jumps, or if steps of all lengths
+    occur.
 
     Args:
         values: values of one column; missing values are skipped.

@@ -33,7 +33,6 @@ class Dialect(NamedTuple):
 
 
 def cells_of(line: str, separator: str) -> list[str]:
-    """The cells of a line."""
     if separator == " ":
         return line.split()
     if '"' not in line:
@@ -56,7 +55,9 @@ def dialect_of(lines: Sequence[str]) -> Dialect:
 
 
 def _fit(lines: Sequence[str], separator: str) -> tuple[bool, float, int, int]:
-    """Score of a separator: whether it separates, the share of values and their number, and the names."""
+    """Score of a separator: whether there is more than one column, the share and number of numeric cells, and the
+    names.
+    """
     names = len(cells_of(lines[0], separator))
     rows = [cells_of(line, separator) for line in lines[1 : SAMPLED + 1] or lines if line.strip()]
     cells = [cell for row in rows for cell in row]

@@ -93,8 +93,8 @@ class CsvTable:
         path: the file, plain or gzipped.
         required: columns that must be there.
         names: names of the columns, if the first line holds values.
-        machine_written: the format has a writer and columns of its own: it ends every line with a newline, so a last
-            line without a newline was cut. Otherwise a table [data.columns] names the columns.
+        machine_written: files of the format are written by a program that ends every line with a newline, so a last
+        line without a newline is incomplete. Otherwise a table [data.columns] names the columns.
 
     Raises:
         InputError: empty file, header without rows, ragged or cut rows, a missing, renamed or repeated column.
@@ -162,7 +162,7 @@ class CsvTable:
 
     @classmethod
     def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
-        """A table whose header, the first of ``lines``, a reader of its own has made of a file's.
+        """A table whose first line, the header, was made by the reader of a format.
 
         Raises:
             InputError: see the class.

@@ -193,8 +193,8 @@ def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[
 def find_held(position: Float[np.ndarray, "time marker 3"]) -> Bool[np.ndarray, "time marker"]:
     """Mask of positions that repeat the previous row although the marker is not at rest.
 
-    Not held: markers that never move, signals so coarsely rounded that repeats are natural, and rows in which the whole
-    body repeats when that is common (the rest of a noise-free recording).
+    Not counted as held: markers that never move, coarsely rounded signals, and rows in which the whole body repeats if
+    that is common (a noise-free recording at rest).
     """
     step = np.abs(np.diff(position, axis=0))
     repeats = (step == 0.0).all(axis=2)
@@ -209,7 +209,7 @@ def find_held(position: Float[np.ndarray, "time marker 3"]) -> Bool[np.ndarray, 
 
 
 def _rounded(changes: Float[np.ndarray, " n"]) -> bool:
-    """Whether a signal is rounded so coarsely that it repeats by itself: its changes are a few times one quantum."""
+    """Whether coarse rounding makes a signal repeat: the changes are a few quanta."""
     quanta = changes / changes.min()
     return bool(np.quantile(quanta, 0.01) < _FEW and np.all(np.abs(quanta - np.rint(quanta)) < 0.01))
 
@@ -232,7 +232,7 @@ def _off_path(
 ) -> tuple[np.ndarray, int]:
     """Rows off the longest smooth path of one marker, and the number of breaks in that path.
 
-    A path through rows whose every step is smooth leaves nothing out: it is searched around the other steps only.
+    A path with only smooth steps needs no search; the search covers the other steps only.
     """
     wrong, breaks = np.zeros(len(time), dtype=bool), 0
     if len(time) < 4 * _VELOCITY_ROWS:
@@ -254,7 +254,7 @@ def _around(rows: np.ndarray, margin: int, length: int) -> list[slice]:
 
 
 class _Motion(NamedTuple):
-    """Rows of one marker, with the velocities that arrive at each and leave it."""
+    """Rows of one marker, with the velocities before and after each row."""
 
     time: np.ndarray
     position: np.ndarray
@@ -271,8 +271,8 @@ class _Motion(NamedTuple):
     def smooth(self, apart: int) -> Bool[np.ndarray, " row"]:
         """Whether a body can move from each row to the row ``apart`` rows later.
 
-        It can if the motion agrees with the mean of the velocities before and after it; a short one may agree with
-        either alone, as the onset of a motion does.
+        A step is plausible if it agrees with the mean of the velocities before and after. A short step may agree with
+        one of the two, as at the onset of a motion.
         """
         first, last = slice(0, len(self.time) - apart), slice(apart, len(self.time))
         gap = (self.time[last] - self.time[first])[:, None]

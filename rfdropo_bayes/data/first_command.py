@@ -1,6 +1,6 @@
 """The command in force before the first row, which many files do not hold.
 
-It is given, or measured, or recognised from how the recording begins. Measured motor angles show it in the first row.
+It is given, or measured, or recognised from how the recording begins. Measured motor angles show the first command.
 Without them, either the first command was in force already, so that the robot rests until commands change, or no
 command was, and the robot starts from its rest pose. A linear robot with a dead time and a lag is fitted for both
 cases; the case with the smaller error in the first rows is taken.
@@ -79,7 +79,7 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
 def angle_at_first(trajectory: Trajectory) -> Float[np.ndarray, " channel"] | None:
     """Motor angles [rad] in the first row, if all were measured and commands are angles; None otherwise.
 
-    A held reading of a slower loop also counts: it is a few rows old, of a robot at rest.
+    A reading of a slower loop that is a few rows old also counts, since the robot is at rest.
     """
     angle, mask = trajectory.motor_angle, trajectory.motor_angle_mask
     if angle is None or trajectory.command_unit != "rad":

@@ -35,9 +35,9 @@ def new_readings(
 ) -> Bool[np.ndarray, "time channel"]:
     """Mask of readings that were made since the previous row.
 
-    All are new unless they are held for longer than the sample time. A change of any channel marks a new held reading,
-    because all channels are read together. The first row counts as held. A new reading that equals the last in every
-    channel goes unnoticed, which loses only repeated readings of a drive at rest.
+    All readings are new unless they last for longer than the sample time. A change of any channel marks a new held
+    reading, because all channels are read together. The first row counts as held. A new reading that equals the last in
+    every channel goes unnoticed, which loses only repeated readings of a drive at rest.
     """
     if hold <= HELD * sample_time(time):
         return np.ones(reading.shape, dtype=bool)

@@ -1,8 +1,8 @@
 """Markers that change names: from a row on, a tracker gives the places of some markers under the names of others.
 
-A change shows in one row: each of these markers is at the expected position of another marker, and far from its own.
-Two points of one body do not trade places within a row, so the change is certain; the rows do not show which names are
-right; the names at the beginning are taken.
+An exchange of markers shows in one row: each exchanged marker is near the expected position of the other marker, and
+far from its own expected position. Two points of one body do not trade places within a row, so the change is certain;
+the rows do not show which names are right; the names at the beginning are taken.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ def changed_names(
 def _expected(
     position: Float[np.ndarray, "time marker 3"], usable: Bool[np.ndarray, "time marker"]
 ) -> tuple[Float[np.ndarray, "2 time marker 3"], Bool[np.ndarray, "time marker"]]:
-    """Expected positions of each marker in a row: its last position and its extrapolation; and whether it was seen."""
+    """Expected positions of each marker in a row (the last position, and an extrapolation), and whether the marker was
+    seen.
+    """
     rows = np.arange(len(position))[:, None]
     last = np.maximum.accumulate(np.where(usable, rows, -1), axis=0)
     last = np.concatenate([np.full((1, last.shape[1]), -1), last[:-1]])

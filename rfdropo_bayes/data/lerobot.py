@@ -1,8 +1,8 @@
 """LeRobotDatasets of versions 2 and 3, folders of JSON and Parquet files: read with pyarrow, not the package lerobot.
 
-Each episode is a recording. A column is called by its feature, a full stop and its name there, such as
-``observation.state.tip_x``; by its number if the dataset has no names, ``action[0]``; and by the feature alone if that
-is a single number, ``timestamp``. Pictures, videos and texts are skipped.
+Each episode is a recording. A column is called ``feature.name``, such as ``observation.state.tip_x``;
+``feature[number]`` if the dataset has no names, such as ``action[0]``; and ``feature`` if the feature is a single
+number, such as ``timestamp``. Pictures, videos and texts are skipped.
 
 Timing. The action of a frame is commanded after its observation, and in force until the next frame.
 """

@@ -33,7 +33,7 @@ def recognised_format(path: Path) -> str:
     """Which of `MAPPED` a file or folder is, by its content; "csv" for a file that is none of the others.
 
     Raises:
-        InputError: a folder that is neither a bag nor a LeRobotDataset, or a path that is not there.
+        InputError: the folder is neither a bag nor a LeRobotDataset, or the path does not exist.
     """
     if path.is_dir():
         if (path / lerobot.INFO).is_file():
@@ -69,7 +69,7 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
     """The observations of a recording in one of the formats `MAPPED`.
 
     Raises:
-        InputError: a file of another format, a damaged one, or a column that is not there.
+        InputError: the file has another format, is damaged, or lacks a column.
     """
     recognised = recognised_format(path)
     if recognised != format:
@@ -94,7 +94,7 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
 
 
 def _in_seconds(columns: CsvColumns, path: Path) -> CsvColumns:
-    """The same for observations whose times the format has in seconds; commands in a CSV keep their own unit."""
+    """Units of times for a format with times in seconds; commands in a CSV keep the CSV's unit."""
     unit = command_clock(columns)[1]
     return changed(columns, where=str(path), time_unit="s", command_time_unit=unit)
 
@@ -119,7 +119,7 @@ def read_mapped(
         mask_missing: mask lost marker positions instead of rejecting the file.
 
     Raises:
-        InputError: on a damaged file, a column that is not there, or files that do not fit together.
+        InputError: a file is damaged or lacks a column, or the files do not match.
     """
     table, columns = observed_table(format, path, columns, episode)
     source = command_table(commands, columns)

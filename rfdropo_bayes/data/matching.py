@@ -51,7 +51,7 @@ def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -
         )
     if set(own) == set(channels) and tuple(own) != tuple(channels):
         raise InputError(
-            f"its commands are in the order {', '.join(own)}, the robot's are {', '.join(channels)}",
+            f"commands are in the order {', '.join(own)}, channels of the robot in the order {', '.join(channels)}",
             where=trajectory.name,
             remedy="list the columns under [data.columns] commands in the robot's order"
             if plain
@@ -59,7 +59,7 @@ def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -
         )
     if trajectory.command_unit != unit:
         raise InputError(
-            f"the recording's commands are in {trajectory.command_unit}, the robot's in {unit}",
+            f"the recording has commands in {trajectory.command_unit}, the robot in {unit}",
             where=trajectory.name,
             remedy="correct command_unit under [data.columns]; for another drive, change [command] unit and [channels] "
             "of the robot"
@@ -69,5 +69,5 @@ def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -
 
 
 def _counted(names: Sequence[str]) -> str:
-    """Such as "2 channels of commands (a, b)"."""
+    """A number and names, such as "2 channels of commands (a, b)"."""
     return f"{len(names)} channel{'s' if len(names) > 1 else ''} of commands ({', '.join(names)})"

@@ -1,4 +1,4 @@
-"""Motive's own export to CSV, of format versions 1.2x: as OptiTrack's software writes it.
+"""Motive's export to CSV, format versions 1.2x.
 
 The first line has facts in pairs, among them the unit of lengths. Rows of types, names, IDs, perhaps parents, and
 quantities follow, then the row of axes and one row per frame. A column here is called by type, name, quantity and axis,
@@ -38,7 +38,8 @@ def read_motive(path: Path) -> MotiveFile:
     """Read an export of Motive's.
 
     Raises:
-        InputError: it is not an export of Motive, has no row of axes or no positions, or is damaged (see `CsvTable`).
+        InputError: the file is not an export of Motive, has no row of axes or no positions, or is damaged (see
+        `CsvTable`).
     """
     lines = read_text(path).replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not lines[0].startswith(MOTIVE):

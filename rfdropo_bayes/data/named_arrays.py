@@ -26,7 +26,7 @@ NUMBERS = "biufMm"  # kinds of arrays that are read: numbers, dates and duration
 
 
 def array_format(path: Path, first: bytes) -> str | None:
-    """Which of `FORMATS` a file is, by its first bytes; None if it is neither."""
+    """Format of a file, one of `FORMATS`, by its first bytes; None for other files."""
     if first.startswith(MATLAB) or (first.startswith(HDF5) and path.suffix == ".mat"):
         return MAT
     if first.startswith(ZIP) and zipfile.is_zipfile(path):

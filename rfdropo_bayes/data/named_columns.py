@@ -76,7 +76,7 @@ class CsvColumns(BaseModel):
         default=None, description="names of all columns, in their order, of a CSV without a line of names"
     )
     command_names: list[str] | None = Field(
-        default=None, description="the same for a CSV of the commands, if they have their own file"
+        default=None, description="names of all columns of the file of commands, for a CSV without a line of names"
     )
     time: str | None = Field(
         default=None,
@@ -92,7 +92,7 @@ class CsvColumns(BaseModel):
     )
     commands: list[str] = Field(
         min_length=1,
-        description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
+        description="columns of the sent commands, one for each channel of the robot, in the robot's order",
     )
     command_unit: CommandUnit = Field(
         description="unit of the commands: a length of cable, an angle of a motor or its counts, a force, torque or "
@@ -117,8 +117,8 @@ class CsvColumns(BaseModel):
     )
     commands_with_poses: bool = Field(
         default=False,
-        description="whether a row has the pose under its own command, as if the robot is at rest, or if commands were "
-        "measured with the pose; by default a command acts from its row on",
+        description="whether the pose of a row results from the command in the same row: true for robots at rest, "
+        "and if commands were measured with the pose; by default a command acts after its row",
     )
     command_time: str | None = Field(
         default=None,
@@ -185,7 +185,8 @@ class CsvColumns(BaseModel):
         "out",
     )
     sections: list[str] | None = Field(
-        default=None, description="the robot's name of each of orientations, see its [[orientations]]"
+        default=None,
+        description="names of orientations in the robot file ([[orientations]]), in the order of the columns",
     )
     rotation_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of rotation vectors")
     robot: str = Field("", description="name of the robot that was recorded")

@@ -1,11 +1,12 @@
 """OptiTrack recordings of the physical trunk, driven open loop by discrete actions.
 
 Timing. The recording loop notes the time, reads the last motion-capture frame, and only then sends the next action: row
-k carries the pose at ``time[k]`` and action k leaves right after it. Command row k, the cumulative nominal displacement
-after action k, is therefore in force from ``time[k]``; row k + 1 shows its effect after about 0.1 s. Action 0 is the
-exception: reading the first frame took until row 1 was due (rows 0 and 1 hold the same frame, taken at row 1), so that
-action 0 left within one frame before ``time[1]``, and action 1 right after it. Nothing was sent while rows repeat the
-initial action. The motors' response is not recorded: delays, ramps and limits are parameters of the model.
+k has the pose at ``time[k]``, and action k is sent right after ``time[k]``. Command row k, the cumulative nominal
+displacement after action k, is therefore in force from ``time[k]``; row k + 1 shows its effect after about 0.1 s.
+Action 0 is an exception. Reading the first frame took until row 1 was due (rows 0 and 1 hold the same frame, taken at
+row 1). So action 0 was sent within one frame before ``time[1]``, and action 1 right after ``time[1]``. Nothing was sent
+while rows repeat the initial action. The motors' response is not recorded: delays, ramps and limits are parameters of
+the model.
 
 The cube's pose is not masked: a jump of the cube alone does not make the trunk's markers wrong.
 """

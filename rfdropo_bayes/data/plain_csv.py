@@ -31,7 +31,7 @@ def read_plain_csv(
     Args:
         path: file with the observations, and the commands unless they have their own file.
         columns: mapping of the columns.
-        commands: file of the commands, if it is another.
+        commands: file of the commands, if separate.
         mask_missing: mask lost marker positions instead of rejecting the file.
 
     Raises:
@@ -48,7 +48,7 @@ def csv_table(path: Path, columns: CsvColumns) -> CsvTable:
 
 
 def command_table(path: Path | None, columns: CsvColumns) -> CsvTable | None:
-    """The file of the commands, if they have their own file."""
+    """The file of the commands, if it is separate."""
     if path is None:
         return None
     return CsvTable(path, columns.commands, names=columns.command_names, machine_written=False)
@@ -58,7 +58,7 @@ def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row:
     """Commands with the start pose at most, from ``row`` of the observations ``start``; see `commands_alone`.
 
     Raises:
-        InputError: on a damaged file, a column that is not there, or a start without that row.
+        InputError: the file is damaged, or lacks a column or the start row.
     """
     table = _commands_alone(path, columns)
     return commands_alone(

@@ -1,4 +1,4 @@
-"""Content of a file or of a program's arrays, in SI units: the parts that a `Trajectory` is built of."""
+"""Parts of a `Trajectory`, from a file or from arrays, in SI units."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class SentCommands:
     largest: float | None = None  # largest plausible command, in their unit; None for the default limits
 
     def of_poses(self) -> SentCommands:
-        """The same of rows whose poses belong to their own commands: a command acts from half-way between its row and
-        the row before on, so that clocks of any step see it in its own row.
+        """Commands in force if the pose in a row belongs to the command in the same row. A command acts from the middle
+        between its row and the row before, so that simulators with any time step apply it in its row.
         """
         time, command = np.asarray(self.command_time), np.asarray(self.command)
         between = 0.5 * (time[:-1] + time[1:])
@@ -81,7 +81,7 @@ class Measured:
 
 
 class Recorded(NamedTuple):
-    """All of a recording, before it is checked: ``Trajectory.build(*recorded)`` checks it."""
+    """All parts of a recording before the checks of ``Trajectory.build(*recorded)``."""
 
     origin: Origin
     sent: SentCommands

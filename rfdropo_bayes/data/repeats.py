@@ -14,9 +14,8 @@ from rfdropo_bayes.data.trajectory import Trajectory
 def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
     """Indices of recordings with identical commands, group by group, in order of first appearance.
 
-    Recordings on different robots, under conditions that the recording itself says differ (the payload hung at the
-    tip), or of the same commands at another speed are not repeats. Times are not compared otherwise: repeats are
-    sampled with the jitter of their own clocks.
+    Recordings are not repeats if the robots, the recorded conditions (a payload at the tip) or the speeds of the
+    commands differ. Times are not compared further, since the sampling times of repeats jitter.
     """
     groups: dict[tuple[object, ...], list[list[int]]] = {}
     for index, trajectory in enumerate(trajectories):
@@ -52,8 +51,9 @@ FIRST_OPENING = 4  # commands
 
 
 def command_openings(trajectory: Trajectory) -> dict[str, str]:
-    """Hashes of the first 4, 8, 16 ... commands of a recording, and of all, by their number; each with the time that
-    they take [s]."""
+    """Hashes of the first 4, 8, 16 ... commands of a recording, and of all commands, by their number, each with a
+    duration [s].
+    """
     command = np.round(np.concatenate([trajectory.initial_command[None], trajectory.command]), 9)
     given = np.concatenate([trajectory.command_time[:1], trajectory.command_time])
     counts = {len(command)}

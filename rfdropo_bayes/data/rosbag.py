@@ -44,7 +44,7 @@ LARGEST_LIST = 256  # longer lists are pictures, scans and clouds of points
 
 
 class _Reading(NamedTuple):
-    """Numbers of one message, or of one element with its own header."""
+    """Numbers of one message, or of one element with a header."""
 
     name: str
     header: Any
@@ -75,7 +75,7 @@ def read_streams(path: Path, topics: Collection[str] | None = None, clock: Clock
     Args:
         path: path of the bag.
         topics: topics to read; by default all with known messages.
-        clock: "header" for stamps if there are any, "log" for the recorder's times.
+        clock: "header" for header stamps, if any; "log" for the recorder's times.
 
     Raises:
         InputError: rosbags is not installed, a bag that is damaged, or a topic that it does not have or define.
@@ -110,7 +110,7 @@ def read_observations(path: Path, columns: CsvColumns) -> CsvTable:
     """Observations at the times of the first marker.
 
     Raises:
-        InputError: see `read_streams`; a column that is not there; positions in several coordinate frames.
+        InputError: see `read_streams`; also a missing column, or positions in several coordinate frames.
     """
     clock, places, pose = clock_of(columns), coordinates(columns), columns.object_pose
     names = [*places, *(columns.tensions or ()), *(columns.motor_angles or ())]
@@ -123,7 +123,7 @@ def read_commands(path: Path, columns: CsvColumns) -> CsvTable:
     """Commands and their times.
 
     Raises:
-        InputError: see `read_streams`; a column that is not there or holds nothing.
+        InputError: see `read_streams`; also a missing or empty column.
     """
     clock, names = clock_of(columns), columns.commands
     sent = commanded(read_streams(path, _topics(names), clock), clock, names, str(path))

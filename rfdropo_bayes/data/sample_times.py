@@ -55,7 +55,7 @@ class Stamps(NamedTuple):
 
 
 def read_stamps(values: Any, unit: str = "s", *, where: str, column: str = "time") -> Stamps:
-    """Stamps of one row each.
+    """Stamps, one for each row.
 
     Args:
         values: numbers in ``unit``, dates, durations or text of these; dates and durations have no unit.
@@ -183,7 +183,7 @@ def _window(time: np.ndarray) -> int:
 
 
 def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
-    """Rows that came in one delivery with the row before, if enough rows did to show that stamps are of arrival."""
+    """Rows that arrived together with the row before, if there are enough to show that stamps are times of arrival."""
     usual, window = row_interval(time), _window(time)
     gaps = np.minimum(np.diff(time), window * usual)  # one gap of hours makes no others short
     means = np.convolve(gaps, np.ones(window) / window, "valid")
@@ -193,7 +193,7 @@ def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
 
 
 def evenly_spaced(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-    """Times from which rates can be taken [s]: evenly spaced if stamps are of arrival, else the stamps."""
+    """Times for derivatives [s]: evenly spaced if stamps are times of arrival, else the stamps."""
     short = short_intervals(time)
     return time if not len(short) else time[0] + _between(time, short) * np.arange(len(time))
 

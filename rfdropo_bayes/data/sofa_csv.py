@@ -2,7 +2,8 @@
 
 Timing. Row 0 is the initial state; row k + 1 is the state after action k, 5 simulation steps of 0.01 s later. So the
 observations are 0.05 s apart, and action k is commanded at the time of row k: command row k, the cumulative
-displacement after action k, is in force from ``time[k]`` until ``time[k + 1]``. Before the first action it is zero.
+displacement after action k, is in force from ``time[k]`` until ``time[k + 1]``. Before the first action the command is
+zero.
 """
 
 from __future__ import annotations

@@ -36,9 +36,7 @@ class RecordingEntry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     observations: str = Field(description="file, or several by wildcards; a folder for a ROS 2 bag or LeRobotDataset")
-    commands: str | None = Field(
-        default=None, description='file of the commands, if they have a separate file; "none": zero commands'
-    )
+    commands: str | None = Field(default=None, description='file of the commands, if separate; "none": zero commands')
     rows: tuple[int, int] | None = Field(
         default=None, description="keep observation rows first to last only, both included, counted from 0"
     )
@@ -72,15 +70,14 @@ class DataSpec(BaseModel):
     )
     initial_command: InitialCommand = Field(
         default=None,
-        description='command before the first row of a file: "first" (its first command was in force already), "zero", '
-        "or one value per channel [m or rad]; recognised from the first rows by default if the file does not state it",
+        description='command before the first row of a file: "first" (the first command was in force already), '
+        '"zero", or one value per channel [m or rad]; by default stated by the file, or recognised from the first rows',
     )
     lead_in: float = Field(
         default=2.0,
         ge=0,
         description="time [s] before the first row during which commands are also simulated, so that a piece may "
-        "start in motion; with 0 it starts at rest under the command in force, as does every piece with "
-        "a tracked object, whose pose starts at the first row",
+        "start in motion; with 0, and with a tracked object, a piece starts at rest under the command in force",
     )
 
     @field_validator("fit", "test", mode="before")
@@ -256,7 +253,7 @@ def _check_split(fit: list[_Source], test: list[_Source]) -> None:
 
 
 def _distinct_names(recordings: list[Trajectory], sources: list[_Source], listed: list[_Source]) -> list[Trajectory]:
-    """Recordings whose files have one name in several folders, of either role, get the folders into their names."""
+    """Recordings whose files have equal names in different folders get names that include the folder."""
     names = [recording.name for recording in recordings]
     distinct = []
     for recording, source in zip(recordings, sources, strict=True):

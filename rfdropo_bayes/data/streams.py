@@ -1,11 +1,11 @@
 """Readings with their own times, such as the topics of a bag, brought to one table.
 
 Observations get the times of the first marker's stream. Readings of the other streams are interpolated linearly between
-two that are no further apart than one and a half rows; a lone reading goes to the row nearest to it; other cells are
+two that are no further apart than one and a half rows; a single reading is assigned to the nearest row; other cells are
 missing. Nothing is held or extrapolated.
 
-Commands are events and keep their times: there is a row whenever any channel is given a command, and the other channels
-keep theirs.
+Commands are events and keep their times: each command of a channel makes a row, in which the other channels keep their
+commands.
 """
 
 from __future__ import annotations

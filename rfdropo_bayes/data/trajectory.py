@@ -320,7 +320,7 @@ class Trajectory:
         and body in the first row began earlier. ``initial_command`` becomes the last command before these.
 
         Raises:
-            InputError: if there are no such rows.
+            InputError: the rows do not exist.
         """
         rows = self.time.size
         if not 0 <= first < last < rows:
@@ -362,7 +362,8 @@ class Trajectory:
     def resample(self, sample_time: float) -> Trajectory:
         """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).
 
-        Commands are events and are unchanged. A resampled value is masked if a row it draws on is masked. Nothing is
+        Commands are events and are unchanged. A resampled value is masked if one of its source rows is masked. Nothing
+        is
         filtered: resampling to a coarser grid picks rows, and their noise stays independent.
 
         Raises:
@@ -444,7 +445,7 @@ def open_netcdf(path: Path) -> xr.Dataset:
     """All of a NetCDF file.
 
     Raises:
-        InputError: it is missing or damaged.
+        InputError: the file is missing or damaged.
     """
     if not Path(path).is_file():
         raise InputError("no such file", where=str(path), remedy="correct the path")

@@ -37,13 +37,13 @@ def load_unseen(
 
     Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv", and
     formats whose columns [data.columns] names with a CSV of commands alone, take it from the first row of ``start``, or
-    start from an unknown pose.
+    begin at an unknown pose.
 
     Args:
         spec: the [data] table of the experiment; its recordings are not read.
         base: folder that paths are relative to.
         commands: the file of commands.
-        start: the file of observations, if it is another file; only one row is used.
+        start: file of observations, if separate; one row is used.
         rows: keep observation rows first to last, both included; the start pose is then from row ``first``.
         begun: beginning of the fitted recordings, "zero" or "first" (`common_beginning`), if all begin by the same
             rule; it then applies to these commands unless [data] or the file has another.

@@ -25,7 +25,7 @@ class BusTable(BaseModel):
     Attributes:
         interface: "hub", or any interface of python-can ("socketcan" on a robot).
         channel: channel of the interface; HOST:PORT or a path for the hub.
-        bitrate: bit rate [bit/s], if the interface sets it.
+        bitrate: bit rate [bit/s], for interfaces that set a bit rate.
         options: further arguments of the interface.
     """
 
@@ -41,7 +41,7 @@ def open_bus(table: BusTable) -> can.BusABC:
     """Open the bus.
 
     Raises:
-        InputError: if it cannot be opened; names the interface and the reason.
+        InputError: the bus cannot be opened; the message names the interface and the reason.
     """
     if table.interface == "hub":
         return HubBus(table.channel, **table.options)
@@ -137,7 +137,7 @@ class LoggedNetwork(canopen.Network):
         """Send a frame.
 
         Raises:
-            CanError: if the bus does not take it; or, once, if reception has failed.
+            CanError: the bus rejects the frame, or (raised once) reception has failed.
         """
         message = can.Message(is_extended_id=can_id > 0x7FF, arbitration_id=can_id, data=data, is_remote_frame=remote)
         with self.send_lock:
@@ -159,7 +159,7 @@ class LoggedNetwork(canopen.Network):
         """Close the bus.
 
         Raises:
-            CanError: if its driver fails to.
+            CanError: the driver fails.
         """
         try:
             super().disconnect()

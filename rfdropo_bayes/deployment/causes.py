@@ -8,7 +8,7 @@ from enum import Enum
 class Reaction(Enum):
     """Way in which the drives stop.
 
-    ``RAMP`` slows the set-points down within the limits and holds; it needs drives and bus that work. ``QUICK_STOP``
+    ``RAMP`` slows the set-points down within the limits and holds; drives and bus must work. ``QUICK_STOP``
     lets each drive brake on its own ramp and hold.
     """
 

@@ -60,7 +60,7 @@ FAULT_RESET_BIT = 0x80
 
 
 class Transition(NamedTuple):
-    """One row of the table: its number in the standard, source state, target state."""
+    """One row of the table: number in the standard, source state, target state."""
 
     number: int
     start: DriveState
@@ -171,8 +171,8 @@ _KEEP = {
 def controlword_towards(state: DriveState, target: DriveState, previous: int) -> int:
     """Controlword that brings a drive one step nearer to a state, or keeps it there.
 
-    A drive in quick stop is brought to another state through SWITCH ON DISABLED: to continue from a stop needs a
-    decision of its own (transition 16). A fault is reset only on the way to another state than FAULT.
+    A drive leaves quick stop only through SWITCH ON DISABLED; transition 16, which continues directly, is not used. A
+    fault is reset only on the way to another state than FAULT.
 
     Args:
         state: state that the drive reports.

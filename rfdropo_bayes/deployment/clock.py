@@ -44,7 +44,7 @@ class CycleClock:
     def wait(self) -> Tick:
         """Sleep until the next cycle.
 
-        A loop that wakes more than a whole period late has missed cycles: they are counted, not repeated.
+        A loop that wakes more than a whole period late has missed cycles. Missed cycles are counted, not repeated.
         """
         self._number += 1
         due = self._start + self._number * self.period
@@ -63,12 +63,12 @@ def real_time(priority: int = PRIORITY, threads: Iterable[int] = (0,)) -> Iterat
 
     The block must sleep between its cycles. It must not wait for the end of a process: Linux then clears that process
     out of /proc, in a loop without sleep, until threads of it have done their share. If these threads have a lower
-    priority on the same processor, they never run, and the loop never ends. For the same reason the block gives the
-    priority back: a thread must not end with it.
+    priority on the same processor, they never run, and the loop never ends. For the same reason the block restores the
+    normal priority: a thread must not end with a raised priority.
 
     Args:
         priority: SCHED_FIFO priority; a higher number runs first.
-        threads: their numbers in the system; 0 is the calling one.
+        threads: system numbers of the threads; 0 is the calling thread.
     """
     before = []
     for thread in threads:

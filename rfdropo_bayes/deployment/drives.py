@@ -46,7 +46,7 @@ from rfdropo_bayes.robots import Motor
 
 
 class Emergency(NamedTuple):
-    """An emergency message: when it came [s, monotonic], the channels of its node, its code and error register."""
+    """An emergency message: time of arrival [s, monotonic], channels of the node, code and error register."""
 
     time: float
     channels: tuple[str, ...]
@@ -79,9 +79,9 @@ class Drive:
         node: node of the axis.
         motor: motor of the axis.
         offset: counts at length zero.
-        identifiers: identifiers of its frames.
+        identifiers: identifiers of the drive's frames.
         units: units of the objects that differ between vendors.
-        unguarded: guards that it may lack, by object index.
+        unguarded: guards that the drive may lack, by object index.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Drive:
 
         Args:
             identity: identity that the drive must report.
-            check_eds: whether vendor and product of its data sheet must also equal the drive's own.
+            check_eds: whether vendor and product of the data sheet must equal those of the drive.
 
         Returns:
             Its identity, statusword, position, supported modes and rated torque.
@@ -227,7 +227,7 @@ class Drive:
         """Least and greatest position of the travel [counts].
 
         Raises:
-            InputError: if the drive's position would wrap in it.
+            InputError: the drive's position would wrap within the travel.
         """
         ends = sorted(self.motor.counts(length, self.offset) for length in self.motor.length_limit_m)
         told = all(self.knows(Object.POSITION_RANGE, subindex) for subindex in (1, 2))
@@ -437,7 +437,7 @@ def drives_of(
         network: network of the drives.
         motors: one motor per drive.
         offsets: counts of each motor at length zero.
-        eds: path of their electronic data sheet.
+        eds: path of the drives' electronic data sheet.
         answer: time limit of a node's answer to an SDO request [s].
         units, unguarded: see `Drive`.
     """

@@ -54,7 +54,7 @@ class HomingResult(BaseModel):
         """Write it as JSON.
 
         Raises:
-            InputError: if it cannot be written.
+            InputError: the file cannot be written.
         """
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
 """The log of a session: a journal of every cycle that a crash cannot take back, and the recording made of it.
 
-Each cycle is one fixed-size record. A thread hands them to the operating system, since a write may wait for the disk:
-if the program is killed, some hundredths of a second are lost, and if the machine loses power, at most the last second.
+Each control cycle is one fixed-size record. A thread passes the records to the operating system, since a write may wait
+for the disk. A killed program loses some hundredths of a second; a power failure loses at most the last second.
 `session.nc` is written from the journal at the end, or after a crash.
 """
 
@@ -68,7 +68,7 @@ class SessionLog:
     """Writes a session's folder while it runs.
 
     Args:
-        folder: folder to write to; it must not hold a session yet.
+        folder: folder to write to, without a session.
         robot: robot to drive.
         facts: facts about the session, kept in the recording's settings.
         frames: name of the file of CAN frames; its ending chooses the format.
@@ -238,10 +238,10 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
 
     Args:
         folder: folder of the session.
-        phases: take only the cycles of these phases, if there are at least two.
+        phases: phases whose cycles are used, if there are at least two cycles.
 
     Raises:
-        InputError: if it has fewer than two cycles.
+        InputError: the journal has fewer than two cycles.
     """
     header, rows = read_journal(folder)
     robot = Robot.model_validate(header["robot"])

@@ -59,7 +59,7 @@ class Snapshot(NamedTuple):
 
 
 class ControlLoop:
-    """One session on configured drives. Runs in its own thread; `run` returns why it ended.
+    """One session on configured drives. The loop runs in its own thread; `run` returns the reason for its end.
 
     Args:
         robot: robot to drive.
@@ -247,8 +247,8 @@ class ControlLoop:
     def follow(self, source: CommandSource, duration: float, phase: Phase = Phase.RUNNING) -> None:
         """Let the source command for ``duration`` seconds, then finish the last ramp.
 
-        Every change of a command is carried out linearly over the robot's ``ramp_s``, within all limits: as its
-        simulator does, so that the log is calibrated as it stands.
+        Every change of a command is carried out linearly over the robot's ``ramp_s``, within all limits, as in the
+        simulator. The log is therefore calibrated without changes.
 
         Raises:
             Stop: if a command cannot be followed, or a marker or object that the source needs is lost.

@@ -27,9 +27,9 @@ class Node:
     Args:
         network: network of the node.
         number: number of the node.
-        eds: path of its electronic data sheet.
+        eds: path of the node's electronic data sheet.
         axes: number of the highest axis that is driven.
-        answer: time limit of its answer to an SDO request [s].
+        answer: time limit of an answer to an SDO request [s].
 
     Raises:
         InputError: if the data sheet cannot be read.

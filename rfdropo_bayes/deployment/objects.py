@@ -109,7 +109,7 @@ def identifiers(places: Sequence[tuple[int, int]]) -> list[Identifiers]:
     The predefined connection set has two RPDOs for each of two axes. Further axes use numbers that CiA 301 leaves free.
 
     Raises:
-        InputError: if there are too many axes beyond the second.
+        InputError: too many axes.
     """
     free, assigned = iter(_FREE), []
     for node, axis in places:

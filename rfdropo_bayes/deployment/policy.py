@@ -55,7 +55,7 @@ class Pull(NamedTuple):
 
     @classmethod
     def told(cls, facts: Mapping[str, str]) -> Pull:
-        """By the metadata of a policy."""
+        """The tension limits in the metadata of a policy."""
         peak, limit = float(facts.get(PEAK_TENSION, "nan")), float(facts.get(TENSION_LIMIT, "inf"))
         return cls(peak, limit, int(facts.get(STOPPED_EPISODES, "0")), int(facts.get(EVALUATED_EPISODES, "0")))
 
@@ -100,10 +100,10 @@ class OnnxPolicy:
         robot: robot to drive.
         goal: position of the goal [m].
         sha256: hash that the file must have; None accepts any.
-        markers: names of the markers that it sees; all of the robot's by default.
+        markers: names of observed markers; all markers of the robot by default.
 
     Attributes:
-        pull: its tensions in the evaluation for which it was selected.
+        pull: tensions of the policy in its best evaluation.
 
     Raises:
         InputError: if the file cannot be read, or its layout, hash or shapes do not fit.
@@ -155,7 +155,7 @@ class OnnxPolicy:
         """Run the network. Its output is the change of the command, clipped to the layout's limits.
 
         Raises:
-            Stop: if its output is not finite, or more than any of its actions.
+            Stop: the output of the policy is not finite, or exceeds the largest action.
         """
         if not self._begun:
             self._earlier.begin([0], scene.command[None])
@@ -254,7 +254,7 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
     """Channels, unit, and the size of every part of the observation.
 
     Raises:
-        InputError: the first that does not fit this robot.
+        InputError: the policy does not fit this robot.
     """
     remedy = "give a policy for this robot"
     if layout.channels != robot.channel_names:
@@ -290,7 +290,7 @@ def read_file(path: Path) -> bytes:
     """Content of a policy file.
 
     Raises:
-        InputError: if it cannot be read.
+        InputError: the file cannot be read.
     """
     try:
         return Path(path).read_bytes()
@@ -330,8 +330,8 @@ _INSTANT = 1e-6  # periods: a command that comes half a period late belongs to t
 def replay_rate(recording: Trajectory, rate_hz: float) -> float:
     """Rate at which commands are sent again [Hz].
 
-    It divides the loop's ``rate_hz``: the divisor nearest to the commands' own rate if the commands are evenly spaced,
-    as in a session; otherwise ``rate_hz``.
+    The rate is a divisor of the loop's ``rate_hz``: the divisor nearest to the rate of the commands if they are evenly
+    spaced, otherwise ``rate_hz``.
     """
     gaps = np.diff(recording.command_time)
     nearest = rate_hz / max(1, round(rate_hz * (float(np.median(gaps)) if gaps.size else 0.1)))
@@ -339,7 +339,7 @@ def replay_rate(recording: Trajectory, rate_hz: float) -> float:
 
 
 def _evenly(periods: Float[np.ndarray, " gap"]) -> bool:
-    """Whether times between commands are whole periods, but for some of them."""
+    """Whether most times between commands are whole periods."""
     whole = np.maximum(1.0, np.round(periods))
     return periods.size == 0 or float(np.median(np.abs(periods - whole))) <= EVEN
 
@@ -347,9 +347,9 @@ def _evenly(periods: Float[np.ndarray, " gap"]) -> bool:
 class RecordedCommands:
     """The commands of a recording, sent again, including the commands before its first row.
 
-    Commands that came evenly at the rate each stay in force for whole periods: a cycle that their session missed must
-    not turn into a command twice or never. Others are sent in the period that is nearest to their own time, and the
-    last command wins if several fall into one period.
+    Evenly spaced commands each stay in force for whole periods: a missed cycle of the recorded session
+    must not repeat or drop a command. Others are sent in the period that is nearest to their own time, and the last
+    command wins if several fall into one period.
 
     Args:
         recording: recording of an earlier session, or any trajectory of this robot.

@@ -51,7 +51,7 @@ class SensorTable(BaseModel):
         multicast: whether Motive streams by multicast (natnet).
         rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
         object_body: identifier of the rigid body that the robot pushes (natnet); its pivot is the object's centre.
-            Create it in Motive while the object is aligned with the robot's base.
+            Create the rigid body in Motive while the object is aligned with the robot's base.
         rotation: rows of the matrix from the sensor's frame to the robot's base frame.
         origin_m: origin of the base frame in the sensor's frame.
         port: UDP port that a simulation sends to (simulated).
@@ -238,7 +238,7 @@ def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
     """The sensor that the table describes.
 
     Raises:
-        InputError: if it cannot be reached.
+        InputError: the server cannot be reached.
     """
     makers: Mapping[str, Callable[[], MarkerSensor]] = {
         "natnet": lambda: NatNetMarkers(table, robot),

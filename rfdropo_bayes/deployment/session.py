@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
 
     @property
     def finished(self) -> bool:
-        """Whether it ended as planned."""
+        """Whether the session ended as planned."""
         return self.cause is Cause.FINISHED
 
 
@@ -125,7 +125,7 @@ def deploy(
 
 
 class _Session:
-    """State of one `deploy` call; the stack closes everything that was opened."""
+    """State of one `deploy` call, with a stack that closes all open resources."""
 
     def __init__(
         self, settings: Deployment, mode: Mode, robot: Robot, out: Path, simulated: bool, stack: contextlib.ExitStack

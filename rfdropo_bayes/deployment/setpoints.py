@@ -13,8 +13,8 @@ from rfdropo_bayes.robots import Motor
 class SetPoints:
     """Set-points of all motors, one step per cycle.
 
-    A step never exceeds the limits on rate and acceleration, and never leaves less than the distance that a stop at the
-    final goal takes: a goal within the limits on length is never overshot into them.
+    A step never exceeds the limits on rate and acceleration, and always leaves the distance needed to stop at the goal.
+    A goal within the limits on length is therefore never overshot.
 
     Args:
         motors: give the limits.

@@ -63,7 +63,6 @@ class DrivesTable(_Table):
 
     @property
     def units(self) -> Units:
-        """For the drives."""
         return Units(self.torque_unit, self.speed_unit, self.acceleration_unit)
 
     def check_serial(self, channels: Sequence[str]) -> None:
@@ -83,8 +82,8 @@ class PolicyTable(_Table):
 
     Attributes:
         file: the ONNX file.
-        sha256: hash that it must have; summary.json has the hash of the policy that ran.
-        markers: names of the markers that it sees; all of the robot's by default.
+        sha256: required hash of the policy; summary.json has the hash of the policy that ran.
+        markers: names of observed markers; all markers of the robot by default.
     """
 
     file: str
@@ -98,8 +97,9 @@ class SafetyTable(_Table):
     Attributes:
         misses: the session ends after this number of deadlines missed by more than a cycle within a second.
         stale_cycles: largest number of cycles without a drive's status.
-        heartbeat_s: drives and master stop if the other's heartbeat is missing for this long.
-        following_error_m, following_time_s: a drive faults if it lags behind by this length for this time.
+        heartbeat_s: drives stop without the master's heartbeat for this time, and the master without a drive's.
+        following_error_m, following_time_s: length and time of a lag behind set-points at which a drive reports a
+        fault.
         start_rate_m_s: rate of the ramp to the start pose; a fifth of each motor's own limit by default.
         settle_s: rest in the start pose before the policy begins.
         hold_s: time for which the drives are watched after a stop.
@@ -211,7 +211,7 @@ def load_deployment(path: Path | str, overrides: Sequence[str] = ()) -> Deployme
         overrides: assignments such as ``"goal.x=0.02"`` that replace entries of the file.
 
     Raises:
-        InputError: if it cannot be read, or a value does not hold.
+        InputError: the file cannot be read, or a value is invalid.
     """
     path = Path(path)
     try:

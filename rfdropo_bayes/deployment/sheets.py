@@ -21,12 +21,12 @@ def data_sheet(eds: str, node: int, axes: int = 1) -> canopen.ObjectDictionary:
     """Read the object dictionary of a drive.
 
     Args:
-        eds: path of its data sheet. The simulated drive's sheet describes one axis; further axes are copies.
+        eds: path of the drive's data sheet. The simulated drive's sheet describes one axis; further axes are copies.
         node: number of the drive.
         axes: number of axes.
 
     Raises:
-        InputError: if it cannot be read.
+        InputError: the sheet cannot be read.
     """
     try:
         text = Path(eds).read_text(encoding="utf-8", errors="replace")

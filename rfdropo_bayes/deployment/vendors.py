@@ -61,7 +61,7 @@ def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, wh
 
     Args:
         stated: unit stated by the owner of the drive.
-        word: content of 0x60A9; 0 if it is empty.
+        word: content of 0x60A9; 0 if empty.
         counts_per_turn: encoder counts per turn of the motor.
         where: location for messages.
 
@@ -87,7 +87,7 @@ def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_t
 
     Args:
         stated: unit stated by the owner of the drive.
-        word: content of 0x60AA; 0 if it is empty.
+        word: content of 0x60AA; 0 if empty.
         counts_per_turn: encoder counts per turn of the motor.
         where: location for messages.
 
@@ -126,7 +126,7 @@ def check_rated_torque(reported: int, torque_n_m: float, unit: TorqueUnit, where
         where: location for messages.
 
     Raises:
-        InputError: if they differ by more than two per cent; names the unit that would make them agree.
+        InputError: the values differ by more than two per cent; the message names the unit in which they agree.
     """
     expected = torque_n_m / _TORQUE[unit]
     if _agree(reported, expected):
@@ -160,7 +160,7 @@ COUNTER = -(2**31), 2**31 - 1  # least and greatest position of 32 bits
 
 
 def check_polarity(word: int, where: str) -> None:
-    """Refuse a drive that reverses positions: some reverse their targets alone, and none need reverse its torque.
+    """Refuse a drive that reverses positions: some drives reverse only their targets, and torques may stay as they are.
 
     Args:
         word: content of 0x607E.
@@ -187,7 +187,7 @@ def check_home_offset(offset: int, unguarded: Collection[int], where: str) -> No
         where: location for messages.
 
     Raises:
-        InputError: if there is an offset, which the standard takes off the limits of 0x607D.
+        InputError: the drive has an offset, which the standard subtracts from the limits of 0x607D.
     """
     if offset and Object.POSITION_LIMIT not in unguarded:
         raise InputError(
@@ -203,7 +203,7 @@ def check_travel(ends: Sequence[int], wrap: tuple[int, int], where: str) -> None
 
     Args:
         ends: least and greatest position.
-        wrap: content of 0x607B; 0, 0 if it is empty.
+        wrap: content of 0x607B; 0, 0 if empty.
         where: location for messages.
 
     Raises:
@@ -255,7 +255,7 @@ def check_guards(lacking: Collection[int], unguarded: Collection[int], where: st
         where: location for messages.
 
     Raises:
-        InputError: with every missing guard and its consequence.
+        InputError: guards are missing; the message lists each with its consequence.
     """
     if Object.PRODUCER_HEARTBEAT in lacking:
         raise InputError(

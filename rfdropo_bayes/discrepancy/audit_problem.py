@@ -1,4 +1,4 @@
-"""The problem of an audit: a simulator with every candidate in it, recordings, and rules."""
+"""The problem of an audit: a simulator with all candidates, recordings, and rules."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
@@ -35,7 +36,7 @@ class AuditProblem:
         stated_noise: noise of the experiment file, used if nothing was repeated; None without it.
         start: start values of base parameters from an earlier calibration; None for a search.
         rules, seed: see `Rules`.
-        left_out: mechanisms that do not run on this body or engine, with the reason.
+        left_out: mechanisms that do not run on this body, engine or data, with the reason.
         groups: groups of recordings with their own candidates; None without groups.
         ports: ports of the simulator for the search for unknown causes; None if not requested.
     """
@@ -58,6 +59,16 @@ class AuditProblem:
     def compared(self) -> Groups | None:
         """The two compared groups; None for an audit of all recordings."""
         return self.groups if self.groups is not None and self.groups.compared else None
+
+    @property
+    def timed(self) -> bool:
+        """Whether rows have times."""
+        return all(UNTIMED not in trajectory.notes for trajectory in self.trajectories)
+
+    @property
+    def clock(self) -> str:
+        """Unit of times in sentences: seconds, or rows if rows have no times."""
+        return "s" if self.timed else "rows"
 
     def candidate(self, name: str) -> Candidate | None:
         """A candidate by its name; None for the mesh and time step, which are not in the library."""

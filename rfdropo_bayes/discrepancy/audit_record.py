@@ -191,7 +191,7 @@ def _watch(answer: Answer) -> str:
     worst, markers = int(np.argmax(found.surprise)), answer.problem.model.recordings.markers
     marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
     first, last = found.edges[worst : worst + 2]
-    return f"watch {marker} while the commands from {first:.2g} to {last:.2g} s are sent again"
+    return f"watch {marker} while the commands from {first:.2g} to {last:.2g} {answer.problem.clock} are sent again"
 
 
 def _other_noise(answer: Answer) -> dict[str, Any]:
@@ -280,8 +280,8 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
 
 
 def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
-    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free, so
-    that only ratios are known if no force was measured. First-order error propagation in logarithms.
+    """Masses, forces and stiffnesses over Young's modulus. With imposed cable lengths and no measured force only these
+    ratios are determined. First-order error propagation in logarithms.
     """
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}
@@ -335,7 +335,7 @@ def _where(answer: Answer) -> dict[str, Any]:
     markers = problem.model.recordings.markers
     misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
     return {
-        "sentence": in_words(found, markers, problem.rules.base_passes),
+        "sentence": in_words(found, markers, problem.rules.base_passes, problem.clock),
         "block_edges_s": found.edges.tolist(),
         "prequential_score": found.score.tolist(),
         "block_p": found.p.tolist(),
@@ -344,7 +344,7 @@ def _where(answer: Answer) -> dict[str, Any]:
 
 
 def _candidates(answer: Answer) -> list[dict[str, Any]]:
-    """Every candidate as the screen of the base model saw it, best first."""
+    """Score tests of all candidates at the base model, the best first."""
     first = answer.causes.screens[0]
     refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]

@@ -56,8 +56,9 @@ class Reached:
         return cls(target, fit.x, fit)
 
     def settled(self) -> tuple[FitTarget, Fit]:
-        """Target and fit; a point that no fit has ended at takes a rollout of each recording, counts as not converged,
-        and the base parameters keep their prior."""
+        """Target and fit. A point that is not the end of a fit takes a rollout of each recording, counts as not
+        converged, and has the prior covariance of the base parameters.
+        """
         if self.fit is not None:
             return self.target, self.fit
         target, fit = self.target, _unfitted(self.target, self.x)

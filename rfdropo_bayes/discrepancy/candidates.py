@@ -232,7 +232,7 @@ def _on_the_way(
 
 
 def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
-    """A fit with several sizes of a probe's one amplitude, of both signs if both are allowed."""
+    """A fit's points with trial values of a probe's amplitude, of both signs if both are allowed."""
     coordinates, (index,) = target.forward.coordinates, probe.amplitudes
     null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
     sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])
@@ -245,8 +245,9 @@ def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way 
 def _best_of(
     target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]
 ) -> tuple[float, Float[np.ndarray, " d"], int]:
-    """Largest decrease of the sum of squares over the points, with refitted base parameters; this point; its
-    number, the last one of several that take as much."""
+    """Largest decrease of the sum of squares over the points, with refitted base parameters; this point; and its index,
+    the last of several with the same decrease.
+    """
     base = span(fit.jacobian)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
     left = np.sum(project_out(base, found.T) ** 2, axis=0)

@@ -156,7 +156,7 @@ class Deadline:
 
     @contextmanager
     def reserve(self) -> Iterator[None]:
-        """Also use the time reserved for the gain."""
+        """Release the time that is reserved for the gain."""
         share, self.share = self.share, 1.0
         try:
             yield

@@ -1,8 +1,8 @@
 """Last part of an audit: an effect on the robot that the library lacks, described as a law at a port.
 
-It runs if the library leaves a misfit: beside the base model and, if that is no better than the named mechanisms,
-beside the model with them. A library candidate that is clearly worse than a law on unseen recordings is a substitute
-for the law, and is not adopted as a cause.
+The search runs if the library leaves a misfit. It extends the base model and, if that is no better than the named
+mechanisms, the model with these mechanisms. A library candidate that is clearly worse than a law on unseen recordings
+is a substitute for the law, and is not adopted as a cause.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.law_search import FoundLaw, Refit, law_search
 from rfdropo_bayes.discrepancy.naming import Named
 from rfdropo_bayes.discrepancy.repairs import without
+
+UNSUPPORTED = 2
+"""Terms in a row without the support of unseen recordings that end a search for a law."""
 
 
 @dataclass(frozen=True)
@@ -79,17 +82,18 @@ def describe(
         return
     clock = model.search.target.forward.deadline
     with clock.stage("ports and laws"), clock.reserve():
-        alone = _beside(problem, model.extended(()), report)
+        for law in _beside(problem, model.extended(()), report):
+            alone = law
+            # Beside named mechanisms, it does not hold until it is compared with them.
+            yield replace(law, holds=law.holds and not model.steps)
         if not model.steps:
-            yield alone
             return
-        yield replace(alone, holds=False)  # until it is compared with the named mechanisms
         seen = alone.held_out if alone.holds else None
         if held_out is not None and seen is not None and seen.beside(held_out.after(len(model.steps))).clear:
             report(f"the law takes the place of {' and '.join(model.names)}")
             yield replace(alone, stand_ins=tuple(model.names))
             return
-        further = _beside(problem, model, report)
+        *_, further = _beside(problem, model, report)
         if further.holds:
             yield further
             yield _without_stand_ins(problem, model, alone, further, report)
@@ -112,7 +116,7 @@ def _without_stand_ins(
     if not gone or described.held_out is None:
         return described
     report(f"with the law, unseen recordings do not ask for {' and '.join(gone)}: the law without them")
-    again = _beside(problem, _without(model, gone), report) if needed else alone
+    *_, again = _beside(problem, _without(model, gone), report) if needed else [alone]
     if not again.holds or again.held_out is None or described.held_out.beside(again.held_out).clear:
         return described
     return replace(again, stand_ins=gone)
@@ -149,32 +153,36 @@ def _needed(problem: AuditProblem, described: Described) -> list[str]:
     return needed
 
 
-def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) -> Described:
-    """The law beside a model, and its gain on unseen recordings."""
+def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) -> Iterator[Described]:
+    """The law beside a model after each term, with its gain on unseen recordings.
+
+    Like named mechanisms, a law is cut to its supported terms. The search ends if unseen recordings do not support its
+    last `UNSUPPORTED` terms.
+    """
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    target, fit = model.judge, model.fit
-    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups)
-    found = law_search(target, *options).find(target, fit)
-    if not found.terms:
-        return Described(found, model.steps)
-    stages = stages_of(model.search.target, model.base, model.steps)
-    named = len(stages) - 1
-    stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
-    held_out = predicted(problem, model.search.target.measured, stages)
-    if held_out.count < len(stages):
-        report(f"with {len(found.terms)} terms, an unseen recording cannot be simulated")
-        found = found.cut(max(held_out.count - 1 - named, 0))
-        if not found.terms:
-            return Described(found, model.steps)
-    # Like named mechanisms, a law is cut to its supported terms.
-    kept = held_out.supported_from(named) - named or len(found.terms)
-    if kept < len(found.terms):
-        report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")
-    found, held_out = found.cut(kept), held_out.after(named + kept)
-    gain, overall = held_out.gain(named, named + kept), held_out.gain(0, named + kept)
-    return Described(found, model.steps, (), gain, overall, held_out, holds_on(problem.rules, gain))
+    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups, problem.timed)
+    before = stages_of(model.search.target, model.base, model.steps)
+    named = len(before) - 1
+    for law in law_search(model.judge, *options).laws(model.judge, model.fit):
+        if not law.terms:
+            yield Described(law, model.steps)
+            continue
+        stages = [*before, *(JudgedModel(refit.target, refit.fit, before[-1].finer) for refit in law.terms)]
+        held_out = predicted(problem, model.search.target.measured, stages)
+        count = len(law.terms)
+        if held_out.count < len(stages):
+            report(f"with {count} terms, an unseen recording cannot be simulated")
+            return
+        supported = held_out.supported_from(named) - named
+        kept = supported or count
+        gain, overall = held_out.gain(named, named + kept), held_out.gain(0, named + kept)
+        seen = held_out.after(named + kept)
+        yield Described(law.cut(kept), model.steps, (), gain, overall, seen, holds_on(problem.rules, gain))
+        if count - supported >= UNSUPPORTED:
+            report(f"unseen recordings do not support more than {supported} of {count} terms: the search ends")
+            return
 
 
 def holds_on(rules: Rules, gain: Gain) -> bool:

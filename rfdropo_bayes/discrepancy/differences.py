@@ -1,5 +1,4 @@
-"""Possible differences between groups of recordings, such as sessions: candidates of an audit that compares two groups,
-and of every audit of recordings in groups.
+"""Possible differences between groups of recordings, such as sessions: candidates of an audit of recordings in groups.
 
 A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
 mechanism is present or larger in one group only, or absent there. A mechanism that all groups lack is a candidate as
@@ -49,8 +48,9 @@ class Groups:
 
     @property
     def shifted(self) -> tuple[str, ...]:
-        """Groups in which a value that all share may be another: of two groups without other recordings the second
-        alone, since the difference is the same for both."""
+        """Groups in which a shared value may differ. For two groups without other recordings this is the second group,
+        since the difference is the same for both.
+        """
         return self.names[1:] if len(self.members) == 2 and not self.complements else self.names
 
     def recordings(self, scope: str) -> tuple[str, ...]:

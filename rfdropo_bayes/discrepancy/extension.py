@@ -114,7 +114,7 @@ class Refits:
     waiting: tuple[str, ...]
 
     def with_fit(self, name: str, fit: Fit) -> Refits:
-        """The same with one more fit, or with a better fit."""
+        """The trials with one more fit, or with a better fit of a candidate."""
         waiting = tuple(each for each in self.waiting if each != name)
         return replace(self, fits={**self.fits, name: fit}, waiting=waiting)
 

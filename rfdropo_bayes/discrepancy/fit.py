@@ -99,11 +99,11 @@ class FitTarget:
 
     @property
     def measured(self) -> FitTarget:
-        """The same under the noise of the measurement."""
+        """The target under the noise of the measurement."""
         return self if self.known is None else self.known
 
     def on(self, forward: Forward) -> FitTarget:
-        """The same with another simulator."""
+        """The target with another simulator."""
         known = None if self.known is None else replace(self.known, forward=forward)
         return replace(self, forward=forward, known=known)
 
@@ -161,7 +161,7 @@ class FitTarget:
         """Measured less simulated readings at one point, in the unit of the noise.
 
         Raises:
-            InputError: a rollout there failed.
+            InputError: a rollout at the point failed.
         """
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 
@@ -342,7 +342,7 @@ class Posterior(ProblemDefaults):
         return np.where(fine[:, None], np.concatenate([white.reshape(len(white), -1), weighed], axis=1), np.inf)
 
     def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
-        """The same of one set of values."""
+        """Residuals at one set of values."""
         return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
 
     def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

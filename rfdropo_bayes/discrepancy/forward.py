@@ -87,11 +87,11 @@ class Forward:
         )
 
     def with_difference(self, step: float) -> Forward:
-        """The same with derivatives over another step."""
+        """The forward model with another step of derivatives."""
         return self._with(lanes=self.lanes.with_difference(step))
 
     def with_coordinates(self, coordinates: Coordinates) -> Forward:
-        """The same in other coordinates of the same parameters."""
+        """The forward model in other coordinates of the same parameters."""
         return self._with(coordinates=coordinates)
 
     def _with(self, **parts: Any) -> Forward:

@@ -87,9 +87,9 @@ class Gain:
 
     Attributes:
         rmse_base, rmse_extended: root mean square distance of a marker [m].
-        elpd_difference: log predictive density of the extended model less the base model's, summed over trajectories;
-            its standard error, and the probability of a sum this large if each difference's sign were random, only from
-            `DIFFERENCE_FROM` trajectories up.
+        elpd_difference: log predictive density of the extended model minus the base model's, summed over trajectories.
+        From `DIFFERENCE_FROM` trajectories on also its standard error, and the probability of a sum this large under
+        random signs.
         coverage: share of measurements in the extended model's central intervals.
         explained: share of the base model's discrepancy that the extension takes away; interval: its 90 % interval,
             for recordings like these.

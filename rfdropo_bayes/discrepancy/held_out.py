@@ -23,6 +23,7 @@ from rfdropo_bayes.discrepancy.repairs import without
 from rfdropo_bayes.errors import NoLikelihoodError
 
 DRAWS = 60
+BLOCKS = 5  # of poses at rest, which are left out in turn
 HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
 
 
@@ -78,7 +79,7 @@ class HeldOut:
         return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
 
     def after(self, steps: int) -> HeldOut:
-        """The same with at most ``steps`` steps."""
+        """The predictions of the base model and of at most ``steps`` steps."""
         parts = ("predictions", "patterns", "judges", "spreads")
         return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
 
@@ -87,7 +88,7 @@ class HeldOut:
         return self.supported_from(0)
 
     def supported_from(self, first: int) -> int:
-        """The same for the steps after the first ``first``, which are accepted."""
+        """The predictions after the first ``first`` steps, which are accepted."""
         last = first
         for after in range(first + 1, len(self.predictions)):
             if self.gain(last, after).clear:
@@ -163,8 +164,9 @@ def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) 
 def _left_out(
     problem: AuditProblem, judges: Sequence[FitTarget], target: FitTarget, fits: Sequence[Fit]
 ) -> tuple[str, Unseen, list[UnseenErrors]]:
-    """Predict each group of repeats from the others; if a group has parameters that no other determines (as a single
-    group has), predict the later rows of all from the earlier rows.
+    """Predict each group of repeats from the others. If a group has parameters that no other determines (as a single
+    group has), predict the later rows of all from the earlier rows in motion, and at rest each block of poses from the
+    others: a pose does not depend on the poses before it.
     """
     measured = target.measurements
     groups = len(measured.members)
@@ -172,6 +174,9 @@ def _left_out(
     if min(kinds.count(kind) for kind in kinds) > 1:
         held_out = "fitted recordings, each left out in turn"
         masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
+    elif getattr(target.forward.lanes.simulator, "at_rest", False):
+        held_out = f"poses, each block of a {BLOCKS}th left out in turn"
+        masks = [block[:, :, None] for block in blocks_of_rows(measured.valid)]
     else:
         held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"
         masks = [later_rows(measured.valid)[:, :, None]]
@@ -201,6 +206,14 @@ def later_rows(valid: Bool[np.ndarray, "group time column"]) -> Bool[np.ndarray,
     seen = np.asarray(valid.any(axis=2))
     before: np.ndarray = np.cumsum(seen, axis=1) - seen
     return before >= HELD_OUT_ROWS * seen.sum(axis=1, keepdims=True)
+
+
+def blocks_of_rows(valid: Bool[np.ndarray, "group time column"]) -> list[Bool[np.ndarray, "group time"]]:
+    """`BLOCKS` blocks of successive measured rows of every recording."""
+    seen = np.asarray(valid.any(axis=2))
+    before: np.ndarray = np.cumsum(seen, axis=1) - seen
+    block = before * BLOCKS // np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    return [seen & (block == k) for k in range(BLOCKS)]
 
 
 @dataclass(frozen=True)

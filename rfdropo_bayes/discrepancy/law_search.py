@@ -295,6 +295,7 @@ class LawSearch:
         most: largest number of terms; None leaves it to the recordings.
         taken: names of coefficients in the model, from laws of an earlier audit.
         scopes: recordings in which a law may act: all, and each group's.
+        timed: whether rows have times; without them there are no features in time.
     """
 
     ports: PortMap
@@ -307,9 +308,15 @@ class LawSearch:
     most: int | None = None
     taken: frozenset[str] = frozenset()
     scopes: tuple[Scope, ...] = (EVERYWHERE,)
+    timed: bool = True
 
     def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
-        """Port and law of an effect that the model lacks.
+        """Port and law of an effect that the model lacks: the last of `laws`."""
+        *_, law = self.laws(target, fit, forced)
+        return law
+
+    def laws(self, target: FitTarget, fit: Fit, forced: bool = False) -> Iterator[FoundLaw]:
+        """Ports of an effect that the model lacks, then its law after each term. The last law stands if the time is up.
 
         Args:
             target: target of the model's fit.
@@ -321,44 +328,44 @@ class LawSearch:
         values = self._values(found)
         null = self._null(known, fit, found)
         where = evidences(found, null)
-        first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
-        afterwards: list[PortEvidence] = []
-        offered = 0.0
+        centre = found.basis.centre - found.begun
+        law = FoundLaw(self.ports, where, [], [], [], centre, None, 0.0)
+        yield law
         try:
-            while len(terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not terms)):
+            while len(law.terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not law.terms)):
+                terms = law.terms
                 if not terms:
                     found = self._sharpened(known, fit, found, values, where)
-                    offered = next((row.gain for row in self._ranked(found, values, 0.0)), 0.0)
-                gates.append(self._gate(found, values, null))
-                ranked = self._ranked(found, values, gates[-1], terms=terms)
+                    law = replace(law, offered=next((row.gain for row in self._ranked(found, values, 0.0)), 0.0))
+                gate = self._gate(found, values, null)
+                law = law if terms else replace(law, gate=gate)
+                ranked = self._ranked(found, values, gate, terms=terms)
                 model = LinearModel(known, terms, fit, found)
-                chosen = self._confirmed(model, ranked, gates[-1], partial(leading_terms, where=where))
+                chosen = self._confirmed(model, ranked, gate, partial(leading_terms, where=where))
                 refits = self._refits(known, terms, fit, chosen)
                 if not refits or refits[0].score <= 0.0:
                     break
-                best, others = self._exchanged(known, terms, found, values, refits, gates[-1], where)
+                best, others = self._exchanged(known, terms, found, values, refits, gate, where)
                 if best.score <= 0.0:
                     break
-                ties = ties if terms else _tied(best, others)
+                ties = law.ties if terms else _tied(best, others)
                 best = self._shaped(known, terms, best)
                 judge, fit = judged_anew(best.target, best.fit)
                 anew = judge is not best.target
                 best = replace(best, target=judge, fit=fit)
-                terms.append(best)
                 found, known = under(found, known, judge), judge.on(target.forward)
                 found = _relinearised(known, found, fit)
                 null = self._null(known, fit, found)
                 where = evidences(found, null)
-                afterwards.append(where[0])
                 self._say(best, where[0])
-                if anew and len(terms) == 1:
+                if anew and not terms:
                     ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
+                law = replace(law, terms=[*terms, best], ties=ties, afterwards=[*law.afterwards, where[0]])
+                yield law
         except OutOfTime:
             self.report("the time was up before the law was found")
-        # The time limit may fall between a term and the evidence after it.
-        terms, gate = terms[: len(afterwards)], next(iter(gates), None)
-        centre = found.basis.centre - found.begun
-        return FoundLaw(self.ports, first, terms, ties, afterwards, centre, gate, offered)
+        if not law.terms:
+            yield law
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
@@ -381,8 +388,10 @@ class LawSearch:
     def _features(self, port: Port) -> Sequence[Feature]:
         """Features of a law at a port, which on a body include the motion."""
         if self.ports.members(port) != (port,):
-            return self.own
-        return (*self.table.features, *self.table.of_motion) if port.stage == "body" else self.table.features
+            features = tuple(self.own)
+        else:
+            features = (*self.table.features, *(self.table.of_motion if port.stage == "body" else ()))
+        return features if self.timed else tuple(feature for feature in features if not feature.in_time)
 
     def _offered(self, port: Port, values: Float[np.ndarray, "group feature row"]) -> tuple[np.ndarray, np.ndarray]:
         """Sizes of a port's features, and the features over their sizes (group, feature, member, row)."""
@@ -551,7 +560,7 @@ class LawSearch:
         return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
 
     def _climbed(self, refit: Refit) -> Refit:
-        """The same, climbed to its end."""
+        """The refit after a complete optimisation."""
         return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
 
     def _shaped(self, known: FitTarget, terms: Sequence[Refit], best: Refit) -> Refit:
@@ -652,7 +661,7 @@ def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
 
 def law_search(
     target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, family: float,
-    report: Callable[[str], None], groups: Groups | None = None,
+    report: Callable[[str], None], groups: Groups | None = None, timed: bool = True,
 ) -> LawSearch:  # fmt: skip
     """The search on a simulator with these ports and commands, for laws of all recordings and of single groups."""
     commands = target.forward.commands
@@ -665,4 +674,4 @@ def law_search(
     members = {} if groups is None else groups.members
     scopes = (EVERYWHERE, *(Scope(name, recordings) for name, recordings in members.items()))
     units = (tuple(channels), unit)
-    return LawSearch(ports, table, own, units, seed, family, report, taken=taken, scopes=scopes)
+    return LawSearch(ports, table, own, units, seed, family, report, taken=taken, scopes=scopes, timed=timed)

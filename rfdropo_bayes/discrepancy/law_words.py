@@ -104,7 +104,7 @@ def law_sentence(answer: Answer) -> str:
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
     unknown = "no mechanism of the library describes" if answer.problem.candidates else "the model lacks"
-    head = f"An effect acts that {unknown}: {laws}{_when(described)}"
+    head = f"An effect acts that {unknown}: {laws}{_when(described, answer.problem.clock)}"
     worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
     looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.found.terms))
     return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
@@ -125,13 +125,13 @@ def _shape(row: dict[str, Any]) -> str:
     return f", with {name} of {row['shape']:.3g} \u00b1 {row['shape_sd']:.2g} {row['shape_unit']}"
 
 
-def _when(described: Described) -> str:
+def _when(described: Described, clock: str) -> str:
     """When the signals at the members of the law's port are largest."""
     term = described.found.terms[0].term
     members = described.found.map.members(term.port)
     size = np.sqrt(np.mean([row.mean**2 for row in described.found.ports if row.port in members], axis=(0, 1)))
     large = described.found.centre[size > 0.7 * size.max()]
-    return f", most from {large.min():.4g} to {large.max():.4g} s"
+    return f", most from {large.min():.4g} to {large.max():.4g} {clock}"
 
 
 def _stand_ins(described: Described) -> str:

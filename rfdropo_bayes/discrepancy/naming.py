@@ -77,7 +77,7 @@ class Named:
         return self.asked.best(self.screen, self.tried, bool(self.steps))
 
     def extended(self, steps: Sequence[Added]) -> Named:
-        """The same with other steps, which are yet to be screened."""
+        """The model with other steps, without score tests."""
         return replace(self, steps=tuple(steps), screen=None, tried=None)
 
     def with_best(self) -> Named:
@@ -146,12 +146,13 @@ def _judged(named: Named) -> Named:
 
 
 def without_needless_steps(named: Named) -> Named:
-    """Without steps that later steps made redundant."""
+    """The model without steps that later steps made redundant."""
     return named.extended(without_needless(named.asked, named.base, named.steps))
 
 
 def without_each_other(steps: Sequence[Added]) -> tuple[Added, ...]:
-    """Steps whose classes do not have mechanisms that are steps themselves: both are in the model, which tells them
-    apart."""
+    """Steps with classes from which mechanisms of other steps are removed: the model contains both, so they are
+    distinguishable.
+    """
     named = {step.name for step in steps}
     return tuple(replace(s, members=tuple(n for n in s.members if n == s.name or n not in named)) for s in steps)

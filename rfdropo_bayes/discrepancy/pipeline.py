@@ -67,7 +67,7 @@ class Found:
     ended: tuple[str, ...] = ()
 
     def after(self, part: str) -> Found:
-        """The same with a part that is done."""
+        """The results with one more finished part."""
         return replace(self, ended=(*self.ended, part))
 
     @property
@@ -297,12 +297,16 @@ def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
     found = replace(found, kept=kept).after(GAIN)
     yield found
     verdict = _verdict(kept, problem, ended=True)
-    if verdict in (PARTLY, UNEXPLAINED) and kept.named.screens[-1].omnibus.p <= problem.rules.extended_passes:
+    passes = kept.named.screens[-1].omnibus.p > problem.rules.extended_passes
+    if verdict in (PARTLY, UNEXPLAINED) and not passes:
         found = replace(found, suspected=_suspected(search, as_measured(last.search.target, last.base)))
         yield found
-    # A discrepancy that the library does not explain, or a base model that could not be fitted for it.
-    if verdict in (PARTLY, UNEXPLAINED) or (verdict == NO_VERDICT and not base.converged):
-        for described in describe(problem, last, kept.held_out, report):
+    # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
+    # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
+    if verdict == UNEXPLAINED or (verdict == PARTLY and not passes) or (verdict == NO_VERDICT and not base.converged):
+        # Beside mechanisms that unseen recordings do not support, a law would have no support either.
+        beside = last.extended(()) if verdict == UNEXPLAINED else last
+        for described in describe(problem, beside, kept.held_out, report):
             found = replace(found, described=described)
             yield found
     yield found.after(LAWS)

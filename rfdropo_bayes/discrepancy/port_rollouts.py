@@ -42,7 +42,7 @@ class Scope(NamedTuple):
     recordings: tuple[str, ...] = ()
 
     def has(self, recordings: Sequence[str]) -> Bool[np.ndarray, " recording"]:
-        """Which of these it contains."""
+        """Mask of the given recordings in which the law acts."""
         return np.array([not self.group or name in self.recordings for name in recordings])
 
 
@@ -71,7 +71,7 @@ class PlacedTerm(NamedTuple):
         return (self.spec,) if self.shape is None else (self.spec, self.shape)
 
     def with_shape(self, command_unit: str) -> PlacedTerm:
-        """The same with the shape of its feature as a parameter."""
+        """The term with the shape of its feature as a parameter."""
         return self._replace(shape=shape_spec(f"{self.spec.name}_shape", self.feature, command_unit))
 
 

@@ -75,13 +75,14 @@ def prequential(target: FitTarget, fit: Fit) -> Prequential:
     return Prequential(edges, np.array(scores), np.array(p), np.array(surprise), misfit)
 
 
-def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
+def in_words(found: Prequential, markers: tuple[str, ...], level: float, clock: str = "s") -> str:
     """When the model first fails, when most, and at which marker.
 
     Args:
         found: the scores.
         markers: names, three channels each.
         level: level of the p-values, shared by all blocks.
+        clock: unit of the blocks' edges.
     """
     failing = np.flatnonzero(found.p <= level / len(found.p))
     if len(failing) == 0:
@@ -89,10 +90,9 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
     first, worst = failing[0], int(np.argmax(found.surprise))
     at = int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))
     share = "in every block" if len(failing) == len(found.p) else f"in {len(failing)} of {len(found.p)} blocks"
-    return (
-        f"The model fails {share} of rows, first from {found.edges[first]:.4g} to {found.edges[first + 1]:.4g} s, most "
-        f"from {found.edges[worst]:.4g} to {found.edges[worst + 1]:.4g} s, and most at marker {markers[at]}."
-        + (f" {BEGINNING}" if begins_wrong(found, level) else "")
+    early, late = (f"from {found.edges[k]:.4g} to {found.edges[k + 1]:.4g} {clock}" for k in (first, worst))
+    return f"The model fails {share} of rows, first {early}, most {late}, and most at marker {markers[at]}." + (
+        f" {BEGINNING}" if begins_wrong(found, level) else ""
     )
 
 

@@ -1,7 +1,7 @@
 """Score tests of a model: a joint test of its residuals, and a test of each candidate.
 
-All p-values are taken from residuals as they would be if the model were right (a parametric bootstrap): noise is drawn
-for every recording, its model is estimated as for the data, and the base model is refitted linearly. No rollouts are
+All p-values come from a parametric bootstrap: residuals are simulated under a right model. Noise is drawn for every
+recording, the noise model is estimated as for the data, and the base model is refitted linearly. No rollouts are
 needed.
 """
 

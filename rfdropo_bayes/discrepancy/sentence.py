@@ -58,7 +58,7 @@ def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 def _left_out(answer: Answer) -> str:
     count = len(answer.problem.left_out)
     does = "candidate does" if count == 1 else "candidates do"
-    return f" Left out: {count} {does} not run on this body or engine." if count else ""
+    return f" Left out: {count} {does} not run on this body, engine or data." if count else ""
 
 
 def _stopped(answer: Answer) -> str:

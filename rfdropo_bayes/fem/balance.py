@@ -90,7 +90,7 @@ class _Step(NamedTuple):
 
 
 def check_effects(effects: BodyEffects) -> None:
-    """Raise InputError for friction of the cables: their pull is then not given by one tension each."""
+    """Raise InputError for cables with friction, since the tension then varies along a cable."""
     for name in ("coulomb_friction", "capstan_friction"):
         if getattr(effects, name) is not None:
             raise InputError(

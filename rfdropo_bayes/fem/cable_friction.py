@@ -108,7 +108,7 @@ def slip_problem(
 def slip_rows(
     layout: CableLayout, slip: Slip, position: Float[Array, "stations 3"], orientation: Float[Array, "stations 4"]
 ) -> tuple[Float[Array, "stations 6 runs"], Float[Array, " runs"]]:
-    """Minus the derivatives of the runs' slip by the motion of the stations, and lengths [m] that grow as they do."""
+    """Negative derivatives of the runs' slip by the motion of the stations, and the corresponding lengths [m]."""
     thread = threads(layout)
     course = courses(layout, thread, position.T, rotation(orientation.T))
     kinds, cables, runs, guides = slip.weight.shape

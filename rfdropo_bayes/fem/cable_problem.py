@@ -1,8 +1,8 @@
 """The constraint problem of cables alone, on lanes of a batch: a complementarity problem, solved by its active set.
 
 With cables only, Newton's step of ``constraints`` is the solution of R g + W g = -b over the cables that pull. It is
-the answer if these cables are the same after it. Most steps need no more than the set of the step before; else Newton's
-method continues from the impulses of that step, with the line search of that module.
+the answer if these cables are the same after it. Most steps have the same active set as the step before. Otherwise
+Newton's method continues from the impulses of that step, with the line search of `fem.constraints`.
 """
 
 from __future__ import annotations

@@ -218,7 +218,7 @@ def station_rows(
     pull: Float[Array, "3 cables guides ..."],
     stations: int,
 ) -> Float[Array, "stations 6 cables ..."]:
-    """Forces and moments on the stations of one pull at every guide, for every cable."""
+    """Forces and moments on the stations by a unit tension of each cable."""
     pulled = jnp.broadcast_to(pull[:, :, :, None], lever.shape)
     parts = jnp.concatenate([thread.weight * pulled, cross(lever, pulled)])
     cables, lanes = lever.shape[1], lever.shape[4:]

@@ -1,8 +1,8 @@
 """Chambers under pressure beside the axis of a rod.
 
 A chamber lies parallel to the axis along part of the body, and its section does not change. Its pressure does work p dV
-= p A dl, with l the length of the fibre in its middle. The sections beside it therefore carry the force -p A along the
-axis, and its moment about the axis, in their own frames: the load follows the body.
+= p A dl, with l the length of the fibre in its middle. Sections along a chamber therefore carry the force -p A and its
+moment about the axis, in their own frames: the load follows the body.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Physics beyond a linear elastic body with frictionless inextensible cables; every effect is absent unless given.
 
-An effect that is given runs with whatever value it has. At its null value it changes nothing, and has a derivative
-there. An effect that is not given (None) costs nothing: it is no part of the traced program.
+An effect that is given runs with whatever value it has. At its null value an effect changes nothing, and is
+differentiable. An effect that is not given (None) costs nothing: it is no part of the traced program.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class BodyEffects(NamedTuple):
 
     @property
     def rubs(self) -> bool:
-        """Whether cables rub in their guides: it adds rows to the problem of every step, also at size zero."""
+        """Whether cables have friction in guides, which adds rows to the problem of every step, also at size zero."""
         return self.coulomb_friction is not None or self.capstan_friction is not None
 
 

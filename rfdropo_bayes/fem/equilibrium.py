@@ -268,9 +268,8 @@ def settled(
     bound: float = ROW_SETTLED,
     moves: Bool[Array, ""] | bool = True,
 ) -> tuple[State, EquilibriumInfo]:
-    """The equilibrium that a state comes to under drives (see `System`), and forces [N] and moments [N m] on the
-    stations, a row of quasi-static motion: until an iteration moves it by less than ``bound``, in body lengths and
-    radians.
+    """The equilibrium of a state under drives (see `System`), forces [N] and moments [N m] on the stations: one row of
+    quasi-static motion. Iterations end when one moves the body by less than ``bound``, in body lengths and radians.
 
     Friction of the cables continues from the state's memory; viscoelastic effects have relaxed. Needs a clamped
     station.
@@ -335,8 +334,8 @@ def quasi_static_step(
     external_force: Float[Array, "stations 6"] | float = 0.0,
     before: StepInfo | None = None,
 ) -> tuple[State, StepInfo]:
-    """A row of quasi-static motion, in place of ``dynamics.step``. A body that missed an equilibrium ``before`` is not
-    moved: its rollout counts as failed.
+    """A row of quasi-static motion, in place of ``dynamics.step``. A body without an equilibrium in an earlier row
+    (``before``) is not moved, and its rollout counts as failed.
     """
     moves = True if before is None else before.converged & ~before.diverged
     moved, info = settled(system, prepared, state, drive, external_force, moves=moves)

@@ -17,11 +17,11 @@ branch and mobilised friction, are carried on in the same way.
 
 Quasi-static motion has no time: every row is an equilibrium that is found from the row before (``equilibrium``).
 
-An impact is not a smooth force: carrying it on would make a stopped body rebound. Impulses of contacts that stop
-surfaces in stage 1 are therefore not carried on. If surfaces close in stage 2, the velocity of stage 1 has let them
-penetrate for most of the step, which stage 2 must not correct within its time g h. Stage 2 is then implicit over the
-time since they met, at most the (1 - g) h since stage 1, and carries on less: p = (1 - g) h with nothing carried on is
-implicit Euler from the end of stage 1. p is a continuous function of the motion, and all intermediate schemes are of
+An impact is not a smooth force: extrapolating an impact would make a stopped body rebound. Impulses of contacts that
+stop surfaces in stage 1 are therefore not carried on. If surfaces close in stage 2, the velocity of stage 1 has let
+them penetrate for most of the step, which stage 2 must not correct within its time g h. Stage 2 is then implicit over
+the time since they met, at most the (1 - g) h since stage 1, and carries on less: p = (1 - g) h with nothing carried on
+is implicit Euler from the end of stage 1. p is a continuous function of the motion, and all intermediate schemes are of
 first order at least.
 """
 

@@ -32,7 +32,7 @@ def _merged(array: Array, batched: bool, size: int, width: int) -> Array:
 def laned(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function of arrays without lanes, given how it acts on arrays with lanes in their last axis.
 
-    Arguments and results are trees of arrays. There are no derivatives: the caller defines them.
+    Arguments and results are trees of arrays. The caller defines derivatives.
     """
 
     @custom_vmap

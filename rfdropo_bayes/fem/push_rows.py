@@ -80,7 +80,9 @@ def meet(
 def _widened(
     touch: Touch, cube: CubeState, twist: Float[Array, "stations 6"], stage: Stage, time_step: Scalar
 ) -> Float[Array, ""]:
-    """Factor on the length of a stage with impacts: as long as the first of them is past, see ``fem.integrators``."""
+    """Factor that limits the length of a stage with impacts to the time since the first impact, see
+    ``fem.integrators``.
+    """
     opening = touch.on_cube[:, 0] @ twist_of(cube) + jnp.einsum("sir,si->r", touch.rows[..., ::3], twist)
     closes = (touch.gap < 0.0) & (opening < 0.0)
     past = jnp.where(closes, touch.gap / jnp.where(closes, opening, 1.0), 0.0)

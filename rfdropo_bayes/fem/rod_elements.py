@@ -146,12 +146,12 @@ def taut_resultant(elements: Elements, taut: TautCables, rates: Six) -> Six:
 
 
 def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six) -> Stiffness:
-    """The stiffness with the rotation of the forces of sections and of cables beside them with the middles of the
-    elements, in leading order; it is symmetric.
+    """The stiffness with the geometric term: forces of sections and of cables turn with the elements. The term is of
+    leading order and symmetric.
 
     Args:
         elements: shape of all elements.
-        stiffness: their stiffness without it.
+        stiffness: stiffness of the elements without this term.
         resultant: forces and moments between the stations in the elements' frames.
         pull: forces and moments of the cables in space.
     """

@@ -69,8 +69,9 @@ def roll(
 
     Args:
         drive: (rows, substeps, drives), or a tree of arrays (rows, substeps, ...) split into steps.
-        horizon: rows to compute; later rows are zero. It may be traced: one compilation serves every prefix, rows
-            beyond it cost nothing, and there is no reverse mode. None computes all rows and allows reverse mode.
+        horizon: rows to compute; later rows are zero. A traced number of steps serves every prefix with one
+        compilation; later rows cost nothing, and there is no reverse mode. None computes all rows and allows reverse
+        mode.
     """
 
     def one(progress: _Progress, commanded: Any) -> tuple[_Progress, None]:

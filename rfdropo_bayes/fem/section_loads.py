@@ -17,7 +17,7 @@ class SectionLoads(NamedTuple):
 
     Attributes:
         force: forces on the sections at some stations [N].
-        stiffness, damping: logarithms of factors; of the damping both of Rayleigh's coefficients.
+        stiffness, damping: logarithms of factors on the stiffness and on both Rayleigh coefficients.
         gravity: added to gravity [m/s2].
         station: indices of the stations that forces act on, each once; not batched.
     """

@@ -1,4 +1,4 @@
-"""Forces and energies of rollouts of a rod: they are simulated again, stage by stage.
+"""Forces and energies of rollouts of a rod, which are simulated again, stage by stage.
 
 Over a step of two stages the momentum changes by all impulses of the second stage and by the first stage's times 1 +
 going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the

@@ -4,9 +4,9 @@ A stage finds the change d of velocities and spins, and the impulses g of all co
 
     A d = r + J' g,    g = P(J (v + d) + b)
 
-All expensive operations run on lanes of a batch (``lanes``). A derivative is one more right-hand side of the factorised
-system: the residual of the equations when the inputs change and the solution does not, which needs no matrix. Reverse
-mode uses the transposed system.
+All expensive operations run on lanes of a batch (``lanes``). A derivative takes one more right-hand side of the
+factorised system: the change of the equations' residual with the inputs, at a constant solution. Reverse mode uses the
+transposed system.
 """
 
 from __future__ import annotations

@@ -47,8 +47,12 @@ def _wall_load(body: Rod, wall: Wall, centre: Float[Array, "stations 3"]) -> Sec
 
 
 def _drag_load(body: Rod, drag: Scalar, velocity: Float[Array, "stations 3"], steep: bool) -> SectionLoad:
-    """Drag -c A |v| v with the speed of a stage's start and the velocity of its end, which never adds energy; or with
-    its whole derivative, ``steep``, without which no scheme would be of second order."""
+    """v| v with the speed of a stage's start and the velocity of its end, which never adds energy; or with its whole
+    derivative, ``steep``, without which no scheme would be of second order.|Drag -c A |v| v with the speed at the start
+    of a stage and the velocity at its end, which never adds energy; with ``steep`` the whole derivative, which
+    second-order schemes need.|v| v with the speed of a stage's start and the velocity of its end, which never adds
+    energy; or with its whole derivative, ``steep``, without which no scheme would be of second order.
+    """
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=1) + STILL**2)
     factor = drag * jnp.asarray(drag_areas(body)) * speed
     damping = factor[:, None, None] * jnp.eye(3)

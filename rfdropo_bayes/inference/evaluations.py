@@ -37,7 +37,7 @@ class Ledger:
         return ", ".join(f"{name} {count}" for name, count in sorted(self.excluded.items())) or "no reason given"
 
     def record(self) -> dict[str, Any]:
-        """For a checkpoint and an `InferenceResult`. (`dataclasses.asdict` counts the items of a Counter instead.)"""
+        """The ledger for a checkpoint and an `InferenceResult` (`dataclasses.asdict` fails for a Counter)."""
         return {"rollouts": self.rollouts, "evaluations": self.evaluations, "excluded": dict(self.excluded)}
 
     @classmethod

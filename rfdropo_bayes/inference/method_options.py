@@ -25,7 +25,7 @@ class MethodOptions:
 
     @property
     def call(self) -> str:
-        """The call that makes these options: with all values that differ from their defaults."""
+        """The call that makes these options, with all values that differ from the defaults."""
         own: Any = self
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(own)}
         changed = (
@@ -88,7 +88,6 @@ def settings_text(value: Any) -> str:
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:
-    """The default of a field."""
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 

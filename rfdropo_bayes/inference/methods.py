@@ -55,7 +55,7 @@ def method_of(config: Any) -> str:
     """Name of the method that a configuration belongs to.
 
     Raises:
-        InputError: it is no method's configuration.
+        InputError: no method has such a configuration.
     """
     for name, method in METHODS.items():
         if isinstance(config, method.config):
@@ -96,12 +96,12 @@ def run(
         options: table of options, or the method's configuration itself.
         key: random key; the same key gives the same draws.
         checkpoint_dir: folder for checkpoints; None keeps none.
-        resume: continue from its checkpoints; a finished run is then only read.
+        resume: continue from the checkpoints of a run; a finished run is only read.
         progress: receives reports of stages.
 
     Raises:
-        InputError: no such method or option, a problem that lacks members (`check_problem`) or that the method cannot
-            take; and the errors of the method itself.
+        InputError: an unknown method or option, a problem without required members (`check_problem`), or an error of
+        the method.
     """
     method = method_named(name)
     check_problem(problem)

@@ -43,7 +43,7 @@ SMALLEST_SHARE = 0.01  # of the work, from which the remaining time is estimated
 
 
 class Progress:
-    """Reports stages, and rollouts between them. Nothing of it influences a result.
+    """Reports stages, and rollouts between them. Progress does not influence results.
 
     Args:
         title: name of the work.
@@ -201,7 +201,7 @@ def run_digest(problem: Problem, method: str, config: Any, key: PRNGKeyArray) ->
 
 
 class Checkpoint:
-    """One file that is replaced whole after every stage: arrays, and everything else as JSON beside them.
+    """One file, replaced after every stage, with arrays and a JSON text.
 
     Args:
         path: the file; ``None`` keeps nothing.

@@ -66,8 +66,8 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
 
 
 def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
-    """A caution for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, and for
-    every parameter that the data put in a region of little prior mass.
+    """Cautions for parameters whose posterior mode lies at a bound or an end of the prior, and for parameters in a
+    region of little prior mass.
 
     A prior that is more uniform in the logarithm is compared with its bounds in logarithms: a scale over decades has
     most of its linear mass near the lower end.
@@ -149,7 +149,7 @@ def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
 
 
 def unseen_modes(replicates: int, optimisations: int | None = None) -> list[Caution]:
-    """A caution if a lost mode would go unnoticed: particles of one replicate may end in a single mode.
+    """A caution if a lost mode would be unnoticed, since the particles of a replicate may end in a single mode.
 
     Args:
         replicates: independent repetitions of the sampler.

@@ -25,7 +25,7 @@ GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)  # of t
 
 
 class InCommandUnit:
-    """Base of mechanisms whose parameters are in the unit of commands: a class gives its parameters for metres of
+    """Base of mechanisms whose parameters are in the unit of commands. A class states its parameters for metres of
     cable.
 
     Args:
@@ -43,7 +43,7 @@ class InCommandUnit:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> InCommandUnit:
-        """With parameters in the unit that a robot is commanded in."""
+        """The mechanism with parameters in the unit of a robot's commands."""
         return cls(robot.command_unit, robot.usual_command)
 
 
@@ -268,7 +268,7 @@ class EndStop(InCommandUnit, MemorylessActuation):
 
 
 class TravelStop(InCommandUnit, SteppedActuation):
-    """Commands beyond a stop are lost, not remembered: a drive at its stop moves with the next command away from it.
+    """Commands beyond a stop have no effect: a drive at its stop moves with the first command away from the stop.
 
     In contrast to `EndStop`, which cuts off the accumulated command and has to be commanded all the way back. Travel is
     counted from the initial command. Both limits are infinite, their inverses zero, at null.

@@ -1,6 +1,6 @@
 """Mechanisms of the body: masses, gravity's direction, a material beyond linear elasticity, cables, a fluid, a wall.
 
-A cable whose length is imposed finds its own tension, so friction at its drive would move nothing. Friction and
+An imposed cable length does not depend on the tension, so friction at the drive would have no effect. Friction and
 elasticity of cables act between the guides, or in series with the drive; see ``fem.cable_friction``.
 """
 

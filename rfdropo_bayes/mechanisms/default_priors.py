@@ -6,15 +6,15 @@ from typing import Any
 
 
 def normal(scale: float, loc: float = 0.0) -> dict[str, Any]:
-    """For an effect of either sign."""
+    """Normal prior of an effect of either sign."""
     return {"distribution": "Normal", "loc": loc, "scale": scale}
 
 
 def half_normal(scale: float) -> dict[str, Any]:
-    """For an effect that cannot be negative."""
+    """Half-normal prior of an effect that cannot be negative."""
     return {"distribution": "HalfNormal", "scale": scale}
 
 
 def log_normal(median: float, sigma: float) -> dict[str, Any]:
-    """For a time whose size is known to a factor of exp(sigma)."""
+    """Log-normal prior of a time that is known to a factor of exp(sigma)."""
     return {"distribution": "LogNormal", "median": median, "sigma": sigma}

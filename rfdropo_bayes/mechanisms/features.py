@@ -1,4 +1,4 @@
-"""Features: the inputs of a law at a port. Each is a number per time step, from time, commands or motion.
+"""Features: the inputs of a law at a port. A feature is a number per time step, from time, commands or motion.
 
 A feature is written as a step with a memory, so that a whole rollout, which scans it, and a session give the same.
 """
@@ -28,9 +28,9 @@ class Kind(NamedTuple):
     """A kind of feature.
 
     Attributes:
-        channels: number of commands it uses.
+        channels: number of commands that the feature uses.
         unit: exponents of the command's unit and of seconds.
-        words: phrase with placeholders for its commands and shape.
+        words: phrase with placeholders for commands and shape.
         formula: symbol with the same placeholders.
         shapes: tried values of its shape, as shares of the commands' stroke or in seconds; empty without a shape.
     """
@@ -85,7 +85,7 @@ class Feature(NamedTuple):
         kind: a key of `KINDS`.
         channels: indices of its commands, or of its `GAUGES`; `OWN` must be replaced before use, see `of`.
         shape: time constant [s] or width [m or rad]; None without a shape.
-        of_motion: whether it is made of `GAUGES`, which take the place of commands then.
+        of_motion: whether the feature depends on `GAUGES` instead of commands.
     """
 
     kind: str
@@ -94,17 +94,22 @@ class Feature(NamedTuple):
     of_motion: bool = False
 
     def of(self, channel: int) -> Feature:
-        """The same with a command in the place of `OWN`."""
+        """The feature with a command in the place of `OWN`."""
         return self._replace(channels=tuple(channel if k == OWN else k for k in self.channels))
 
     def in_shape(self, shape: Any) -> Feature:
-        """The same in another shape, which may be traced."""
+        """The feature with another shape, which may be traced."""
         return self._replace(shape=shape)
 
     def commands(self, names: Sequence[str]) -> list[str]:
-        """Names of its commands, or of its gauges."""
+        """Names of the feature's commands or gauges."""
         known = GAUGES if self.of_motion else names
         return [OWN_NAME if k == OWN else known[k] for k in self.channels]
+
+    @property
+    def in_time(self) -> bool:
+        """Whether it depends on seconds, and not on the order of commands alone."""
+        return bool(KINDS[self.kind].unit[1]) or self.kind in ("low_pass", "lag")
 
     def begin(self, first: Float[Array, " channel"]) -> Any:
         """Memory before the first step, given the command that was held before it."""
@@ -183,7 +188,7 @@ class Feature(NamedTuple):
         return tuple((name, power) for name, power in ((own, length), ("s", seconds)) if power)
 
     def shape_unit(self, command_unit: str) -> str:
-        """Unit of its shape; "-" without a shape."""
+        """Unit of the feature's shape; "-" without a shape."""
         own = "m" if self.of_motion else command_unit
         return "-" if self.shape is None else own if self.kind == "play" else "s"
 
@@ -255,7 +260,7 @@ def feature_named(
         shape: time constant or width; None without a shape.
         names: names of the commands, in their order; `OWN_NAME`, if it may be used, comes last. Or `GAUGES`.
         where: location in the file.
-        of_motion: whether it is made of gauges.
+        of_motion: whether the feature depends on gauges.
 
     Raises:
         InputError: an unknown kind or command, or a shape that is missing or has no meaning.

@@ -69,10 +69,10 @@ class Law:
     """Base of the laws of every stage.
 
     Args:
-        port: port at which it acts.
-        terms: terms of its sum.
+        port: port at which the law acts.
+        terms: terms of the sum.
         ports: all ports of the robot.
-        formula: formula that names it.
+        formula: formula that names the law.
     """
 
     stage: str
@@ -95,7 +95,7 @@ def _summed(terms: Sequence[Term], values: Values, levels: Float[Array, "row cha
 
 
 class CableLaw(Law):
-    """Adds its signal to the command of one cable, or of every cable by its own command."""
+    """Adds a signal to the command of one cable, or to each cable's command (then a function of that command)."""
 
     stage = "actuation"
     inside_drive = False
@@ -107,7 +107,6 @@ class CableLaw(Law):
         return [(k, [term._replace(feature=term.feature.of(k)) for term in self.terms]) for k in numbers]
 
     def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
-        """See `ActuationMechanism`."""
         reached = constant
         for k, terms in self._cables:
             parts = (values[term.spec.name] * term.feature.at_rest(constant) for term in terms)
@@ -115,7 +114,6 @@ class CableLaw(Law):
         return reached
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Any, ...]:
-        """See `SteppedMechanism`."""
         return tuple(tuple(term.feature.begin(first) for term in terms) for _, terms in self._cables)
 
     def advance(
@@ -132,7 +130,6 @@ class CableLaw(Law):
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
-        """See `ActuationMechanism`."""
         levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
         for k, terms in self._cables:
             command = command.at[:, k].add(_summed(terms, values, levels, time_step)[1:])
@@ -160,7 +157,6 @@ class DelayLaw(Law):
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
-        """See `ActuationMechanism`."""
         levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
         return read_late(levels, self.signal(values, levels, time_step) / time_step)[1:]
 
@@ -170,18 +166,15 @@ class SignalLaw(Law):
 
     @property
     def whole_only(self) -> str:
-        """See `SignallingMechanism`."""
         return ""
 
     def signal_before(self, values: Values, first: Float[Array, " channel"]) -> tuple[Any, Float[Array, ""]]:
-        """See `SignallingMechanism`."""
         parts = (values[term.spec.name] * term.shaped(values).at_rest(first) for term in self.terms)
         return tuple(term.feature.begin(first) for term in self.terms), sum(parts, jnp.zeros(()))
 
     def signal_after(
         self, values: Values, memory: Any, given: Float[Array, " channel"], time_step: float
     ) -> tuple[Any, Float[Array, ""]]:
-        """See `SignallingMechanism`."""
         return _advanced(self.terms, values, memory, given, time_step)
 
 
@@ -193,22 +186,18 @@ class BodyLaw(SignalLaw):
 
     @property
     def follows_motion(self) -> bool:
-        """See `PushingMechanism`."""
         return any(term.feature.of_motion for term in self.terms)
 
     @property
     def whole_only(self) -> str:
-        """See `SignallingMechanism`."""
         return "it follows the motion of a whole rollout" if self.follows_motion else ""
 
     def carried(self, w: Float[Array, " row"]) -> BodySignals:
-        """See `SignallingMechanism`."""
         return self._ports.push(self.port, w)
 
     def push(
         self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
     ) -> BodySignals:
-        """See `PushingMechanism`."""
         w = _summed([t for t in self.terms if not t.feature.of_motion], values, command, time_step)
         if path is not None:
             w = w + _summed([t for t in self.terms if t.feature.of_motion], values, gauges_of(path), time_step)
@@ -222,19 +211,16 @@ class SensingLaw(SignalLaw):
 
     @property
     def whole_only(self) -> str:
-        """See `SignallingMechanism`."""
         return "it changes the times at which markers are seen" if self.port.kind == "observation" else ""
 
     def carried(
         self, w: Float[Array, " time"], position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
-        """See `SignallingMechanism`."""
         return sensed(self.port, w, position, time)
 
     def sense_with_commands(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"], meanwhile: Meanwhile
     ) -> Float[Array, "time marker 3"]:
-        """See `CommandedSensingMechanism`."""
         w = sample(self.signal(values, meanwhile.levels, meanwhile.time_step), meanwhile.commands)
         return self.carried(w, position, time)
 
@@ -247,7 +233,6 @@ class ClockedSensingLaw(Law):
     def sense_over_time(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
-        """See `TimedSensingMechanism`."""
         return sensed(self.port, self._at(values, time), position, time)
 
     def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[()]:
@@ -257,7 +242,6 @@ class ClockedSensingLaw(Law):
     def advance(
         self, values: Values, memory: tuple[()], given: Float[Array, "marker 3"], now: Float[Array, ""]
     ) -> tuple[tuple[()], Float[Array, "marker 3"]]:
-        """See `SteppedMechanism`."""
         time = jnp.asarray(now, float)[None]
         return memory, sensed(self.port, self._at(values, time), given[None], time)[0]
 
@@ -267,7 +251,7 @@ class ClockedSensingLaw(Law):
 
 
 def law_at(port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> Mechanism:
-    """The law of these terms at a port, in the form that its stage has."""
+    """The law with the given terms at a port, of the class for the port's stage."""
     if port.kind in ("cable", "cables"):
         return CableLaw(port, terms, ports, formula)
     if port.kind == "delay":

@@ -1,4 +1,4 @@
-"""Ports by name: the places at which an effect may enter a simulated robot, and the action of a signal there.
+"""Ports by name: places at which a signal may act on a simulated robot, and its action.
 
 A port of actuation or of the body acts on a rollout (`simulators.ports`); one of sensing is a map of the markers.
 """
@@ -49,7 +49,7 @@ class Port(NamedTuple):
 
 
 class PortMap(NamedTuple):
-    """The ports of a robot on an engine, and the composition of signals there."""
+    """The ports of a robot on an engine, and the sum of signals at ports."""
 
     ports: tuple[Port, ...]  # all of them
     left_out: dict[str, str]  # ports that the body cannot carry, with the reason
@@ -62,7 +62,7 @@ class PortMap(NamedTuple):
         return next((port for port in self.ports if name in (port.name, port.words)), None)
 
     def members(self, port: Port) -> tuple[Port, ...]:
-        """The ports at which a law of this port acts: for "cables" every cable, by its own command."""
+        """The ports at which a law of this port acts: every cable for "cables", each as a function of its command."""
         if port.kind == "cables":
             return tuple(each for each in self.ports if each.kind == "cable")
         return (port,)
@@ -78,7 +78,7 @@ class PortMap(NamedTuple):
         return BodySignals(jnp.zeros((rows, self.places, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
 
     def signals(self, port: Port, w: Float[Array, " row"]) -> PortSignals:
-        """A signal at a port of actuation or of the body, as a rollout takes it; at one with several members none."""
+        """A signal at a port of actuation or of the body, as input of a rollout; None for several members."""
         none = self.silent(len(w))
         if port.kind == "cable":
             return none._replace(command=none.command.at[:, port.number].set(w))

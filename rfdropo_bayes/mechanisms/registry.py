@@ -1,4 +1,4 @@
-"""All mechanisms by name. To add one: write its class in the module of its stage, and one line here.
+"""All mechanisms by name. To add a mechanism, write a class in the module of its stage.
 
 A mechanism may also be defined in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
 experiment file, replaces a registry name; see docs/mechanisms.md.
@@ -13,109 +13,39 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms.actuation import (
-    ActuatorLag,
-    Backlash,
-    CableGain,
-    CableSlack,
-    CommandDelay,
-    CommandGain,
-    DriveCreep,
-    EndStop,
-    GuideAzimuth,
-    RateLimit,
-    SpoolGrowth,
-    TravelStop,
-)
-from rfdropo_bayes.mechanisms.body_mechanisms import (
-    AxialStiffness,
-    BaseCompliance,
-    BaseTilt,
-    BendTwistCoupling,
-    CableCompliance,
-    CapstanFriction,
-    CoulombFriction,
-    FibreLaw,
-    Payload,
-    PlaneAnisotropy,
-    QuadraticDrag,
-    Softening,
-    SoftPart,
-    StiffnessGradient,
-    ViscoelasticBranch,
-    WallContact,
-)
-from rfdropo_bayes.mechanisms.drift import (
-    CableGainDrift,
-    CameraDrift,
-    CameraTurn,
-    CameraZoom,
-    Drift,
-    DriveDrift,
-    GainDrift,
-)
-from rfdropo_bayes.mechanisms.sensing import (
-    CameraOffset,
-    CameraRotation,
-    CameraScale,
-    ClockOffset,
-    MarkerOffset,
-    SensorLag,
-)
+from rfdropo_bayes.mechanisms import actuation, body_mechanisms, sensing
+from rfdropo_bayes.mechanisms.drift import Drift, DriveZero, drift_of
 from rfdropo_bayes.mechanisms.sizes import scales_of, sized
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 
-REGISTRY: dict[str, type] = {
-    mechanism.name: mechanism
-    for mechanism in (
-        CommandDelay,
-        ActuatorLag,
-        CommandGain,
-        CableGain,
-        CableSlack,
-        GuideAzimuth,
-        Backlash,
-        EndStop,
-        TravelStop,
-        RateLimit,
-        SpoolGrowth,
-        DriveCreep,
-        DriveDrift,
-        GainDrift,
-        CableGainDrift,
-        Payload,
-        AxialStiffness,
-        StiffnessGradient,
-        SoftPart,
-        BaseCompliance,
-        BaseTilt,
-        CoulombFriction,
-        CapstanFriction,
-        CableCompliance,
-        ViscoelasticBranch,
-        FibreLaw,
-        PlaneAnisotropy,
-        BendTwistCoupling,
-        Softening,
-        QuadraticDrag,
-        WallContact,
-        CameraRotation,
-        CameraScale,
-        CameraOffset,
-        CameraDrift,
-        CameraTurn,
-        CameraZoom,
-        MarkerOffset,
-        SensorLag,
-        ClockOffset,
-    )
-}
+MODULES = (actuation, body_mechanisms, sensing)
+DRIFTING = (
+    DriveZero,
+    actuation.CommandGain,
+    actuation.CableGain,
+    actuation.CableSlack,
+    sensing.CameraOffset,
+    sensing.CameraRotation,
+    sensing.CameraScale,
+)
+"""Mechanisms whose sizes may drift, see `drift_of`."""
+
+
+def defined_in(module: ModuleType) -> list[Any]:
+    """The mechanisms that a module defines, in its order: its classes with a cause."""
+    own = (kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__)
+    return [kind for kind in own if hasattr(kind, "cause")]
+
+
+KINDS = (*(kind for module in MODULES for kind in defined_in(module)), *map(drift_of, DRIFTING))
+REGISTRY: dict[str, type] = {kind.name: kind for kind in KINDS}
 
 
 ACTS = {"actuation": ("actuate",), "body": ("embody",), "contact": ("embody",), "sensing": ("sense", "sense_over_time")}
@@ -139,7 +69,7 @@ class MechanismChoice:
 
     Attributes:
         source: name under which a file would ask for it.
-        kind: its class, or the mechanism itself.
+        kind: class of the mechanism, or the mechanism itself.
     """
 
     source: str
@@ -187,7 +117,7 @@ def choose_mechanisms(
 
 
 def source_of(mechanism: Any) -> str:
-    """Under which name a file would ask for a mechanism: its name, or ``module:ClassName`` of a class or an object."""
+    """Name of a mechanism in a file: a name of the library, or ``module:ClassName``."""
     if isinstance(mechanism, str):
         return mechanism
     kind = mechanism if isinstance(mechanism, type) else type(mechanism)

@@ -85,9 +85,9 @@ class CameraOffset:
 class MarkerOffset:
     """Each marker displaced from its place by an arm that turns with the body; zero in the base simulator.
 
-    The arm is given as it is in the first row. From there it turns as little as takes the body's direction at the
-    marker, which its neighbours in the robot's order show (their chord), to its later direction: without twist, exact
-    for bending between markers that are close. A robot with one marker shows no direction, and its arm keeps its own.
+    The arm is given as it is in the first row. The arm turns with the body's direction at the marker (the chord of the
+    neighbouring markers), by the smallest rotation. This neglects twist, and is exact for bending between close
+    markers. With one marker the direction of the body is unknown, and the arm does not turn.
 
     Args:
         markers: names; numbers by default.

@@ -1,9 +1,9 @@
 """One rule for sizes of mechanisms: numbers of a usual trunk, scaled to a robot by the dimension of their unit.
 
-A play of half a millimetre is much for a robot that pulls eight, and nothing for a robot that pulls eighty. So lengths
-of cable scale with the pull of usual commands, other lengths with the body's length, masses with the body's mass, and
-forces with the tension, or the thrust of a chamber, that bends the body by a usual pull, ``E I pull / (length
-radius^2)``. Times, angles and ratios stay, and so does the density of a fluid around the body.
+A play of half a millimetre is much for a robot that pulls eight, and nothing for a robot that pulls eighty. Cable
+lengths scale with the pull of usual commands, other lengths with the body's length, and masses with the body's mass.
+Forces scale with ``E I pull / (length radius^2)``, the tension (or thrust of a chamber) that bends the body by a usual
+pull. Times, angles and ratios stay, and so does the density of a fluid around the body.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Experiments: their file, the objects it describes, the model made of them, and the folders of runs."""
+"""Experiments: files, the objects that a file describes, models, and the folders of runs."""

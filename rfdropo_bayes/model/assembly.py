@@ -104,7 +104,7 @@ def build_simulator(spec: ModelSpec) -> AnySimulator:
 
 
 def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
-    """The simulator of a model that must have a robot: body, engine and mechanisms.
+    """The simulator (body, engine and mechanisms) of a model; the model must have a robot.
 
     Raises:
         InputError: the model is a black box.
@@ -161,7 +161,7 @@ def with_drives(robot: Robot, drives: Sequence[DriveTravel], groups: Patterns) -
 
 
 def with_groups(simulator: AnySimulator, groups: Patterns) -> AnySimulator:
-    """The same simulator, whose drives take commands as is stated for these groups of recordings."""
+    """The same simulator, with drives as stated for the given groups of recordings."""
     if isinstance(simulator, BlackBoxSimulator) or not simulator.robot.drives:
         return simulator
     return replace(simulator, robot=simulator.robot.grouped(groups))  # type: ignore[type-var]

@@ -41,7 +41,7 @@ class WeighedTable(ExperimentTable):
 class LawTermTable(ExperimentTable):
     """A term of [[model.laws]]: a coefficient times a feature."""
 
-    coefficient: str = Field(description="name of its parameter; zero has no effect")
+    coefficient: str = Field(description="name of the parameter; zero has no effect")
     feature: str = Field(description="kind of the feature, see docs/mechanisms.md")
     commands: list[str] = Field(default_factory=list, description="commands of the feature")
     motion: list[str] = Field(
@@ -64,7 +64,7 @@ class LawTable(ExperimentTable):
     """[[model.laws]]: an effect that no mechanism of the library has, as a law at a port."""
 
     port: str = Field(
-        description='port at which it acts, such as "cable left", "stiffness" or "marker m3 along the body"'
+        description='port at which the law acts, such as "cable left", "stiffness" or "marker m3 along the body"'
     )
     terms: list[LawTermTable] = Field(min_length=1, description="terms, whose sum is the signal")
 
@@ -77,7 +77,7 @@ class ModelTable(ExperimentTable):
         description="effects on top of the base simulator, by name, or file.py:ClassName of your own",
     )
     laws: list[LawTable] = Field(
-        default_factory=list, description="effects that have no name: laws at ports, as an audit describes them"
+        default_factory=list, description="effects without a name: laws at ports, as found by an audit"
     )
     noise: NoiseModel = Field(
         default="auto",
@@ -146,8 +146,8 @@ class SimulatorTable(ExperimentTable):
     )
     motion: Literal["dynamic", "quasi-static"] = Field(
         default="dynamic",
-        description='"quasi-static": every row is an equilibrium, found from the row before; it has no damping, and '
-        "time acts on drives and cameras alone. It is enough if the robot moves slower than its body answers, which "
+        description='"quasi-static": every row is an equilibrium, without damping; only drives and cameras depend on '
+        "time. Quasi-static motion suffices if commands change slowly compared with vibrations of the body, which "
         "rfdropo check measures",
     )
     push: bool = Field(default=False, description="put the robot's cube and plate before the trunk")
@@ -158,7 +158,7 @@ class SimulatorTable(ExperimentTable):
     )
     tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
     engine: Literal["auto", "jax", "numba"] = Field(
-        default="auto", description='"auto" is the compiled engine, or JAX if it has a GPU and the body is a rod'
+        default="auto", description='"auto" is JAX for a rod if there is a GPU, else the compiled engine'
     )
     precision: Literal["float64", "float32"] = Field(
         default="float64", description="floating-point precision of the compiled engine; stiff bodies need float64"
@@ -204,7 +204,9 @@ class InferenceTable(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     method: str = Field(
-        default="smc", description="see docs/reference/methods.md; options of the method stand beside it"
+        default="smc",
+        description="inference method (docs/reference/methods.md); options of the method are further keys of this "
+        "table",
     )
     rollouts: int | None = Field(
         default=None, ge=1, description=f"budget in full-length rollouts; {ROLLOUTS} without minutes"
@@ -212,8 +214,8 @@ class InferenceTable(BaseModel):
     minutes: float | None = Field(
         default=None,
         gt=0.0,
-        description="budget in minutes on the machine that calibrates, predictions and report included; rollouts are "
-        "timed, and their number is limited accordingly; rollouts, if given, count instead",
+        description="budget in minutes on the machine that calibrates, predictions and report included; the number "
+        "of rollouts follows from their measured time; replaced by rollouts, if given",
     )
 
     @property
@@ -268,7 +270,7 @@ class AuditTable(ExperimentTable):
     minutes: float = Field(
         default=30.0,
         gt=0.0,
-        description="bound of the whole run in minutes, after which it finishes with its present results",
+        description="limit of the whole run in minutes, after which the audit ends with its present results",
     )
 
 
@@ -278,7 +280,7 @@ class DesignTable(ExperimentTable):
     minutes: float = Field(
         default=10.0,
         gt=0.0,
-        description="bound of the whole run in minutes, after which it proposes the best candidate so far",
+        description="limit of the whole run in minutes, after which the best candidate so far is proposed",
     )
 
 
@@ -291,7 +293,7 @@ class Experiment(ExperimentTable):
     )
     adapter: dict[str, Any] = Field(
         default_factory=dict,
-        description="settings of another simulator: markers, channels, parameters and further keys of its adapter; "
+        description="settings of another simulator: markers, channels, parameters and further keys of the adapter; "
         "see docs/your_simulator.md",
     )
     seed: int = Field(default=0, description="seed of all random numbers")

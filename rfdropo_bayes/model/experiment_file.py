@@ -162,13 +162,13 @@ def code_placed(source: str, folder: Path, out: Path | None = None) -> str:
 
 
 def _copy_name(file: str) -> str:
-    """Name of a copy: files of one name in two folders stay two."""
+    """Name of a copy; files with equal names in different folders get different names."""
     *folders, own = [part for part in Path(file).parts if part != Path(file).anchor]
     return "_".join(["above" if part == ".." else part for part in folders[-1:]] + [own])
 
 
 def _brought(file: Path, out: Path | None, name: str) -> str:
-    """Path of a file: its copy ``name`` in ``out``, or the file itself."""
+    """Path of a file, or of the copy ``name`` in ``out``."""
     if out is None:
         return str(file.resolve())
     try:

@@ -1,4 +1,4 @@
-"""Check that a calibration is used with its own integrator: fitted values depend on the time step."""
+"""Check that a calibration is used with the integrator of its fit, since fitted values depend on the time step."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None)
     """Integrator of a fit.
 
     Args:
-        attributes: attributes of its posterior.
-        folder: folder of its run, whose config.toml is used if the attributes lack it; "euler" if both lack it.
+        attributes: attributes of the posterior.
+        folder: folder of the run; config.toml is used if the attributes lack the integrator, and "euler" if both lack
+        it.
     """
     if INTEGRATOR in attributes:
         return str(attributes[INTEGRATOR])
@@ -38,7 +39,7 @@ def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None)
 
 
 def check_fitted_integrator(fitted: str, integrator: str | None, *, where: str) -> None:
-    """See that a model takes its time steps as the fit did whose answer it is to use; None is a black box.
+    """Check that a model uses the integrator of the fit whose posterior it uses; None stands for a black box.
 
     Raises:
         InputError: it does not.

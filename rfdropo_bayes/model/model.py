@@ -56,7 +56,7 @@ class Model:
             `BlackBox`.
         priors: inferred parameters: {parameter: prior}. A prior is a numpyro distribution, a table such as
             ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default. For
-            a black box, all its parameters with their own priors by default, less its `families`.
+            a black box, by default all parameters except `families`, with their priors.
         mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or your own
             mechanisms, as classes or objects.
         noise: noise of the positions, by name as in an experiment file; or, if it is known, ``{"standard_deviation":
@@ -68,9 +68,9 @@ class Model:
         more: further keys of an experiment file's [model], such as ``tension = True`` or ``per_recording``.
 
     Attributes:
-        spec: its specification, as objects.
-        settings: settings of its experiment beside the model.
-        file: its source file, if any; a changed model has none.
+        spec: specification of the model, as objects.
+        settings: settings of the experiment outside the model.
+        file: source file; None for a model that was changed or made in Python.
 
     Raises:
         InputError: an unknown robot, key, mechanism or parameter; or a prior that does not fit its parameter.
@@ -142,7 +142,7 @@ class Model:
         return self.settings.title or (self.name if self.file is None else self.file.path.stem)
 
     def recordings(self, role: Literal["fit", "test"]) -> list[Trajectory]:
-        """The recordings that its experiment file names."""
+        """The recordings that the experiment file names."""
         return load_data(self.settings.data, self.folder, role)
 
     @property
@@ -223,14 +223,14 @@ class Model:
 
         Args:
             meant: keys that describe the run in a file; a model read from a file has them already.
-            given: keys that a call overrides; None if it does not.
+            given: keys and values that replace the file's; None keeps the file's.
         """
         stated = {name: value for name, value in given.items() if value is not None}
         return {**self.tables(), **(meant if self.file is None else {}), **stated}
 
     def tables(self) -> dict[str, Any]:
-        """Tables of its source file, or equivalent tables as far as a file allows. They state the integrator, so that a
-        changed default does not alter their meaning.
+        """Tables of the model's source file, or equivalent tables as far as a file allows. They state the integrator,
+        so that a changed default does not alter their meaning.
         """
         if self.file is not None:
             found = dict(self.file.tables)

@@ -198,7 +198,7 @@ def spec_of(
 
     Args:
         experiment: the file.
-        folder: base of its relative paths.
+        folder: base of relative paths.
         robot: replaces the robot of the file.
         mechanisms: names, classes or objects that replace the mechanisms of the file.
 

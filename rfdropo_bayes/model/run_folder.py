@@ -86,7 +86,7 @@ def run_folder(
         data: hashes of the recordings, by their names.
         texts: files named in the tables that exist in no folder, such as the description of a robot made in Python.
         resume: continue the run in the folder, if any.
-        overwrite: start anew in any folder of this program.
+        overwrite: delete an earlier run of this program in the folder, and start anew.
 
     Yields:
         the folder.
@@ -132,7 +132,7 @@ def _held(out: Path, *, shared: bool) -> Iterator[None]:
     """Hold the lock of a folder, which the system gives back however the program ends.
 
     Raises:
-        InputError: another program holds it, and the two may not share it.
+        InputError: another program uses the folder, and may not share it.
     """
     try:
         import fcntl
@@ -285,7 +285,7 @@ def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]
 
 
 def _without_folders(entry: Any) -> Any:
-    """A recording's entry with the names of its files alone."""
+    """A recording's entry with file names without folders."""
     if isinstance(entry, dict):
         return {key: _without_folders(value) if key in FILE_KEYS else value for key, value in entry.items()}
     return Path(str(entry)).name

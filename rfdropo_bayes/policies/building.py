@@ -31,7 +31,7 @@ def trunk_simulator(
     """The rod on the compiled engine, as episodes want it.
 
     Args:
-        push: put the robot's cube and plate before it.
+        push: whether the robot's cube and plate are simulated.
         mechanisms: extensions by name, or of a file relative to ``folder``.
         precision: precision of the body's motion, as in an experiment file; single precision is up to twice as fast and
             moves the

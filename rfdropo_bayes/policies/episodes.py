@@ -321,8 +321,9 @@ class Episodes:
 def pose_with_errors(
     pose: Float[np.ndarray, "row 7"], errors: Float[np.ndarray, "row 6"]
 ) -> Float[np.ndarray, "row 7"]:
-    """Poses of a cube [m, quaternion x, y, z, w] as motion capture sees them: its errors [m] of the centre, then of
-    points `LEVER` away from it, which turn the cube."""
+    """Poses of a cube [m, quaternion x, y, z, w] with errors of motion capture [m]: of the centre, and of points at the
+    distance `LEVER`, which rotate the cube.
+    """
     turn = Rotation.from_rotvec(errors[:, 3:] / LEVER) * Rotation.from_quat(pose[:, 3:])
     return np.concatenate([pose[:, :3] + errors[:, :3], turn.as_quat()], axis=1)
 

@@ -19,7 +19,7 @@ class TrunkEnv(gymnasium.Env):
     """A task of the paper as one environment.
 
     Args:
-        task: its name, such as ``"TrunkReach-v0"``.
+        task: name of a task, such as ``"TrunkReach-v0"``.
         render_mode: ``"rgb_array"`` or None.
         options: see `make_episodes`.
 
@@ -46,7 +46,6 @@ class TrunkEnv(gymnasium.Env):
         return seen[0], self.episodes.begun_with(0)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One action."""
         step = self.episodes.act(np.asarray(action)[None])
         info = {
             "distance": float(step.distance[0]),

@@ -77,16 +77,9 @@ class _Graph:
 
 
 def policy_layers(model: Any) -> tuple[list[Any], bool]:
-    """Layers of a model of Stable-Baselines3 from observation to action, and whether a tanh ends them."""
-    policy = model.policy
-    if hasattr(policy, "mlp_extractor"):  # PPO, A2C; a tanh only with gSDE and squash_output
-        return [policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net], policy.squash_output
-    if hasattr(policy, "q_net"):  # DQN
-        return [policy.q_net.features_extractor, policy.q_net.q_net], False
-    actor = policy.actor
-    if hasattr(actor, "latent_pi"):  # SAC
-        return [actor.features_extractor, actor.latent_pi, actor.mu], True
-    return [actor.features_extractor, actor.mu], False  # TD3, DDPG: a tanh is among the layers
+    """Layers of a model of PPO from observation to action, and whether a tanh ends them."""
+    policy = model.policy  # a tanh only with gSDE and squash_output
+    return [policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net], policy.squash_output
 
 
 def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Path, facts: Mapping[str, str]) -> Path:
@@ -94,8 +87,8 @@ def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Pa
 
     Args:
         model: the trained model.
-        normalisation: the ``VecNormalize`` it was trained under, or None.
-        layout: layout of its observation and action.
+        normalisation: ``VecNormalize`` of the policy's training.
+        layout: layout of the policy's observation and action.
         path: file to write.
         facts: further metadata: hashes, seed, versions.
 
@@ -105,11 +98,10 @@ def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Pa
     from onnx import TensorProto, checker, helper, save
 
     graph = _Graph("observation")
-    if normalisation is not None and normalisation.norm_obs:
-        moments, limit = normalisation.obs_rms, float(normalisation.clip_obs)
-        graph.apply("Sub", graph.constant(moments.mean))
-        graph.apply("Div", graph.constant(np.sqrt(moments.var + normalisation.epsilon)))
-        graph.apply("Clip", graph.constant(-limit), graph.constant(limit))
+    moments, limit = normalisation.obs_rms, float(normalisation.clip_obs)
+    graph.apply("Sub", graph.constant(moments.mean))
+    graph.apply("Div", graph.constant(np.sqrt(moments.var + normalisation.epsilon)))
+    graph.apply("Clip", graph.constant(-limit), graph.constant(limit))
     layers, squashed = policy_layers(model)
     graph.network(layers)
     if layout.kind == "discrete":
@@ -143,7 +135,7 @@ class ExportedPolicy:
         path: path of the ONNX file.
 
     Attributes:
-        layout: layout of its observation and action.
+        layout: layout of the policy's observation and action.
         facts: its other metadata.
 
     Raises:

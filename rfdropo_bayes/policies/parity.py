@@ -1,8 +1,8 @@
-"""Exported policies beside the models they are made from: before a training and after it.
+"""Comparison of exported policies with their models, before and after training.
 
-Some options of an algorithm change the network in ways that an export may not follow. A training of hours must not end
-there, so that the untrained policy is exported and compared first: as it is, and with numbers drawn for its weights,
-because an untrained policy's actions are near zero, and hide a missing tanh or limit.
+Some options of an algorithm change the network in ways that an export may not follow. A failure after hours of training
+is avoided: the untrained policy is exported and compared first, as it is and with random weights, because an untrained
+policy's actions are near zero, and hide a missing tanh or limit.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ SMALLEST, USUAL, LARGEST = 0.01, 3.0, 20.0
 """Observations in deviations from their mean: nearly zero, usual for a trained policy, and twice the clipping limit of
 a normalisation.
 """
-DEVIATION = 0.1  # deviation of observations without normalisation [m]
-
 TOLERANCE = 1e-3
 """Largest difference of a continuous action, which ranges from -1 to 1. The order of float32 operations causes less
 than a tenth of it; a missing layer causes a hundred times it.
@@ -43,13 +41,11 @@ def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float
     """Observations from near their mean to ``largest`` deviations away from it, as the environments give them.
 
     Args:
-        normalisation: the ``VecNormalize`` of the policy, or None for observations in metres.
+        normalisation: the ``VecNormalize`` of the policy.
         size: size of an observation.
         largest: deviations of the last row.
     """
     rows = np.random.default_rng(0).normal(size=(ROWS, size)) * np.geomspace(SMALLEST, largest, ROWS)[:, None]
-    if normalisation is None or not normalisation.norm_obs:
-        return (DEVIATION * rows).astype(np.float32)
     moments = normalisation.obs_rms
     return (moments.mean + np.sqrt(moments.var + normalisation.epsilon) * rows).astype(np.float32)
 
@@ -72,9 +68,9 @@ def check_exportable(model: Any, normalisation: Any, act: Act, layout: PolicyLay
 
     Args:
         model: model of Stable-Baselines3, trained or untrained.
-        normalisation: the ``VecNormalize`` around its environments, or None.
+        normalisation: the ``VecNormalize`` around its environments.
         act: map from the environments' observations to the model's most likely actions.
-        layout: layout of its observation and action.
+        layout: layout of the policy's observation and action.
 
     Raises:
         InputError: a layer that cannot be exported, or another action.
@@ -113,21 +109,19 @@ def _drawn(model: Any, normalisation: Any) -> Iterator[None]:
     kept = [(parameter, parameter.data) for parameter in model.policy.parameters()]
     last = policy_layers(model)[0][-1].modules()
     outputs = [module.weight for module in last if isinstance(module, torch.nn.Linear)][-1]
-    moments = None if normalisation is None else normalisation.obs_rms
+    moments = normalisation.obs_rms
     try:
         for parameter, data in kept:
             # He et al. (2015): with variance 2 / n of the weights neither ReLU nor tanh lets a signal die or blow up.
             gain = OUTPUT if parameter is outputs else np.sqrt(2.0)
             scale = gain / np.sqrt(max(data.shape[-1], 1)) if data.ndim > 1 else 0.5
             parameter.data = torch.as_tensor(rng.normal(scale=scale, size=data.shape)).to(data)
-        if moments is not None:
-            drawn = moments.copy()
-            drawn.mean = rng.normal(scale=0.3, size=drawn.mean.shape)  # m, as a robot of that length
-            drawn.var = rng.uniform(1e-4, 1.0, size=drawn.var.shape)
-            normalisation.obs_rms = drawn
+        drawn = moments.copy()
+        drawn.mean = rng.normal(scale=0.3, size=drawn.mean.shape)  # m, as a robot of that length
+        drawn.var = rng.uniform(1e-4, 1.0, size=drawn.var.shape)
+        normalisation.obs_rms = drawn
         yield
     finally:
         for parameter, data in kept:
             parameter.data = data
-        if moments is not None:
-            normalisation.obs_rms = moments
+        normalisation.obs_rms = moments

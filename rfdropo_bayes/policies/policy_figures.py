@@ -74,7 +74,7 @@ def draws_figure(parameters: Mapping[str, np.ndarray], distances: np.ndarray) ->
 
 
 def save_animation(frames: Sequence[np.ndarray], path: Path, period: float) -> Path:
-    """Write pictures, one every ``period`` [s], as a GIF in real time."""
+    """Write pictures at intervals of ``period`` [s] as a GIF that plays in real time."""
     pictures: list[Any] = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1e3 * period), loop=0)
     return path

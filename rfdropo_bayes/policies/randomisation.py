@@ -28,7 +28,7 @@ class Randomisation(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters that it varies or sets."""
+        """Parameters that the randomisation varies or sets."""
         ...
 
     @property
@@ -166,8 +166,8 @@ class Sessions:
         return _digest([self.draws.sha256, {name: column.tolist() for name, column in self.spreads.items()}])
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
-        """One row, and a session's deviations from it: normal, of the row's own spread; sums end at the hard bounds, as
-        in fits and predictions.
+        """One row plus a session's deviations, which are normal with the row's spread; sums are clipped to the hard
+        bounds, as in fits and predictions.
         """
         index = int(rng.integers(len(self.draws.rows)))
         values = dict(zip(self.names, map(float, self.draws.rows[index]), strict=True))
@@ -245,7 +245,7 @@ def with_width(randomisation: Randomisation, width: float, specs: Sequence[Param
     Positive parameters are spread in logarithms.
 
     Raises:
-        InputError: ranges or one point, whose width is given by the user.
+        InputError: the distribution is uniform or a point, whose width the user states directly.
     """
     if isinstance(randomisation, Layers):
         *before, last = randomisation.parts
@@ -309,7 +309,7 @@ def drawn_rows(
     """Rows of a posterior, of the parameters that the simulator has.
 
     Raises:
-        InputError: it shares no parameter with the simulator, or has a mechanism that the simulator lacks.
+        InputError: the source shares no parameter with the simulator, or has a mechanism that the simulator lacks.
     """
     known = {spec.name for spec in specs}
     _require_mechanisms([info.name for info in record.free if info.name not in known], robot, where)
@@ -326,7 +326,7 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
     """RF-DROPO's distribution from a run folder.
 
     Raises:
-        InputError: no summary there, one of a method that has no phi, or a phi that does not fit the simulator.
+        InputError: the folder has no summary, the method has no phi, or phi does not match the simulator.
     """
     path = Path(path)
     file = path / PHI if path.is_dir() else path

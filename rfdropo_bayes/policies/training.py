@@ -22,13 +22,13 @@ from pydantic_core import PydanticSerializationError
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import stop_if_asked_twice
-from rfdropo_bayes.policies.algorithms import algorithm_class, algorithm_options, check_critic
 from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, peak_tension, play
 from rfdropo_bayes.policies.parity import check_exportable
+from rfdropo_bayes.policies.ppo import ppo_options
 from rfdropo_bayes.policies.training_config import TrainingTable
 
 EVALUATION_SEED = 1_000_003  # evaluations play other episodes than the first of a training
-CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
+CHECKPOINT, EPISODES = "checkpoints", "episodes.jsonl"
 LAST, BEST = "", "best_"  # prefixes of a checkpoint's files
 STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")  # keys of a checkpoint's state.json
 
@@ -44,7 +44,7 @@ class Trained:
     """The policy of the evaluation with the highest reward: the last evaluation need not be the best."""
 
     model: Any  # model of Stable-Baselines3
-    normalisation: Any  # the ``VecNormalize`` around its environments, or None
+    normalisation: Any  # the ``VecNormalize`` around its environments
     # a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m], infinite
     # without an end; episodes whose simulation failed; with tensions, median and maximum of the episodes' largest
     # tension [N], and the number of episodes stopped by the limit
@@ -60,9 +60,7 @@ class Trained:
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The policy's most likely action for observations as the environments give them."""
-        if self.normalisation is not None:
-            observation = self.normalisation.normalize_obs(observation)
-        return self.model.predict(observation, deterministic=True)[0]
+        return self.model.predict(self.normalisation.normalize_obs(observation), deterministic=True)[0]
 
 
 def train(
@@ -81,7 +79,7 @@ def train(
     Args:
         environments: makes the given number of environments as one ``VecEnv`` with a ``layout``, a ``randomisation``, a
             ``log`` and the count ``redrawn``.
-        table: algorithm and budget.
+        table: options and budget.
         out: folder for ``log.jsonl``, ``episodes.jsonl`` (start and end of every training episode), TensorBoard's files
             and the checkpoint.
         seed: seed of all random numbers.
@@ -91,34 +89,31 @@ def train(
         show: progress on stderr; None draws a bar on a terminal, and prints a line now and then elsewhere.
 
     Raises:
-        InputError: an unknown algorithm or option, a critic that the algorithm cannot have, or a checkpoint of another
-            run.
+        InputError: an unknown option, or a checkpoint of another run.
     """
     import torch
 
     torch.set_num_threads(1)  # networks this small are slower on two
     venv = environments(table.environments)
     layout = venv.get_attr("layout")[0]
-    options = algorithm_options(table.algorithm, layout.kind, gamma, table.options, table.environments)
-    maker = algorithm_class(table.algorithm, layout.kind)
-    check_critic(table.algorithm, table.critic)
+    options = ppo_options(layout.kind, gamma, table.options, table.environments)
     known = {"table": _plain(table), "seed": seed, **(fingerprint or {})}
     folder = Path(out) / CHECKPOINT
     state = _load_state(folder, known) if resume else None
-    model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
+    model, normalisation = _begin(options, venv, folder, state, out, seed)
     check_exportable(model, normalisation, Trained(model, normalisation, [], 0, 0.0).act, layout)
     cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)
     state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "redrawn": 0, "curve": [], "logged": 0}
     log = Path(out) / EPISODES
     if log.exists():  # episodes of a leg that a kill has cut short come again
         os.truncate(log, state["logged"])
-    with Progress(f"{table.algorithm} {table.task}", show=show, log=Path(out) / "log.jsonl") as progress:
+    with Progress(f"PPO {table.task}", show=show, log=Path(out) / "log.jsonl") as progress:
         while model.num_timesteps < table.steps:
             state = _leg(model, normalisation, venv, cases, table, state, seed, log)
             _save(model, normalisation, folder, state)
             progress.stage(model.num_timesteps / table.steps, **state["curve"][-1])
     if _best_row(state["curve"]) < len(state["curve"]) - 1:
-        model, normalisation = _load(maker, venv, table, folder, BEST)
+        model, normalisation = _load(venv, folder, BEST)
     return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"], state["redrawn"])
 
 
@@ -135,71 +130,36 @@ def _plain(table: TrainingTable) -> dict[str, Any]:
 
 
 def _begin(
-    maker: Any,
-    options: Mapping[str, Any],
-    venv: Any,
-    table: TrainingTable,
-    folder: Path,
-    state: Mapping[str, Any] | None,
-    out: Path,
-    seed: int,
+    options: Mapping[str, Any], venv: Any, folder: Path, state: Mapping[str, Any] | None, out: Path, seed: int
 ) -> tuple[Any, Any]:
     """A model and its normalisation, new or as they were saved."""
+    from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
     tensorboard = str(Path(out) / "tensorboard")
     if state is None:
         variance = LEAST_SPREAD**2  # added to variances
-        normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=variance) if table.normalise else None
-        ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
-        around = _training_environments(normalisation or venv, table)
-        policy, options = _policy_class(around, table, options)
+        normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=variance)
+        ours: dict[str, Any] = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
         try:
-            return maker(policy, around, **ours, **options), normalisation
+            return PPO("MlpPolicy", normalisation, **ours, **options), normalisation
         except Exception as error:  # Stable-Baselines3 asserts, and PyTorch and Python raise whatever they raise
             raise InputError(
-                f"{maker.__name__} cannot be made: {error}",
+                f"PPO cannot be made: {error}",
                 where="[training.options]",
-                remedy=f"see the options of {maker.__name__} in the documentation of Stable-Baselines3",
+                remedy="see the options of PPO in the documentation of Stable-Baselines3",
             ) from error
-    model, normalisation = _load(maker, venv, table, folder, LAST, tensorboard)
-    if getattr(model, "replay_buffer", None) is not None:
-        if not (folder / REPLAY).exists():
-            remedy = "start anew with --overwrite: without its history the run would not continue the same training"
-            raise InputError(f"the checkpoint has no {REPLAY}", where=str(folder), remedy=remedy)
-        model.load_replay_buffer(folder / REPLAY)
-    return model, normalisation
+    return _load(venv, folder, LAST, tensorboard)
 
 
-def _load(
-    maker: Any, venv: Any, table: TrainingTable, folder: Path, which: str, tensorboard: str | None = None
-) -> tuple[Any, Any]:
+def _load(venv: Any, folder: Path, which: str, tensorboard: str | None = None) -> tuple[Any, Any]:
     """The last or the best model of a checkpoint, and its normalisation."""
+    from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    normalisation = VecNormalize.load(str(folder / f"{which}normalisation.pkl"), venv) if table.normalise else None
+    normalisation = VecNormalize.load(str(folder / f"{which}normalisation.pkl"), venv)
     path = folder / f"{which}model.zip"
-    around = _training_environments(normalisation or venv, table)
-    return maker.load(path, env=around, device="cpu", tensorboard_log=tensorboard), normalisation
-
-
-def _training_environments(around: Any, table: TrainingTable) -> Any:
-    """Environments for training: the policy's environments, with further observations for the critic."""
-    if table.critic == "observation":
-        return around
-    from rfdropo_bayes.policies.critic import ParametersBeside
-
-    return ParametersBeside(around)
-
-
-def _policy_class(around: Any, table: TrainingTable, options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-    """Policy class for Stable-Baselines3, and the options completed for it."""
-    if table.critic == "observation":
-        return "MlpPolicy", options
-    from rfdropo_bayes.policies.critic import AsymmetricPolicy
-
-    own = {**options["policy_kwargs"], "unseen": len(around.varied.names)}
-    return AsymmetricPolicy, {**options, "policy_kwargs": own}
+    return PPO.load(path, env=normalisation, device="cpu", tensorboard_log=tensorboard), normalisation
 
 
 def _best_row(curve: Sequence[Mapping[str, float]]) -> int:
@@ -216,13 +176,15 @@ def _leg(
     seed: int,
     log: Path,
 ) -> dict[str, Any]:
-    """Learn until the next evaluation, and evaluate in the same environments: each leg resets them all."""
+    """Learn until the next evaluation, and evaluate in the same environments. Learning and evaluation each begin with a
+    reset of all environments.
+    """
     began, redrawn = time.monotonic(), venv.get_attr("redrawn")[0]
     leg = int(state["leg"]) + 1
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
     model.set_env(model.get_env(), force_reset=True)
     venv.set_attr("log", log)
-    count = _failures(table.steps)
+    count = _failures()
     remaining = table.steps - model.num_timesteps
     if table.anneal:
         # Stable-Baselines3's own schedules count from the start of a leg.
@@ -232,11 +194,9 @@ def _leg(
     model.learn(steps, callback=count, reset_num_timesteps=False, tb_log_name="run", log_interval=1)
     venv.set_attr("log", None)
     policy = Trained(model, normalisation, [], 0, 0.0)
-    if normalisation is not None:
-        normalisation.training = False
+    normalisation.training = False
     episodes = play(policy.act, venv, cases, EVALUATION_SEED + seed)
-    if normalisation is not None:
-        normalisation.training = True
+    normalisation.training = True
     seconds = state["seconds"] + time.monotonic() - began
     row = {"steps": int(model.num_timesteps), "seconds": seconds, **_summary(episodes)}
     for name, value in row.items():
@@ -253,9 +213,8 @@ def _leg(
     }
 
 
-def _failures(steps: int) -> Any:
-    """A callback that counts training episodes whose simulation failed, has schedules count the whole run's steps, and
-    stops if Ctrl-C was pressed twice.
+def _failures() -> Any:
+    """A callback that counts failed training episodes, and stops if Ctrl-C was pressed twice.
 
     Stable-Baselines3 imports are heavy, so that the class is made here.
     """
@@ -263,9 +222,6 @@ def _failures(steps: int) -> Any:
 
     class Failures(BaseCallback):
         failed = 0
-
-        def _on_training_start(self) -> None:
-            self.model._total_timesteps = steps  # of a leg, otherwise: exploration of DQN would end with the first
 
         def _on_step(self) -> bool:
             stop_if_asked_twice()
@@ -292,7 +248,9 @@ def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint beside the previous checkpoint, then replace it: a kill leaves one of the two."""
+    """Write a checkpoint beside the previous checkpoint, then replace the previous checkpoint, so that a killed process
+    leaves one of the two.
+    """
     partial = folder.with_name(f"{CHECKPOINT}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -300,13 +258,10 @@ def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]
         is_best = _best_row(state["curve"]) == len(state["curve"]) - 1
         for which in (LAST, BEST) if is_best else (LAST,):
             model.save(partial / f"{which}model.zip")
-            if normalisation is not None:
-                normalisation.save(str(partial / f"{which}normalisation.pkl"))
+            normalisation.save(str(partial / f"{which}normalisation.pkl"))
         if not is_best:
             for path in folder.glob(f"{BEST}*"):
                 shutil.copy2(path, partial)
-        if getattr(model, "replay_buffer", None) is not None:
-            model.save_replay_buffer(partial / REPLAY)
         (partial / "state.json").write_text(json.dumps(state), encoding="utf-8")
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
@@ -339,7 +294,7 @@ def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None
             where=str(folder),
             remedy="start anew: give --overwrite, not --resume",
         ) from None
-    files = ("model.zip", "normalisation.pkl") if known["table"]["normalise"] else ("model.zip",)
+    files = ("model.zip", "normalisation.pkl")
     absent = [name for name in STATE if name not in state]
     absent += [which + name for which in (LAST, BEST) for name in files if not (folder / (which + name)).exists()]
     if absent:

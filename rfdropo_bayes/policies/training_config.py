@@ -10,7 +10,7 @@ from rfdropo_bayes.signatures import as_options
 
 
 class TrainingTable(BaseModel):
-    """[training]: a task, an algorithm and a budget."""
+    """[training]: a task, options of PPO, and a budget."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -29,8 +29,8 @@ class TrainingTable(BaseModel):
     step: float | None = Field(
         default=None,
         gt=0.0,
-        description="largest change of a command by an action, in its unit; 5 mm of cable by default, or a twentieth "
-        "of the range of other commands",
+        description="largest change of a command by an action, in the command's unit; 5 mm of cable by default, or a "
+        "twentieth of the range of other commands",
     )
     noise: float = Field(default=0.0, ge=0.0, description="white noise on the observed markers [m]")
     history: int = Field(
@@ -42,17 +42,10 @@ class TrainingTable(BaseModel):
     tension_limit: float | None = Field(
         default=None,
         gt=0.0,
-        description="an episode fails and ends once any cable pulls more [N], as drives then stop; none by default",
+        description="tension [N] beyond which an episode fails and ends, as drives would stop; none by default",
     )
-    algorithm: str = Field(default="PPO", description="name of an algorithm of Stable-Baselines3")
     options: dict[str, Any] = Field(
-        default_factory=dict,
-        description="options of the algorithm, under their names in Stable-Baselines3, with net_arch",
-    )
-    critic: Literal["observation", "parameters"] = Field(
-        default="observation",
-        description="input of the critic of PPO or A2C in training: the observation, or also the parameters that "
-        "differ between episodes; the policy never sees them",
+        default_factory=dict, description="options of PPO by their names in Stable-Baselines3; also net_arch"
     )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
     anneal: bool = Field(
@@ -72,9 +65,7 @@ class TrainingTable(BaseModel):
         default=1.0,
         gt=0.0,
         le=10.0,
-        description=(
-            "factor by which draws of the posterior or of phi are spread about their middle, up to hard bounds"
-        ),
+        description=("factor on the distances of posterior or phi draws from their middle, up to hard bounds"),
     )
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="lowest and highest value of each parameter, for uniform randomisation"
@@ -86,10 +77,6 @@ class TrainingTable(BaseModel):
     )
     goals: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
         default=None, description="corners of the box that goals are drawn from [m]; the task's own by default"
-    )
-    normalise: bool = Field(
-        default=True,
-        description="scale observations and rewards by their running moments (deviations plus 0.01 in quadrature)",
     )
     evaluate_every: int = Field(
         default=100_000,

@@ -21,7 +21,7 @@ class TrunkVecEnv(VecEnv):
 
     Args:
         episodes: the lanes.
-        log: file that gets one JSON line per finished episode: its start and its end. The start, as an option of a
+        log: file for one JSON line per finished episode, with its start and end. The start, as an option of a
             reset, begins the episode again.
 
     The info of every step holds ``distance`` [m], ``diverged``, ``tension`` [N], the largest since the step before, and

@@ -43,7 +43,7 @@ def contradicts(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) 
 
     Args:
         draws: draws of one parameter's posterior.
-        prior: draws of its prior, some 400 at least.
+        prior: draws of the parameter's prior, at least 400.
     """
     prior, centre = np.sort(prior[np.isfinite(prior)]), float(np.median(draws))
     n, below = len(prior), int(np.searchsorted(prior, centre))

@@ -160,8 +160,8 @@ def load_posterior(path: Path) -> xr.DataTree:
 def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
     """ArviZ's summary of each parameter: bulk and tail effective sample size, Monte-Carlo error of the mean, R-hat.
 
-    ``r_hat`` (rank-normalised, split) needs chains and is NaN for a single chain. Chains that never moved, or of fewer
-    than four draws, give NaN throughout.
+    ``r_hat`` (rank-normalised, split) needs chains and is NaN for a single chain. Constant chains, and chains of fewer
+    than four draws, give NaN.
     """
     chains, draws = next(iter(posterior.values())).shape
     if draws < 4:

@@ -1,4 +1,4 @@
-"""Facts about a parameter beside its draws, and whose it is."""
+"""Facts about an inferred parameter, and its owner (a recording, a group or none)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ParameterInfo:
         return cls(**{**given, "scope": Scope(**given["scope"])})
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as JSON has it."""
+        """The facts as JSON types."""
         return {**asdict(self), "low": float(self.low), "high": float(self.high), "prior": dict(self.prior)}
 
     @property
@@ -66,7 +66,7 @@ class ParameterInfo:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Ends of its prior, at the hard bounds or inside them; infinite without an end.
+        """Ends of the prior, at or inside the hard bounds; infinite without an end.
 
         Zero is not counted as an end of a spread between groups: the groups are then equal.
         """

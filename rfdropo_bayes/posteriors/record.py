@@ -125,11 +125,11 @@ class PosteriorRecord:
         )
 
     def inference_data(self) -> InferenceData:
-        """The same in ArviZ's layout."""
+        """The record in ArviZ's layout."""
         return in_arviz(self.tree())
 
     def tree(self) -> xr.DataTree:
-        """The same as a tree of datasets, one for each of ArviZ's groups."""
+        """The record as a tree of datasets, one for each of ArviZ's groups."""
         products = [{**asdict(p), "powers": dict(p.powers)} for p in self.derived]
         return to_tree(
             self.posterior,
@@ -215,7 +215,7 @@ def _prior_predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset 
 
 
 def _with_draws(predicted: Mapping[int, Float[np.ndarray, "draw time marker 3"]]) -> dict[str, Any]:
-    """Positions with one dimension of draws; recordings with fewer have their own again behind them."""
+    """Positions with one dimension of draws; recordings with fewer draws are repeated to the same length."""
     most = max((len(each) for each in predicted.values()), default=0)
     data: dict[str, Any] = {}
     for i, each in predicted.items():

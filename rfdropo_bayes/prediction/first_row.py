@@ -50,9 +50,9 @@ def match_first_row(
 
     Args:
         problem: problem of the new recordings.
-        values: draws of all its parameters.
+        values: draws of all parameters of the model.
         names: recordings with an unknown offset.
-        deviations: deviations drawn from their prior.
+        deviations: deviations between groups, drawn from the prior.
         model_error: error of each marker; without it, offsets weight all markers equally, and deviations are unchanged.
         key: random key of the perturbations.
 

@@ -39,7 +39,7 @@ class ModelError(NamedTuple):
         return float(np.linalg.norm(self.scale[3 * index : 3 * index + 3]) / np.sqrt(self.share))
 
     def every(self, step: float) -> Autoregression:
-        """The same as noise of rows that are ``step`` seconds apart."""
+        """The model error as noise of rows with ``step`` seconds between them."""
         memory = np.array([1.0, np.exp(-step / self.correlation_time)])
         return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf, step=step)
 

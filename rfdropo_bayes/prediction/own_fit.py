@@ -43,8 +43,8 @@ def fit_own(
     """Levenberg-Marquardt steps of all draws in one batch, until the predicted gain of each is negligible.
 
     Derivatives cost two rollouts per coordinate. All draws start with the derivatives of the first draw, and each step
-    updates them (Broyden 1965). A draw gets its own derivatives if the predicted gain is more than twice the actual
-    gain, and before it counts as converged.
+    updates them (Broyden 1965). Derivatives are computed at a draw if the predicted gain exceeds twice the actual gain,
+    and before the draw counts as converged.
 
     Args:
         residuals: function of points and draw indices, returns whitened residuals.

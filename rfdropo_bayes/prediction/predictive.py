@@ -1,4 +1,4 @@
-"""Predictions under a posterior: of the recordings it was fitted to, and of recordings it has never seen.
+"""Predictions under a posterior: of fitted and of new recordings.
 
 A pushed cube starts at its measured pose in a new recording.
 """
@@ -145,7 +145,7 @@ def predict_new(
     (`match_first_row`), and for a new recording of a known group draws are weighted by its first row
     (`resampled_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
-    A parameter that only some fitted recordings had free, such as a payload, applies to them alone. A parameter that
+    A parameter of some fitted recordings only, such as a payload, applies only to these recordings. A parameter that
     only some groups have also applies to their new recordings; an unseen group lacks it. A cube starts at its measured
     pose in the first row.
 
@@ -153,7 +153,7 @@ def predict_new(
         fitted: names of the fitted recordings.
         model_error: residuals of the model on the fitted recordings, its error in new recordings if its noise is white;
             without it, all markers have equal weight in a first row.
-        groups: recordings that belong together, by name or wildcard; by default each is its own group.
+        groups: recordings that belong together, by name or wildcard; by default each recording is a group.
         slow: error of the session of each unseen recording, by name.
     """
     names = [t.name for t in trajectories]
@@ -213,7 +213,7 @@ def with_repeats_marked(
 
     Args:
         predictions: predictions of recordings.
-        trajectories: these recordings, in the same order.
+        trajectories: the same recordings as trajectories, in the same order.
     """
     marked, number = list(predictions), 0
     for split in ("fit", "test"):
@@ -229,7 +229,7 @@ def with_repeats_marked(
 def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key: PRNGKeyArray) -> Batch:
     """Values of the parameters of new recordings, from draws of the fitted parameters.
 
-    One fitted recording is chosen per draw for all parameters of a new recording: its values belong together.
+    For each draw, all parameters of a new recording come from one fitted recording, so that the values are consistent.
     """
     count, extended = len(next(iter(values.values()))), {}
     chosen = {

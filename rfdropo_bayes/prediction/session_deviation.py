@@ -48,6 +48,7 @@ def session_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) 
 def draw_deviation(
     deviation: ParameterInfo, values: Mapping[str, np.ndarray], key: PRNGKeyArray, count: int
 ) -> Float[np.ndarray, " n"]:
-    """The deviation of a group that no fit has seen, one for each of ``count`` draws, of their own spread between
-    groups, in the parameter's unit."""
+    """The deviation of an unseen group for each of ``count`` draws, from each draw's spread between groups, in the
+    parameter's unit.
+    """
     return np.asarray(jax.random.normal(key, (count,))) * deviation.spread_of(values, count)

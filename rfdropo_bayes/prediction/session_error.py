@@ -82,12 +82,12 @@ class SessionError(NamedTuple):
         return scale[:, None, None, None] * unit[None, :, :, None] * series
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values; `from_dict` undoes it."""
+        """The error as plain values; `from_dict` is the inverse."""
         return {**self._asdict(), "sessions": dict(self.sessions)}
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> SessionError:
-        """From plain values."""
+        """The error from plain values."""
         tuples = {name: tuple(given[name]) for name in ("markers", "residual", "reach", "shown", "missed")}
         return cls(**{**given, **tuples})
 

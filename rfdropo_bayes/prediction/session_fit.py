@@ -1,7 +1,8 @@
 """Parameters of a new session, fitted to one short recording under every draw of the body.
 
-The body keeps its posterior. Under each draw the session's parameters are fitted to perturbed data and perturbed prior
-means (`fit_own`), so that the optimum is a draw from their posterior given that body. Each body is then weighted by its
+The posterior of the body's parameters is unchanged. Under each draw the session's parameters are fitted to perturbed
+data and perturbed prior means (`fit_own`), so that the optimum is a draw from their posterior given that body. Each
+body is then weighted by its
 evidence: the likelihood of the recording with the session's parameters integrated out. The draws are exact for a linear
 model with normal noise.
 """
@@ -104,7 +105,7 @@ def physical_of_normal(
 
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
-    """Log evidence of the unperturbed data for every body, from the linearisation at its own optimum."""
+    """Log evidence of the unperturbed data for every draw of the body, from the linearisation at its optimum."""
     evidence = -_least_cost(fit, noise) - 0.5 * np.linalg.slogdet(_curvature(fit))[1]
     return np.where(np.isfinite(evidence), evidence, -np.inf)
 

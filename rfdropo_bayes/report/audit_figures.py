@@ -293,7 +293,7 @@ def class_figure(residuals: Residuals, effect: ClassEffect) -> Figure:
 def binned(
     cause: Float[np.ndarray, " row"], values: Float[np.ndarray, "k row"]
 ) -> tuple[Float[np.ndarray, " bin"], Float[np.ndarray, "k bin"]]:
-    """Means over rows with as much of a cause: over each of its values, or, of more than `BINS`, over quantiles."""
+    """Means over rows with equal values of a cause; over quantiles for more than `BINS` values."""
     known = np.unique(cause)
     if len(known) > BINS:
         edges = np.unique(np.quantile(cause, np.linspace(0.0, 1.0, BINS + 1)))

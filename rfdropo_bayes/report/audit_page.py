@@ -35,7 +35,7 @@ def render_audit(
     """HTML of an audit.
 
     Args:
-        seen: data of its figures.
+        seen: data of the figures.
         content: content of audit.json.
         title: title of the experiment.
         config: the experiment file of the run.

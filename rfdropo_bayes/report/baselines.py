@@ -70,7 +70,7 @@ def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
                     count[:, marker] += within
         if not count.all():
             raise InputError(
-                f"no other fit recording lasts {recording.time[-1]:.4g} s, the length of this recording",
+                f"no other fitted recording lasts {recording.time[-1]:.4g} s, as this recording does",
                 where=recording.name,
             )
         return total / count[..., None]
@@ -93,7 +93,7 @@ def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
             if same_opening(own, begun) and (source.sha256 != recording.sha256 or source.name != recording.name)
         ]
         if not repeats:
-            raise InputError("no other fit recording has its commands", where=recording.name)
+            raise InputError("no other fitted recording has the same commands", where=recording.name)
         total, count = np.zeros(recording.position.shape), np.zeros(recording.position.shape[1])
         for source in repeats:
             for marker in np.flatnonzero(source.position_mask.any(axis=0)):
@@ -102,7 +102,7 @@ def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
                 total[:, marker] += np.stack([np.interp(recording.time, time, path[:, i]) for i in range(3)], axis=-1)
                 count[marker] += 1
         if not count.all():
-            raise InputError("a marker was lost in all fit recordings of its commands", where=recording.name)
+            raise InputError("a marker was lost in all fitted recordings with the same commands", where=recording.name)
         return total / count[:, None]
 
     return predict
@@ -164,7 +164,7 @@ def baseline_errors(
 
 
 def _with_markers(recording: Trajectory, markers: Sequence[str]) -> Trajectory:
-    """A recording with these of its markers, in this order."""
+    """A recording restricted to the given markers, in the given order."""
     if recording.marker_names == tuple(markers):
         return recording
     return Trajectory(recording.dataset.sel(marker=list(markers)))

@@ -81,7 +81,7 @@ def coverage_figure(curves: Mapping[str, TransformCurve], shares: Mapping[str, M
 
     Args:
         curves: "fit" and "test".
-        shares: observed coverage by nominal one, per role.
+        shares: observed coverage by nominal coverage, per role.
     """
     figure = Figure(figsize=(style.WIDTH, 3.3))
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))

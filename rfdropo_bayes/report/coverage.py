@@ -94,7 +94,9 @@ def transform_curve(recordings: Sequence[RecordingPrediction]) -> TransformCurve
 
 
 def _independent_values(transformed: Float[np.ndarray, " n"]) -> float:
-    """Honest scores are centred at zero, about which they are taken: a constant error is one value."""
+    """Correct scores have mean zero, so autocorrelations are taken about zero: a constant error then counts as one
+    value.
+    """
     n = len(transformed)
     if n < 3:
         return float(n)

@@ -69,7 +69,7 @@ class RunFacts:
 
     Attributes:
         title: title of the experiment.
-        robot: name of its robot.
+        robot: name of the robot.
         method: inference method.
         engine: simulator, precision and discretisation in words.
         status: "done", or "interrupted" if the budget or the user ended it early.

@@ -4,7 +4,7 @@ The covariance of log parameters is, for a posterior that the data dominate, the
 eigenvector of it is a product of powers of parameters; a small eigenvalue means that the data determine this product,
 an eigenvalue as large as under the prior means that they do not inform it. Weakly correlated parameters are separated
 first, so that each product combines correlated parameters only. A parameter that may be zero or negative has no
-logarithm: it stands by itself, in its own unit.
+logarithm: it enters linearly, in its own unit.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ def _directions(stack: Float[np.ndarray, "parameter n"]) -> Float[np.ndarray, "p
     """Weights of the logarithms, one row per combination.
 
     The eigenvectors of their covariance; but if one ridge dominates three parameters or more, the directions across it
-    have nearly equal variances and an arbitrary basis. In that case they are the ratios that do not change along the
-    ridge, each against the parameter that changes most.
+    have nearly equal variances and an arbitrary basis. In that case, the ratios that do not change along the ridge are
+    given, each relative to the parameter that changes most.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(stack)))
     if len(values) < 3 or values[-1] < RIDGE**2 * max(values[-2], 0.0):

@@ -63,7 +63,7 @@ class _Scale:
         return np.linspace(low, high, number)
 
     def backward(self, place: np.ndarray) -> np.ndarray:
-        """From an even axis to displayed values."""
+        """Map from an even axis to displayed values."""
         return np.exp(place) if self.log else place
 
     def apply(self, axes: Axes, which: str, *, ticks: int = 4) -> None:
@@ -174,7 +174,7 @@ def _cloud(axes: Axes, x: np.ndarray, y: np.ndarray, across: _Scale, up: _Scale,
 def _regions(axes: Axes, u: np.ndarray, v: np.ndarray, across: _Scale, up: _Scale) -> None:
     """Outlines of the smallest regions that hold 50 % and 90 % of the draws.
 
-    The histogram lies along the principal axes of the cloud: one along a parameter would blur a thin ridge.
+    The histogram lies along the principal axes of the draws, since bins along the parameters would blur a thin ridge.
     """
     points = np.stack([u, v])
     centre = points.mean(axis=1, keepdims=True)
@@ -251,7 +251,7 @@ def draw_before_and_after(
 
 
 def _heights(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Histogram with its peak at 1: a posterior far narrower than its prior would otherwise flatten the prior."""
+    """Histogram with a peak of 1: otherwise a narrow posterior would flatten its prior."""
     counts = np.histogram(values, bins=edges)[0].astype(float)
     return counts / max(counts.max(), 1.0)
 

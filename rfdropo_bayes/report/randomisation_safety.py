@@ -1,4 +1,4 @@
-"""Is this posterior safe to randomise a simulator over, and if not, why not."""
+"""Whether a posterior is safe to randomise a simulator over, with reasons."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Safety:
-    """The answer and its grounds."""
+    """The verdict and its reasons."""
 
     verdict: str  # "safe", "with care" or "unsafe"
     sentence: str  # the same in words

@@ -1,7 +1,6 @@
 """A replay in three dimensions of measured and simulated motion, drawn by the page itself, offline.
 
-The page holds positions as whole tenths of a millimetre, and `templates/replay.js` draws them: turned by dragging,
-played, and moved to any instant.
+The page holds positions in tenths of a millimetre; `templates/replay.js` draws, rotates and plays them.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ POSTERIOR, SUMMARY, CONFIG, REPORT = "posterior.nc", "summary.json", "config.tom
 def write_run(folder: Path, record: PosteriorRecord, summary: Mapping[str, Any], config: str) -> Path:
     """Write all four files and return the path of the report.
 
-    The numbers are written before the pictures are drawn, so that a run that is stopped there has lost nothing.
+    The numbers are written before the pictures are drawn, so that a stop while drawing loses nothing.
 
     Raises:
         InputError: if the folder cannot be written.

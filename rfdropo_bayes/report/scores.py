@@ -1,8 +1,8 @@
 """Error figures: root mean square over time of the 3-D distance of a marker, in millimetres.
 
-The LAST marker is the headline. A recording that ends in a pose it holds is also scored in two parts, because a long
-hold would drown the motion: the moving part (every row before the pose has settled) and the final pose (the mean of the
-last rows).
+The LAST marker is the headline. A recording that ends at rest is also scored in two parts, since a long rest would
+dominate the score: the moving part (all rows before the pose has settled) and the final pose (the mean of the last
+rows).
 """
 
 from __future__ import annotations

@@ -70,12 +70,12 @@ def copied(
     own = command_openings(recording)
     alike = [path for path in earlier if same_opening(own, openings.get(path.name, {}))]
     if not alike:
-        raise InputError("no fitted recording has its commands", where=recording.name)
+        raise InputError("no fitted recording has the same commands", where=recording.name)
     mean = np.zeros(recording.position.shape)
     for column, marker in enumerate(recording.marker_names):
         seen = [p for p in alike if marker in p.marker_names and p.mask[:, p.marker_names.index(marker)].any()]
         if not seen:
-            raise InputError(f"{marker} was lost in all fitted recordings of its commands", where=recording.name)
+            raise InputError(f"{marker} was lost in all fitted recordings with the same commands", where=recording.name)
         for path in seen:
             index = path.marker_names.index(marker)
             usable = path.mask[:, index]

@@ -103,7 +103,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 
 
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
-    """The end of its prior, "low" or "high", that a posterior is piled up at; None if it is not.
+    """The end of the prior, "low" or "high", at which a posterior accumulates; None without accumulation.
 
     If the prior is logarithmic, the comparison is in logarithms; see `cut_off_at`.
     """
@@ -165,8 +165,8 @@ class Summary(_Open):
 def effective_draws(record: PosteriorRecord, rows: Sequence[ParameterRow], details: Mapping[str, Any]) -> float | None:
     """Number of independent draws that a posterior is worth; None for draws that are no posterior.
 
-    At most the number of distinct draws: a sampler without budget repeats a few. Weighted draws have their own number,
-    other draws the least of ArviZ's for a parameter.
+    At most the number of distinct draws: a sampler without budget repeats a few. Weighted draws have a number of their
+    own; for other draws it is the smallest of ArviZ's numbers per parameter.
     """
     if record.log_likelihood is None:
         return None
@@ -254,7 +254,7 @@ def combined_hash(hashes: list[str]) -> str:
 
 
 def _plain(value: Any, path: str, missing: dict[str, str]) -> Any:
-    """Values as JSON has them; a number that is not finite becomes null and is noted."""
+    """Values in JSON's types; numbers that are not finite become null and are listed."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v, f"{path}.{k}" if path else str(k), missing) for k, v in value.items()}
     if isinstance(value, np.ndarray):
@@ -294,7 +294,7 @@ def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     """Write summary.json.
 
     Raises:
-        InputError: if it cannot be written.
+        InputError: the summary cannot be written.
     """
     write_json(path, summary, finite=True)
 
@@ -303,7 +303,7 @@ def read_summary(path: Path) -> dict[str, Any]:
     """Read summary.json.
 
     Raises:
-        InputError: if it is missing, no JSON, or lacks a stable key.
+        InputError: the summary is missing, is no JSON, or lacks a stable key.
     """
     try:
         summary = json.loads(Path(path).read_text(encoding="utf-8"))

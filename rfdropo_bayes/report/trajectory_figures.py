@@ -28,7 +28,7 @@ AXES = ("x", "y", "z")
 
 
 def shown_markers(count: int) -> list[int]:
-    """Markers that have their own row: evenly chosen, the last always among them."""
+    """Markers that get a row each: an even choice that includes the last."""
     return sorted(
         {round(i) for i in np.linspace(count - 1, 0, min(count, MOST_MARKERS) + (count > MOST_MARKERS))[:MOST_MARKERS]}
     )

@@ -42,11 +42,11 @@ class Audit:
         content: content of audit.json.
         tables: experiment file with the adopted extensions, as tables.
         page: the report as HTML.
-        robot: audited robot, if it was made in Python; None if the tables name it.
+        robot: audited robot, if made in Python; None for a robot that the tables name.
         base: folder that paths in the tables are relative to.
-        folder: folder with its files, if written.
-        shown: data of its figures; None if it was read from files.
-        answer: answer with its fits; None if it was read from files.
+        folder: folder with the audit's files, if written.
+        shown: data of the figures; None for an audit read from files.
+        answer: answer with fits; None for an audit read from files.
         residuals: residuals of the base and the final model, and signals at ports; None if it was read from files.
     """
 

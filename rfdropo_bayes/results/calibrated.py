@@ -47,7 +47,7 @@ class Calibration:
         content: content of summary.json.
         config: the experiment as TOML.
         model: fitted model; None if it cannot be rebuilt from files.
-        folder: folder with its files, if written.
+        folder: folder with the calibration's files, if written.
     """
 
     record: PosteriorRecord
@@ -61,7 +61,7 @@ class Calibration:
         """The posterior in a folder with the model that was fitted, and no further content.
 
         Raises:
-            InputError: no posterior there, or a damaged one.
+            InputError: the folder has no posterior, or a damaged posterior.
         """
         return cls(PosteriorRecord.load(folder / POSTERIOR), {"title": model.title}, "", model, folder)
 
@@ -82,12 +82,12 @@ class Calibration:
 
     @property
     def verdict(self) -> str:
-        """Whether it is ``"safe"`` to randomise over, ``"with care"`` or ``"unsafe"``."""
+        """Verdict on randomisation over the posterior: ``"safe"``, ``"with care"`` or ``"unsafe"``."""
         return str(self.content["randomisation"]["verdict"])
 
     @property
     def sentence(self) -> str:
-        """The verdict with its grounds."""
+        """The verdict with reasons."""
         return str(self.content["randomisation"]["sentence"])
 
     @property
@@ -213,7 +213,7 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 
 def picture_tag(figure: Figure) -> str:
-    """A figure as an image inside HTML, in few colours: a notebook keeps it."""
+    """A figure as an image with few colours inside HTML, which a notebook stores."""
     drawn, small = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=96)
     Image.open(drawn).convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)

@@ -21,10 +21,10 @@ def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:
 
 
 class PointMass(RobotTable):
-    """A rigid part fixed to the body: its mass [kg] is the parameter of that name; it sits at a station."""
+    """A rigid part fixed to the body at a station; the parameter of the same name is its mass [kg]."""
 
-    parameter: Name = Field(description="parameter that holds its mass [kg]")
-    z_m: float = Field(description="station at which it sits")
+    parameter: Name = Field(description="parameter for the mass [kg] of the part")
+    z_m: float = Field(description="station of the part")
 
 
 class Body(RobotTable):

@@ -24,25 +24,25 @@ class Cable(RobotTable):
     azimuth_deg: float = Field(description="azimuth of the cable, from +x towards +y")
     anchor_z_m: float = Field(description="axial coordinate of the anchor, a point fixed to the base")
     anchor_radius_m: Positive = Field(description="distance of the anchor from the axis")
-    anchor_azimuth_deg: float | None = Field(default=None, description="azimuth of the anchor, if it differs")
+    anchor_azimuth_deg: float | None = Field(
+        default=None, description="azimuth of the anchor, if different from the cable's"
+    )
     guide_z_m: tuple[float, ...] = Field(
         min_length=1, description="axial coordinates of the guides in the undeformed body; the cable ends at the last"
     )
     guide_radius_m: tuple[Positive, ...] = Field(description="distance of each guide from the axis")
     drive: Literal["displacement", "tension"] = Field(
         default="displacement",
-        description='"displacement": its drive winds in a length; "tension": its drive holds a force, whatever length '
-        "that takes",
+        description='"displacement": the drive winds in a length; "tension": the drive holds a force at any length',
     )
     displacement_limit_m: Pair | None = Field(
         default=None,
-        description="least and greatest displacement, pull > 0; commands beyond it stop at the limit; only "
-        "for cables driven by displacement",
+        description="least and greatest displacement, pull > 0, to which commands are clipped; only for cables "
+        "driven by displacement",
     )
     tension_limit_n: Pair | None = Field(
         default=None,
-        description="least and greatest tension; commands beyond it stop at the limit; only for cables driven by "
-        "tension",
+        description="least and greatest tension, to which commands are clipped; only for cables driven by tension",
     )
 
     @model_validator(mode="after")
@@ -75,7 +75,7 @@ class Cable(RobotTable):
 
     @property
     def end_m(self) -> float:
-        """Axial coordinate of its end in the undeformed body."""
+        """Axial coordinate of the cable's end in the undeformed body."""
         return self.guide_z_m[-1]
 
     def turned(self, angle: float) -> Cable:

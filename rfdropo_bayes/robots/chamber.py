@@ -10,7 +10,7 @@ from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 
 class Chamber(RobotTable):
-    """A chamber parallel to the axis: its pressure times its area is a force that follows the body.
+    """A chamber parallel to the axis: pressure times area is a force that follows the body.
 
     Between its ends the sections carry this force at the chamber's distance from the axis: a thrust along the axis and
     a moment.
@@ -18,8 +18,8 @@ class Chamber(RobotTable):
 
     name: Name = Field(description="unique among the robot's cables and chambers")
     azimuth_deg: float = Field(description="azimuth of the chamber, from +x towards +y")
-    radius_m: float = Field(ge=0.0, description="distance of its middle line from the axis")
-    z_m: Pair = Field(description="axial coordinates of its two ends in the undeformed body")
+    radius_m: float = Field(ge=0.0, description="distance of the chamber's middle line from the axis")
+    z_m: Pair = Field(description="axial coordinates of the chamber's two ends in the undeformed body")
     area_m2: Positive = Field(description="area across the axis on which the pressure acts")
     pressure_limit_pa: Pair = Field(
         description="least and greatest pressure above the surroundings; commands beyond are held at the limit"
@@ -54,10 +54,10 @@ class Chamber(RobotTable):
         return self.model_copy(update={"azimuth_deg": self.azimuth_deg + angle})
 
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Place of its middle line across the axis [m]."""
+        """Place of the chamber's middle line across the axis [m]."""
         angle = np.deg2rad(self.azimuth_deg)
         return self.radius_m * np.array([np.cos(angle), np.sin(angle)])
 
     def ends(self) -> Float[np.ndarray, "2 3"]:
-        """Middle of its two ends in the undeformed body [m]."""
+        """Middle of the chamber's two ends in the undeformed body [m]."""
         return np.column_stack([np.tile(self.middle(), (2, 1)), self.z_m])

@@ -29,23 +29,23 @@ class DriveTravel(RobotTable):
     """
 
     cables: Literal["all"] | tuple[str, ...] = Field(
-        default="all", description='"all", or names of the command channels that it holds for'
+        default="all", description='"all", or names of the command channels with these limits'
     )
     recordings: str | tuple[str, ...] = Field(
-        default="*", description="recordings that it holds for: groups of [model.groups], names or wildcards"
+        default="*", description="recordings with these limits: groups of [model.groups], names or wildcards"
     )
     low: Values | None = Field(default=None, description="least value of the counter; none by default")
     high: Values | None = Field(default=None, description="greatest value of the counter; none by default")
     start: Values | None = Field(
-        default=None, description="counter at the start of a recording; by default the command in force there"
+        default=None, description="counter at the start of a recording; by default the command in force at the start"
     )
     count_size: float = Field(
         default=1.0,
         description="pull per count [m or rad, as the commands]; negative if the counter falls as a cable is pulled",
     )
     beyond: Literal["lost", "kept", "clipped"] = Field(
-        description='effect of a command beyond a limit: "lost", the drive ignores all of it; "clipped", it goes '
-        'to the limit and forgets the rest; "kept", it waits at the limit until the commands come back'
+        description='effect of a command beyond a limit: "lost", the drive ignores the whole command; "clipped", the '
+        'drive goes to the limit and forgets the rest; "kept", the drive waits at the limit until the commands return'
     )
 
     @model_validator(mode="after")
@@ -78,7 +78,7 @@ class DriveTravel(RobotTable):
         return group in patterns or any(fnmatchcase(whole(recording), pattern) for pattern in patterns)
 
     def columns(self, channels: Sequence[str]) -> list[int]:
-        """Indices of its cables among the command channels.
+        """Indices of the table's cables among the command channels.
 
         Raises:
             InputError: a cable that is no channel.
@@ -146,7 +146,7 @@ def travel_in(
         tables: tables of a robot and its experiment.
         channels: names of the command channels.
         recording: name of the recording.
-        initial: command before its first row [m or rad].
+        initial: command before the first row [m or rad].
         group: group of the recording.
 
     Raises:

@@ -18,14 +18,14 @@ class Motor(RobotTable):
     ``sign`` is +1.
     """
 
-    channel: Name = Field(description="command channel that it drives")
+    channel: Name = Field(description="command channel of the motor")
     node: int = Field(ge=1, le=127, description="CANopen node of the drive")
     axis: int = Field(default=1, ge=1, le=8, description="axis of that node, for drives of several motors")
     sign: int = Field(description="+1 if counts rise as the cable is pulled, else -1")
     drum_radius_m: Positive = Field(description="radius at which the cable is wound")
     gear: Positive = Field(description="turns of the motor per turn of the drum")
     counts_per_turn: Positive = Field(description="counts of the encoder per turn of the motor")
-    offset_counts: int = Field(default=0, description="counts at length zero, used until homing has found them")
+    offset_counts: int = Field(default=0, description="counts at length zero, used before the first homing")
     rated_torque_n_m: Positive = Field(description="torque of the motor that the drive reports as 1000 per mille")
     length_limit_m: Pair = Field(description="least and greatest length of cable wound up")
     rate_limit_m_s: Positive = Field(description="greatest rate of the set-points")

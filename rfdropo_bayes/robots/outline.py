@@ -156,7 +156,7 @@ class RobotOutline:
         return np.cumsum(lengths).tolist()
 
     def end_of_cables(self, segment: int) -> float:
-        """Height at which the cables of a segment end [m]: its end, or the disk that is nearest to it."""
+        """Height at which the cables of a segment end [m]: the segment's end, or the nearest disk."""
         end = self.segment_ends()[segment]
         if self.shape != "disks":
             return end
@@ -188,7 +188,7 @@ class RobotOutline:
         Args:
             scale: factor of the lengths that were assumed.
             bend: factor of the bend of a command, by the attribute that `sets_bend`.
-            evidence: reason for both, in words.
+            evidence: reason for length and radius, in words.
         """
         lengths = ("length", "radius", "tip_radius", "inner_radius")
         changes: dict[str, Any] = {
@@ -386,7 +386,7 @@ def _chambers(o: RobotOutline) -> list[str]:
 
 
 def _limits(o: RobotOutline) -> list[str]:
-    """How the drive of a cable works, and its limits."""
+    """Kind and limits of a cable's drive."""
     if o.command_unit in ("m", "rad"):
         return [f"displacement_limit_m = [{-o.length:.6g}, {0.5 * o.length:.6g}]"]
     usual = o.bending_force if o.usual_command is None else o.newtons * o.usual_command

@@ -33,7 +33,7 @@ class Parameter(RobotTable):
     prior: dict[str, Any] = Field(
         description='default prior, e.g. { distribution = "LogNormal", median = 4.5e6, sigma = 0.5 }'
     )
-    description: str = Field(min_length=1, description="one line on its physical meaning")
+    description: str = Field(min_length=1, description="physical meaning in one line")
     each: Literal["cable"] | None = Field(
         default=None, description='"cable" stands for one parameter per cable, named NAME_CABLE'
     )

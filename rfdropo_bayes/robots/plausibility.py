@@ -1,6 +1,6 @@
 """Implausible numbers in a robot's description, such as millimetres given as metres.
 
-Bounds are far beyond existing robots: they catch factors of a thousand, not bad guesses.
+Bounds lie far beyond existing robots: they catch wrong units (factors of a thousand), not bad guesses.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ class PolicyLayout:
 
     @property
     def sha256(self) -> str:
-        """Digest: two policies with one digest see and do the same."""
+        """Digest: equal for policies with equal observations and actions."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
     def require(self, other: PolicyLayout, *, where: str) -> None:

@@ -49,15 +49,15 @@ class CommandTiming(RobotTable):
 
     unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = Field(
         description='unit of the commands: "m" of cable, "rad" of a motor, "N" of tension, "N m" of torque, "Pa" of '
-        'pressure, or "-" of drives that are sent volts or a share of their supply; channels.gain has the newtons of '
-        "torques, and the newtons or pascals of such drives"
+        'pressure, or "-" for drives with commands in volts or shares of their supply; channels.gain converts '
+        'torques to newtons, and commands of "-" to newtons or pascals'
     )
     ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
     dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
     usual: Positive | None = Field(
         default=None,
-        description="size of usual commands, in their unit: mechanisms have priors in this size; by default "
-        f"{USUAL_SHARE} of the largest command",
+        description="size of usual commands, in the unit of commands, which scales the priors of mechanisms; by "
+        f"default {USUAL_SHARE} of the largest command",
     )
 
 
@@ -83,7 +83,7 @@ class PushScene(RobotTable):
     """A cube on a plate across gravity, for pushing."""
 
     plate_height_m: float = Field(description="coordinate of the plate's top against gravity")
-    contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
+    contact_distance_m: float = Field(ge=0.0, description="smallest distance between surfaces")
     parameters: dict[Name, Parameter] = Field(
         description="the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
         "turn about the vertical [rad], zero if the edges are parallel to the axes"
@@ -212,7 +212,7 @@ class Robot(RobotTable):
         """Read and validate a robot description.
 
         Its body is a section profile, or shapes that make one up (`sections`). A file with a key ``base`` describes a
-        variant of that robot: its tables replace the base's of the same name.
+        variant of that robot: its tables replace tables of the base with the same name.
 
         Args:
             name_or_path: name of a robot that comes with the package, or path of a TOML file.
@@ -296,7 +296,6 @@ class Robot(RobotTable):
 
     @property
     def command_unit(self) -> str:
-        """Unit of the commands."""
         return self.command.unit
 
     @property
@@ -326,7 +325,6 @@ class Robot(RobotTable):
 
     @property
     def marker_names(self) -> tuple[str, ...]:
-        """Names of the markers."""
         return tuple(marker.name for marker in self.markers)
 
     @property
@@ -368,8 +366,8 @@ class Robot(RobotTable):
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
         """Least and greatest command of each channel [m or rad] at nominal parameters.
 
-        A cable may be released as far as it may be pulled, or to its own limit if that is nearer: a policy could
-        otherwise pay out slack that takes hundreds of actions to wind up again.
+        A cable may be released as far as it may be pulled, or to its release limit if that is nearer. Otherwise a
+        policy could release slack that takes hundreds of actions to wind up.
         """
         limits = self.drive_limits()
         pull, release = limits[:, 1], np.maximum(limits[:, 0], -limits[:, 1])
@@ -382,8 +380,9 @@ class Robot(RobotTable):
         return low.max(axis=0), high.min(axis=0)
 
     def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
-        """Size of each channel's command for a given pull of a cable [m]: the pull itself, or at nominal parameters
-        the angle that moves the cable that moves most."""
+        """Size of each channel's command for a given pull of a cable [m]: the pull, or the angle (at nominal
+        parameters) that moves one of the channel's cables by the pull and the others by less.
+        """
         if self.command_unit == "m":
             return np.full(len(self.channel_names), pull)
         return pull / np.abs(np.asarray(self.channel_matrix(self.nominal()), dtype=float)).max(axis=0)
@@ -396,7 +395,7 @@ class Robot(RobotTable):
     def channel_matrix(self, parameters: Mapping[str, Any]) -> Any:
         """Matrix (drive, channel) from commands to the drives of cables and chambers, for these parameter values.
 
-        Values may be JAX tracers: the matrix is then one too.
+        Values may be JAX tracers; the matrix is then also a tracer.
         """
         gain = np.array(self.channels.gain)
         radius = self.channels.radius_parameter

@@ -60,7 +60,7 @@ class Cylinder(RobotTable):
 
     shape: Literal["cylinder"] = Field(default="cylinder", description="form of the section")
     length_m: Positive = Field(description="length along z")
-    layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
+    layers: int = Field(ge=1, description="number of layers of equal thickness")
     radius_m: Positive = Field(description="radius")
 
     def profile(self) -> Profile:
@@ -73,7 +73,7 @@ class Cone(RobotTable):
 
     shape: Literal["cone"] = Field(default="cone", description="form of the section")
     length_m: Positive = Field(description="length along z")
-    layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
+    layers: int = Field(ge=1, description="number of layers of equal thickness")
     radius_m: Radii = Field(description="radius at the base end, and at the tip end")
 
     def profile(self) -> Profile:
@@ -86,9 +86,11 @@ class Tube(RobotTable):
 
     shape: Literal["tube"] = Field(default="tube", description="form of the section")
     length_m: Positive = Field(description="length along z")
-    layers: int = Field(ge=1, description="layers it is cut into, of equal thickness")
-    radius_m: Positive | Radii = Field(description="outer radius, or its two values towards the base and the tip")
-    inner_radius_m: Positive | Radii = Field(description="radius of the hollow, or its two values")
+    layers: int = Field(ge=1, description="number of layers of equal thickness")
+    radius_m: Positive | Radii = Field(description="outer radius, or two values, towards the base and the tip")
+    inner_radius_m: Positive | Radii = Field(
+        description="radius of the hollow, or two values, towards the base and the tip"
+    )
 
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:
@@ -111,7 +113,7 @@ class Disks(RobotTable):
     thickness_m: Positive = Field(description="thickness of a disk")
     backbone_radius_m: Positive = Field(description="radius of the backbone between the disks")
     modulus_ratio: Positive = Field(default=1.0, description="Young's modulus of the disks over the backbone's")
-    density_ratio: Positive = Field(default=1.0, description="density of the disks over the backbone's")
+    density_ratio: Positive = Field(default=1.0, description="ratio of the densities of disks and backbone")
 
     @model_validator(mode="after")
     def _fits(self) -> Disks:

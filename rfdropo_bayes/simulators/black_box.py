@@ -133,7 +133,7 @@ class BlackBox:
 
     @property
     def push(self) -> None:
-        """No cube stands before it."""
+        """No cube stands before the robot."""
 
     @property
     def body(self) -> None:
@@ -149,7 +149,7 @@ class BlackBox:
         return np.full(len(low), pull) if self.command_unit == "m" else ACTION * (high - low)
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
-        """All markers: its undeformed body is unknown."""
+        """All markers, since the undeformed body is unknown."""
         return tuple(range(len(self.markers)))
 
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
@@ -219,9 +219,7 @@ class BlackBox:
 
     @property
     def digest(self) -> str:
-        """Digest of the source, as far as it can be read, and of the parameters; and of the function's attribute
-        ``digest``.
-        """
+        """Digest of the readable source, of the parameters, and of the function's attribute ``digest``."""
         try:
             source = getattr(self.function, "digest", None)
             source = (
@@ -282,17 +280,15 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     @property
     def time_step(self) -> float:  # type: ignore[override]
-        """Time step of the box."""
         return self.box.time_step
 
     @property
     def lanes(self) -> int:
-        """Parameter sets that it is given at once."""
+        """Number of parameter sets in a call of the function."""
         return self.box.lanes
 
     @property
     def command_unit(self) -> str:
-        """Unit of the commands."""
         return self.box.command_unit
 
     @cached_property
@@ -383,7 +379,6 @@ class BlackBoxSimulator(ExtendedSimulator):
         return Observation(position, sample(moved.tension, commands), None, status, angle)
 
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
-        """See `ExtendedSimulator.lane_start`."""
         return LaneStart({spec.name: values[spec.name] for spec in self.box.specs}, drives.level, None)
 
     def begin_lanes(self, count: int) -> BodyLanes:

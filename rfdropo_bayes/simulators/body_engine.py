@@ -1,7 +1,7 @@
 """Engines for the motion of a body, and of a cube that it pushes: a rod in JAX or compiled by Numba, a mesh by Numba.
 
-For a rod both give the same numbers. JAX is differentiable and runs on any device; Numba fills the lanes and threads of
-a CPU with rollouts, one call out of a traced program for a whole batch, and its derivatives are differences. A rod may
+For a rod both engines give the same numbers. JAX is differentiable and runs on any device; Numba uses vector lanes and
+threads of a CPU, in one callback for a whole batch, with derivatives by differences. A rod may
 also be at rest in every row: an equilibrium found from the row before, without time or damping.
 """
 

@@ -74,7 +74,7 @@ class LanesBeforeCube:
     """Bodies that start clear of cube and plate: see `BodyLanes`.
 
     The equilibrium of a body ignores both, and a body that overlaps the cube would throw it away. The unbalanced force
-    of such a start counts as infinite.
+    of a start in penetration counts as infinite.
     """
 
     def __init__(
@@ -94,7 +94,6 @@ class LanesBeforeCube:
         self._gaps = jax.jit(jax.vmap(gap))
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`."""
         motion = self._bodies.reset(rows, given)
         # all lanes are computed, so that the same program serves any number of rows
         source = np.zeros(self._count, int)
@@ -104,7 +103,6 @@ class LanesBeforeCube:
         return self._markers(motion._replace(imbalance=np.where(gap < -TOUCHING, np.inf, motion.imbalance)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """See `BodyLanes`."""
         return self._markers(self._bodies.advance(displacement, loads))
 
     def _markers(self, motion: Motion) -> Motion:
@@ -120,13 +118,11 @@ class CompiledLanes:
         self.save, self.restore = self._session.save, self._session.restore
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`."""
         cube = None if given.cube is None else cube_arrays(given.cube)
         begin = {"start" if self._from_equilibrium else "before": given.start}
         return _last(self._session.reset(rows, given.material, **begin, cube=cube, loads=self._acting(given.loads)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """See `BodyLanes`."""
         if self._at_rest:
             displacement, loads = _ends(displacement, loads)
         return _last(self._session.advance(displacement, loads=self._acting(loads)), begun=1)
@@ -177,18 +173,15 @@ class ReferenceLanes:
         return Motion(*(None if part is None else part[rows] for part in self._shown(self._lanes.state.tension)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"], loads: BodySignals | None = None) -> Motion:
-        """See `BodyLanes`."""
         if self._engine.at_rest:
             displacement, loads = _ends(displacement, loads)
         self._lanes, peak = self._moved(self._lanes, jnp.asarray(displacement), loads)
         return self._shown(peak)
 
     def save(self) -> Float[np.ndarray, "lane values"]:
-        """See `BodyLanes`."""
         return flat_lanes(self._lanes, self._count)
 
     def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """See `BodyLanes`."""
         whole = self.save()
         whole[rows] = state
         self._lanes = lanes_like(self._lanes, whole)

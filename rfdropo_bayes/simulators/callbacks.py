@@ -1,4 +1,4 @@
-"""Rollouts that no traced program can hold: one call out of it for a whole batch."""
+"""Rollouts outside traced programs: one callback for a whole batch."""
 
 from __future__ import annotations
 

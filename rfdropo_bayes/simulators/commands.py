@@ -185,7 +185,7 @@ def carried_out(
     Args:
         given: times of the last commands before each of ``at`` [s], in order; repeated and later commands have no
             effect. The first command must be completed.
-        value: values of these commands, cumulative [m or rad].
+        value: cumulative commands at these times [m or rad].
         at: times [s].
         ramp: 0 carries a command out at once: a command given at the start of a step acts during it.
     """

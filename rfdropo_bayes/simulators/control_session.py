@@ -1,6 +1,6 @@
 """Sessions: many robots that advance by one control period per call, each with its own parameters and time.
 
-A session splits a simulator's rollout: the same drives, mechanisms, body and cameras, whose state is kept between
+A session is a rollout in parts: drives, mechanisms, body and cameras are the same, and their states are kept between
 calls. Its state is plain arrays with one row per lane.
 """
 
@@ -104,7 +104,7 @@ class Session:
 
     @property
     def time(self) -> Float[np.ndarray, " lane"]:
-        """Since every lane was started [s]."""
+        """Time of each lane since its start [s]."""
         return self.period * self._past.periods
 
     @property
@@ -381,8 +381,9 @@ class Session:
 
     @cached_property
     def _look(self) -> Any:
-        """Cameras of all lanes after an observation, and the marker positions [m] that they see under the last signals;
-        None for the cameras before makes it the first."""
+        """States of the cameras after an observation, and the observed marker positions [m] under the last signals; the
+        observation is the first if the earlier states are None.
+        """
         cameras = SensingMechanism | TimedSensingMechanism | CommandedSensingMechanism
         chain: list[Any] = [m for m in self.simulator.mechanisms if isinstance(m, cameras)]
 
@@ -421,5 +422,5 @@ class Session:
 
 @jax.jit
 def _chosen(rows: Bool[Array, " lane"], new: Any, old: Any) -> Any:
-    """Some lanes of one tree of arrays, the others of another."""
+    """Some lanes from one tree of arrays, the other lanes from another tree."""
     return jax.tree.map(lambda n, o: jnp.where(rows.reshape(-1, *(1,) * (n.ndim - 1)), n, o), new, old)

@@ -58,7 +58,6 @@ def scene_of(robot: Robot, body: Rod | TetrahedralBody) -> PushGeometry:
 
 
 def cube_inputs(robot: Robot, values: Mapping[str, Float[Array, ""]]) -> CubeInputs:
-    """The cube for these values."""
     side = jnp.asarray(values["cube_side"], float)
     centre = jnp.stack([jnp.asarray(values[f"cube_{axis}"], float) for axis in "xyz"])
     mass, friction = jnp.asarray(values["cube_mass"], float), jnp.asarray(values["friction"], float)

@@ -75,12 +75,12 @@ class ExtendedSimulator:
 
     @property
     def integrator(self) -> str | None:
-        """Integrator of time steps; None if the simulator has its own."""
+        """Integrator of time steps; None for a simulator without a choice of integrators."""
         return None
 
     @property
     def command_timing(self) -> tuple[float, float]:
-        """For how long a change of a command is carried out, and how late [s]."""
+        """Duration and delay of a command's change [s]."""
         return 0.0, 0.0
 
     def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:

@@ -7,6 +7,7 @@ simulator exactly. The library of mechanisms lives one room above.
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -34,8 +35,8 @@ class Mechanism(Protocol):
 
     Attributes:
         name: registry name.
-        stage: one of `STAGES`, in the order in which they act on a rollout.
-        parameters: its parameters; the nominal value of each is its null value, except for parameters with a ``grid``.
+        stage: one of `STAGES`, which are in the order of their action on a rollout.
+        parameters: parameters of the mechanism; nominal values are null values, except for parameters with a ``grid``.
             A null value that is a bound makes the effect one-sided.
         cause: one line on the physical cause.
         remedy: one line on the remedy in a laboratory.
@@ -85,7 +86,7 @@ class SensingMechanism(Mechanism, Protocol):
 
 @runtime_checkable
 class TimedSensingMechanism(Mechanism, Protocol):
-    """Acts on measurements, with a memory or a clock of its own."""
+    """Acts on measurements, with a memory or a clock."""
 
     def sense_over_time(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
@@ -119,7 +120,7 @@ class PushingMechanism(Mechanism, Protocol):
 
     @property
     def follows_motion(self) -> bool:
-        """Whether it depends on how the body moves."""
+        """Whether the mechanism depends on the motion of the body."""
 
     def push(
         self, values: Values, command: Float[Array, "row channel"], path: Float[Array, "row 3"] | None, time_step: float
@@ -178,13 +179,11 @@ class SteppedActuation:
     """Base of mechanisms of actuation that are written as a step; a rollout scans it."""
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Any:
-        """See `SteppedMechanism`."""
         raise NotImplementedError
 
     def advance(
         self, values: Values, memory: Any, given: Float[Array, " channel"], now: float
     ) -> tuple[Any, Float[Array, " channel"]]:
-        """See `SteppedMechanism`."""
         raise NotImplementedError
 
     def actuate(
@@ -203,17 +202,14 @@ class MemorylessActuation:
         raise NotImplementedError
 
     def settle(self, values: Values, constant: Float[Array, " channel"]) -> Float[Array, " channel"]:
-        """See `ActuationMechanism`."""
         return self.reach(values, constant)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[()]:
-        """See `SteppedMechanism`."""
         return ()
 
     def advance(
         self, values: Values, memory: tuple[()], given: Float[Array, " channel"], now: float
     ) -> tuple[tuple[()], Float[Array, " channel"]]:
-        """See `SteppedMechanism`."""
         return memory, self.reach(values, given)
 
     def actuate(
@@ -254,8 +250,17 @@ def needs_cables(mechanism: Mechanism | type) -> bool:
     return bool(getattr(mechanism, "needs_cables", False))
 
 
-def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0], cables: bool = True) -> str | None:
-    """Why a mechanism does not run on a body with or without cables, on an engine or in a motion; None if it runs."""
+def needs_times(mechanism: Mechanism) -> bool:
+    """Whether a parameter of a mechanism is a time or a rate."""
+    return any("s" in re.findall(r"[A-Za-z]+", spec.unit) for spec in mechanism.parameters)
+
+
+def obstacle(
+    mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS[0], *, cables: bool = True, timed: bool = True
+) -> str | None:
+    """Why a mechanism does not run on a body with or without cables, on an engine or in a motion, or on rows with or
+    without times; None if it runs.
+    """
     if body == BLACK_BOX:
         return None if mechanism.stage in ("actuation", "sensing") else f"it acts on the {mechanism.stage}, inside"
     if body not in bodies_of(mechanism):
@@ -264,6 +269,8 @@ def obstacle(mechanism: Mechanism, body: str, engine: str, motion: str = MOTIONS
         return "it acts on cables, and the robot has none"
     if engine not in engines_of(mechanism):
         return f"it runs on the engine {' or '.join(engines_of(mechanism))} only"
+    if not timed and needs_times(mechanism):
+        return "it acts in time, and the rows have no times"
     if motion not in motions_of(mechanism):
         return f"it acts on a body in motion, and motion is {motion}"
     return None

@@ -47,7 +47,9 @@ class TetrahedraTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     mesh: str = Field(description="mesh file (VTK, Gmsh), in the folders of recordings")
-    unit: Literal["m", "cm", "mm"] = Field(description="unit of its coordinates, in the frame of the robot's base")
+    unit: Literal["m", "cm", "mm"] = Field(
+        description="unit of the mesh's coordinates, in the frame of the robot's base"
+    )
     clamp_height: float = Field(description="height [m] at or below which nodes are fixed")
     frames: Literal["polar", "edges"] = Field(
         default="polar",
@@ -71,8 +73,8 @@ class TetrahedraTable(BaseModel):
     )
     marker_cables: tuple[str, ...] = Field(
         default=(),
-        description="cables at whose guides markers lie: such a marker is the mean of the guides at its height; if "
-        "empty, every marker is a point of the body",
+        description="cables at whose guides markers lie: a marker is then the mean of the guides at its height; if "
+        "empty, markers are points of the body",
     )
 
 
@@ -195,13 +197,12 @@ class MeshTrunkSimulator(RobotSimulator):
         initial: Float[np.ndarray, " channel"],
         observation_time: Float[np.ndarray, " time"],
     ) -> Commands:
-        """Recorded commands on this simulator's clock, handed over as its drives do."""
+        """Recorded commands on the simulator's clock, interpolated as by its drives."""
         if self.options.drives == "sofa":
             return animated_on_grid(time, value, initial, observation_time, time_step=self.time_step)
         return super().commands(time, value, initial, observation_time)
 
     def inputs(self, values: Values, commands: Commands) -> tuple[TetrahedralMaterial, Array, Array]:
-        """See `RobotSimulator`."""
         displacement = self.displacements(values, commands)
         return self.material(values), jnp.zeros_like(displacement[0]), displacement
 
@@ -209,7 +210,7 @@ class MeshTrunkSimulator(RobotSimulator):
         """See `RobotSimulator`; the energies are of the body.
 
         Raises:
-            InputError: another integrator than implicit Euler, whose states alone determine the velocities.
+            InputError: the integrator is not implicit Euler; only for Euler do the states determine the velocities.
         """
         if self.engine.integrator != "euler":
             raise InputError(
@@ -234,7 +235,6 @@ class MeshTrunkSimulator(RobotSimulator):
         return profile_rod(**self.robot.rod_arrays())
 
     def material(self, values: Values) -> TetrahedralMaterial:
-        """See `RobotSimulator`."""
         layers = self._layers
         masses = jnp.asarray(self.robot.point_masses(values))
         material = self.embodied(values, layers, jnp.ones(layers.elements), masses)

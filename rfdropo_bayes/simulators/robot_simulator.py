@@ -167,11 +167,11 @@ class RobotSimulator(ExtendedSimulator):
         return self.engine.lanes
 
     def with_backend(self, backend: Backend) -> Self:
-        """The same, computed by another backend."""
+        """The simulator with another backend."""
         return replace(self, engine=replace(self.engine, backend=backend))  # type: ignore[type-var]
 
     def pushing(self) -> Self:
-        """The same with the cube and the plate of its robot before it.
+        """The simulator with the robot's cube and plate.
 
         Raises:
             InputError: a robot without a cube.
@@ -293,7 +293,7 @@ class RobotSimulator(ExtendedSimulator):
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.
 
-        Always in double precision; with another integrator than implicit Euler always by the reference engine, as
+        The computation is in double precision. Integrators other than implicit Euler need the reference engine, since
         states alone do not determine the stages of a step. Mechanisms of sensing have no effect; only `rollout` reports
         divergence.
 
@@ -357,7 +357,7 @@ class RobotSimulator(ExtendedSimulator):
         """Values with the cube at its measured pose, less the offset of the measuring frame, standing on the plate.
 
         Args:
-            values: values of one rollout, or of many (arrays of one shape); missing values are nominal.
+            values: values of one rollout, or of many (arrays of equal shapes); missing values are nominal.
             pose: measured centre [m] and unit quaternion (x, y, z, w).
         """
         known = {spec.name: spec.nominal for spec in self.parameters} | dict(values)
@@ -400,8 +400,9 @@ class RobotSimulator(ExtendedSimulator):
         return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
 
     def exerted(self, values: Values, level: Float[Array, " drive"]) -> Float[Array, " drive"]:
-        """Drives of the engine at levels of the robot's drives [m, N or Pa]: a drive that holds a tension winds a
-        spring that is so soft that the cable's own length does not count."""
+        """Drives of the engine at levels of the robot's drives [m, N or Pa]. A drive that holds a tension winds a very
+        soft spring, so that the cable's length has no effect.
+        """
         if self.robot.held_by_force:
             return level * np.array([SOFT if each.unit == "N" else 1.0 for each in self.robot.actuators])
         return level + self.pretension(values)
@@ -433,12 +434,10 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def integrator(self) -> str | None:
-        """See `ExtendedSimulator.integrator`."""
         return self.engine.integrator
 
     @property
     def command_timing(self) -> tuple[float, float]:
-        """See `ExtendedSimulator.command_timing`."""
         return self.robot.command.ramp_s, self.robot.command.dead_time_s
 
     def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:
@@ -446,7 +445,6 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.travel(recording, command)
 
     def lane_start(self, values: Values, drives: Wound) -> LaneStart:
-        """See `ExtendedSimulator.lane_start`."""
         material, cube = self.body_inputs(values)
         return LaneStart(material, self.exerted(values, drives.level), cube)
 
@@ -477,5 +475,4 @@ class RobotSimulator(ExtendedSimulator):
         return self.in_measuring_frame(values, super().measured(values, position, time, meanwhile))
 
     def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """See `ExtendedSimulator.in_measuring_frame`."""
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

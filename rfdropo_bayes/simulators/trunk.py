@@ -92,7 +92,6 @@ class TrunkSimulator(RobotSimulator):
 
     @property
     def discretised(self) -> dict[str, object]:
-        """See `RobotSimulator`."""
         return {"body": "rod", "elements": self.assembly.system.body.elements}
 
     def session(self, lanes: int, period: float) -> Session:
@@ -100,7 +99,6 @@ class TrunkSimulator(RobotSimulator):
         return Session(self, lanes, period)
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Material, Array, Array]:
-        """See `RobotSimulator`."""
         return self.material(values), *self.wound(values, commands, self.time_step)
 
     def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
@@ -115,7 +113,6 @@ class TrunkSimulator(RobotSimulator):
         return stepped_balance(system, prepared, state, displacement, self.time_step, engine.integrator, *around)
 
     def material(self, values: Values) -> Material:
-        """See `RobotSimulator`."""
         body = self.assembly.system.body
         masses = jnp.zeros(len(body.station)).at[self.assembly.station_of].set(self.robot.point_masses(values))
         cuts = np.diff(self.assembly.station_of)

@@ -1,1 +1,1 @@
-"""Calls of the Python interface and of the command line: one module for each verb, named after it."""
+"""Functions of the Python interface and of the command line: one module for each verb."""

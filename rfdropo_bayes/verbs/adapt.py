@@ -252,7 +252,7 @@ def _fitted(asked: SessionTask, draws: int, key: jax.Array, show: bool | None) -
 
 
 def _named(recordings: Sequence[Trajectory]) -> str:
-    """Their names, each once: a recording that was parted has one name."""
+    """Unique names; both parts of a divided recording have the same name."""
     return ", ".join(dict.fromkeys(whole(recording.name) for recording in recordings))
 
 
@@ -402,7 +402,7 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
 
 
 def _adapted(model: Model, model_error: ModelError, recording: Trajectory, group: str | None) -> Model:
-    """The model of the adapted run: its noise is known, and its group and its recording are named."""
+    """The model of the adapted run, with known noise, and with the names of its group and recording."""
     groups = model.spec.groups if group is None else in_group(recording.name, group, model.spec.groups)
     noise = NoiseTable(
         standard_deviation=float(np.sqrt(np.mean(np.square(model_error.scale)))),
@@ -491,8 +491,8 @@ def _record(
 
 
 def _of_other_groups(asked: SessionTask, draws: int) -> tuple[list[InferredParameter], Batch]:
-    """Parameters that other groups and recordings have of their own, and their values under each draw of the body
-    before: the folder of a session also predicts recordings of other sessions.
+    """Parameters of other groups and recordings, and their values under each draw of the body. With them the folder of
+    a session also predicts recordings of other sessions.
     """
     known = asked.scopes.names
     others = [p for p in fitted_scopes(asked.fit).parameters if p.scope.owner and p.name not in known]

@@ -1,8 +1,9 @@
 """A search for the arrangement of a robot's commands by a chain of arcs, from scratch.
 
-First the cables of each column may run anywhere, and end at any height at which cables of the robot end: the column
-that explains most is placed first, then the next, then each once more while the others stay. Order and turns of the
-robot's description have no part in this, so no order is a bad start. Then the columns are given to the channels that
+First, the cables of each column may run anywhere and end at any height at which cables of the robot end. The column
+that explains most is placed first, then the next; then each column is placed once more with the others fixed. Order and
+turns of the robot's description have no part in this, so no order is a bad start. Then the columns are given to the
+channels that
 run nearest, sections turned as a whole: an assignment problem.
 """
 
@@ -154,7 +155,7 @@ class ArcSearch:
         return self.scores(kind, azimuth, sign, np.ones((guesses, columns), dtype=bool))
 
     def turned(self, arrangement: Arrangement) -> Arrangement:
-        """The arrangement with its sections turned as explains the motion best."""
+        """The arrangement with the section azimuths that explain the motion best."""
         for _ in range(2):
             for section in range(self.sections.number):
                 tried = [_with_turn(arrangement, section, angle) for angle in FINE]

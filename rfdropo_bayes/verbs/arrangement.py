@@ -47,7 +47,6 @@ class Sections(NamedTuple):
 
     @property
     def number(self) -> int:
-        """Number of sections."""
         return 1 + max(self.of_drive)
 
 

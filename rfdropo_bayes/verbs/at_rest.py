@@ -94,7 +94,7 @@ def without_memory(mechanism: Any) -> bool:
 
 
 def _fixed(spec: ModelSpec, simulator: TrunkSimulator) -> dict[str, float]:
-    """Fixed values that a robot at rest has."""
+    """Fixed parameter values of a model, if its simulator has the parameters."""
     known = [each.name for each in simulator.parameters]
     given = expand_groups(spec.fixed, simulator.parameters)
     return {name: float(value) for name, value in given.items() if name in known}

@@ -20,6 +20,7 @@ from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.candidates import Candidate
@@ -36,7 +37,7 @@ from rfdropo_bayes.discrepancy.pipeline import audit as ask
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
-from rfdropo_bayes.mechanisms.ports import port_map
+from rfdropo_bayes.mechanisms.ports import PortMap, port_map
 from rfdropo_bayes.mechanisms.registry import source_of
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
@@ -269,8 +270,16 @@ def build_problem(
         seed,
         {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
-        port_map(simulator, model.recordings.markers) if whole and table.ports else None,
+        _ports(simulator, model, fitted) if whole and table.ports else None,
     )
+
+
+def _ports(simulator: AnySimulator, model: TrajectoryModel, fitted: Sequence[Trajectory]) -> PortMap:
+    """Ports of a simulator; without delays if rows have no times."""
+    ports = port_map(simulator, model.recordings.markers)
+    if all(UNTIMED not in trajectory.notes for trajectory in fitted):
+        return ports
+    return ports._replace(ports=tuple(port for port in ports.ports if port.unit != "s"))
 
 
 def _something_asked(table: AuditTable, groups: Groups | None) -> None:
@@ -349,7 +358,8 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
         body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
         cables = not isinstance(spec.robot, Robot) or bool(spec.robot.cables)
-        why = obstacle(mechanism, body, engine, spec.simulator.motion, cables)
+        timed = UNTIMED not in recording.notes
+        why = obstacle(mechanism, body, engine, spec.simulator.motion, cables=cables, timed=timed)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:
@@ -375,8 +385,9 @@ def _lanes(
     coordinates: Coordinates,
     workshop: Workshop,
 ) -> Lanes:
-    """The simulator with all candidates, which compiled engines only run for rollouts with some of them: there is one
-    without candidates, and another without expensive ones. Lanes in the workshop are reused.
+    """The simulator with all candidates. Compiled engines run this simulator only for rollouts with candidates; other
+    rollouts use a simulator without candidates, or a simulator without expensive ones. Lanes in the workshop are
+    reused.
     """
     fields, markers = _fields(model), model.recordings.marker_index
     made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
@@ -423,7 +434,7 @@ def _model(
 ) -> tuple[TrajectoryModel, int]:
     """The model with all candidates, and the number of its first parameters, those of the base model.
 
-    The noise of its channels is known, so that its parameters are not included.
+    The noise of the channels is known, so noise parameters are not included.
     """
     added = simulator.mechanisms[len(spec.mechanisms) :]
     gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
@@ -511,7 +522,7 @@ def extended_tables(
 
 
 def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, Any]]:
-    """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
+    """Priors under which the sizes of a mechanism were fitted, at least as wide as the sizes, see `widened`."""
     coordinates = answer.problem.coordinates
     factor = widening(answer.extended, coordinates)
     priors = {}

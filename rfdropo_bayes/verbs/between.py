@@ -1,4 +1,4 @@
-"""Groups of recordings in an audit: their recordings, and the model's description of their difference."""
+"""Groups of recordings in an audit, and their differences in a model's file."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def groups_at_hand(patterns: Patterns, fitted: Sequence[Trajectory], tested: Seq
 
 
 def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Recordings of groups that the experiment names; a recording that it puts into none is a group of its own."""
+    """Recordings of the groups in the experiment; a recording in no group forms a group."""
     groups = gather_groups(names, patterns)
     for group in between:
         if group not in groups and group not in patterns:
@@ -158,7 +158,7 @@ def _groups_of(scope: str, groups: Groups, patterns: Patterns) -> dict[str, tupl
 
 
 def _naming(groups: Mapping[str, Sequence[str]], patterns: Patterns) -> Patterns:
-    """Patterns that name these groups, and by which their recordings belong to them."""
+    """Patterns of groups and of their recordings."""
     for group, recordings in groups.items():
         for recording in recordings:
             if group not in patterns or group_of(recording, patterns) != group:

@@ -224,7 +224,7 @@ def _say_robot(report: Check, robot: Workpiece) -> None:
 
 
 def _read(report: Check, experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
-    """The recordings of one role; if some are faulty, only the others."""
+    """The recordings of one role, without faulty recordings."""
     spec = experiment.data
     if spec is None:
         if role == "fit":

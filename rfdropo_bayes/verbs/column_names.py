@@ -121,7 +121,7 @@ def guess_columns(
 
     Args:
         path: a CSV, an export of Motive's, a bag, a LeRobotDataset, or a file of arrays.
-        sent: a CSV with the commands, if they have a separate file.
+        sent: a CSV with the commands, if separate.
         names: column names of a CSV without names; command_names: the same for the commands' file.
 
     Raises:
@@ -221,8 +221,8 @@ def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers
     None if the number of columns does not match.
 
     Args:
-        rows: the cells of its first rows.
-        commands: their number, if it is known.
+        rows: cells of the table's first rows.
+        commands: number of commands, if known.
         markers: their names.
     """
     width, places = len(rows[0]), [f"{marker}_{axis}" for marker in markers for axis in "xyz"]
@@ -319,7 +319,7 @@ def names_of(positions: list[list[str]]) -> list[str]:
 
 
 def _triples(names: list[str]) -> dict[str, list[str]]:
-    """Columns that differ in one letter, x, y or z: their common name, and the three in this order."""
+    """Columns whose names differ in one letter, x, y or z: the common name, and the three columns in this order."""
     triples: dict[str, dict[str, str]] = {}
     for name in names:
         for match in AXIS.finditer(name):

@@ -185,7 +185,7 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
 
     Args:
         table: table with these columns.
-        time: their column; None without times.
+        time: column of times; None without times.
         places: positions of the markers in any unit, a row of coordinates for each time; None if unknown.
     """
     if time is None or len(table) < 2:
@@ -209,7 +209,7 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
 
 
 def command_time_unit(table: CsvTable, time: str | None, duration: float) -> Unit:
-    """The unit of the commands' own times: as given, or the unit in which they last as long as the recording [s]."""
+    """The unit of the commands' times: as given, or the unit in which their duration equals the recording's [s]."""
     guess = time_unit(table, time)
     if time is None or not guess.evidence or duration <= 0.0 or "1970" in guess.evidence:
         return guess
@@ -220,7 +220,7 @@ def command_time_unit(table: CsvTable, time: str | None, duration: float) -> Uni
 
 
 def _rate(places: np.ndarray | None) -> float:
-    """Mean rate of motion, in turns a row: the speed of the markers over their spread; zero if they rest."""
+    """Mean rate of motion, in turns a row: speed over amplitude of the markers; zero at rest."""
     if places is None or len(places) < 3:
         return 0.0
     step, extent = np.sqrt(np.nanmean(np.diff(places, axis=0) ** 2)), np.sqrt(np.nanmean(np.nanvar(places, axis=0)))
@@ -230,7 +230,7 @@ def _rate(places: np.ndarray | None) -> float:
 def _likeliest(interval: float, decimals: bool, rate: float) -> str:
     """The unit in which time between rows and rate of motion are most plausible for soft robots.
 
-    Motion that would be faster than any soft robot's rules a unit out: rows between which markers go to and fro are
+    A unit is excluded if the motion would be too fast for a soft robot. Rows between which markers move to and fro are
     poses at rest, seconds apart.
     """
 

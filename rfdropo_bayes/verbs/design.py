@@ -79,10 +79,10 @@ def design(
     """Propose the commands that best separate the leading explanations of a model's misfit: candidates of the library,
     and laws at ports that the recordings cannot distinguish.
 
-    The proposals stay within the range of commands that the recordings have used, are as long as the first recording
-    and of four kinds: random walks, holds, slow loops and chirps. If no candidate is significant, the most informative
-    sequence for the base parameters is proposed. When the time is up, the best sequence so far is proposed for the
-    leading explanation so far.
+    The proposals stay within the recorded range of commands and are as long as the first recording. There are four
+    kinds: random walks, holds, slow loops and chirps. If no candidate is significant, the most informative sequence for
+    the base parameters is proposed. When the time is up, the best sequence so far is proposed for the leading
+    explanation so far.
 
     Args:
         model: simulator and inferred parameters.
@@ -124,7 +124,6 @@ def _design(
     minutes: float | None,
     report: Callable[[str], None],
 ) -> Design:
-    """See `design`."""
     settings = model.settings
     problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(fit))
     clock = Clock(settings.design.minutes if minutes is None else minutes)
@@ -192,7 +191,7 @@ def _alternatives(
         return []
     simulator: Any = problem.lanes.simulator
     names, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    options = (problem.ports, names, unit, problem.seed, problem.rules.family, report)
+    options = (problem.ports, names, unit, problem.seed, problem.rules.family, report, None, problem.timed)
     alternatives: list[Refit] = []
     with clock.part(LAWS_BY, "laws at ports"):
         search = replace(law_search(target, *options), most=1)

@@ -65,8 +65,8 @@ def evaluate(
 
     Args:
         model: simulated model.
-        options: keys of [training], such as the task. Without that table they are taken from the first policy's
-            training.
+        options: keys of [training], such as the task. Without that table the settings of the first policy's training
+        are used.
         fit: a calibration, or its folder, whose posterior provides the episodes' parameters.
         policies: policy.onnx, or folders that hold one; named after their folders, with parent folders if two names are
             equal.
@@ -131,7 +131,7 @@ def _task_of(policies: Sequence[Path]) -> dict[str, Any]:
 
 def _drop_limit(inherited: dict[str, Any]) -> list[str]:
     """Remove the tension limit from a training's definition of episodes, for a model without tensions. Returns a
-    sentence about it, or none without a limit.
+    sentence about the limit; empty without a limit.
     """
     limit = inherited.pop("tension_limit", None)
     if limit is None:
@@ -174,7 +174,7 @@ def _otherwise_trained(policies: Mapping[str, ExportedPolicy], integrator: str) 
 
 
 def _names(policies: Sequence[Path]) -> list[str]:
-    """Names of policies: their folders, with enough parent folders to be distinct."""
+    """Names of policies: folders, with enough parent folders to be distinct."""
     places = [p if p.is_dir() else (p.parent if p.stem == "policy" else p.with_suffix("")) for p in policies]
     parts = [place.resolve().parts for place in places]
     if len(set(parts)) < len(parts):

@@ -96,7 +96,7 @@ def with_counts(guess: Guess, counts: float | None, unit_given: bool) -> Guess:
     """A guess with the counts of one turn; whoever gives them, and no unit (``unit_given``), has commands in counts.
 
     Raises:
-        InputError: counts of one turn that are not positive, or are given for commands in another unit.
+        InputError: counts of one turn are not positive, or commands are in another unit than counts.
     """
     if counts is None:
         return guess
@@ -138,15 +138,16 @@ def write_first_files(
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
 
     Args:
-        folder: folder to write to; it is made.
+        folder: folder to create and write to.
         outline: the robot.
         recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
             third of the rows of a single recording.
-        commands: the file of commands of each, if they have any.
-        guess: guess of their columns, see `of_robot`; None without recordings, when random commands are simulated.
+        commands: files of commands, one for each recording, if separate.
+        guess: guess of the recordings' columns, see `of_robot`; None without recordings, if random commands are
+        simulated.
 
     Raises:
-        InputError: files of these names are there already, or the folder cannot be written to.
+        InputError: the files exist already, or the folder cannot be written to.
     """
     folder = output_folder(folder)
     robot, experiment = folder / f"{outline.name}.toml", folder / "experiment.toml"
@@ -400,7 +401,7 @@ def _clock(guess: Guess) -> list[str]:
 
 
 def _command_clock(guess: Guess) -> list[str]:
-    """The times of commands in a file of their own."""
+    """The times of commands in a separate file."""
     if guess.command_time is None:
         return []
     return [

@@ -31,10 +31,10 @@ def write_model_experiment(
 
     Args:
         model: file of the model, which is not moved.
-        folder: folder to write to; it is created.
+        folder: folder to create and write to.
         recordings: files to fit; the last of several is for testing.
-        commands: the file of commands of each, if they have any.
-        guess: guess of their columns; None without recordings.
+        commands: files of commands, one for each recording, if separate.
+        guess: guess of the recordings' columns; None without recordings.
 
     Returns:
         the file, and its assumptions.

@@ -1,7 +1,7 @@
-"""The robot as it is installed: zeros of its cables, its frame and its drives as parameters of the base model.
+"""The installed robot: zeros of cables, frame and drives as parameters of the base model.
 
-Every real robot has them, and no drawing has their values. Priors have the sizes of the robot and of its recording:
-shares of the largest pull and of the body's length, and angles of a frame that was put up by hand.
+Every real robot has these offsets, and no drawing gives their values. Prior widths depend on the robot and its
+recording: shares of the largest pull and of the body's length, and angles of a frame that was aligned by hand.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def installed_priors(
     """Lines of [model.priors] of a robot as it is installed.
 
     Args:
-        robot: robot whose lengths set their sizes.
+        robot: robot whose lengths set the sizes of the priors.
         recording: recording whose commands set the sizes of the cables' zeros.
         frame: frame in which a rod at rest explains that recording; priors are centred there.
-        assumed: answers of the robot's outline that were not given, which have wide priors.
+        assumed: unknown sizes of the robot, which get wide priors.
     """
     lines = []
 
@@ -96,13 +96,13 @@ def installed_priors(
 def parts_of(recording: Trajectory | None, recordings: int, *, rests: bool, timed: bool) -> list[dict[str, Any]]:
     """Rows of each entry of fit and test, the last of which is the test: ``rows`` and ``every``; empty for all rows.
 
-    Of a recording that stands alone the last third is the test. Poses without times have no order, so rows between the
+    The last third of a single recording is the test. Poses without times have no order, so rows between the
     fitted ones are the test if there are enough.
 
     Args:
         recording: the first recording.
         recordings: their number.
-        rests: whether every row is an equilibrium, so that a fit can leave out rows.
+        rests: whether every row is an equilibrium; a fit may then leave out rows.
         timed: whether rows have times.
     """
     count = 0 if recording is None else len(recording.time)

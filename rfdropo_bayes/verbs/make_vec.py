@@ -217,7 +217,7 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     """The posterior, or phi, of a run's folder or file, of which parameters are drawn.
 
     Raises:
-        InputError: it was fitted with another integrator than the simulator's.
+        InputError: the posterior was fitted with another integrator than the simulator's.
     """
     folder = source if source.is_dir() else source.parent
     file = source if source.is_file() and not phi else folder / POSTERIOR

@@ -45,7 +45,7 @@ SOLVED = 0.5  # least share of the rows in which the rod must have an equilibriu
 
 
 class Proposal(NamedTuple):
-    """Another arrangement of the commands: its agreement, the lines for it, and its alternatives in words."""
+    """Another arrangement of the commands: agreement, lines for the experiment file, and alternatives in words."""
 
     agreement: float
     lines: tuple[str, ...]
@@ -122,7 +122,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
     Args:
         spec: model of a robot; values are nominal or fixed.
         recordings: recordings in the base's frame; the first `MOST` are used.
-        columns: table used to read them.
+        columns: table that maps the recordings' columns.
 
     Raises:
         InputError: no common marker of robot and recordings.

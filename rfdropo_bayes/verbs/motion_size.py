@@ -34,7 +34,7 @@ class Size(NamedTuple):
         return self.measured / self.nominal
 
     def within(self, factor: float) -> bool:
-        """Whether both are of one size."""
+        """Whether both motions have the same size."""
         return 1.0 / factor <= self.ratio <= factor
 
 

@@ -56,7 +56,7 @@ class Finding(NamedTuple):
 
     @property
     def common_turn(self) -> float:
-        """By which the whole is turned [rad], -pi to pi: the mean over the sections."""
+        """Rotation of the whole robot [rad], -pi to pi: the mean over the sections."""
         return float(np.angle(np.mean(np.exp(1j * np.array(self.arrangement.turns)))))
 
     @property
@@ -158,7 +158,7 @@ class _Finder:
         return equals
 
     def alternatives(self, chosen: Arrangement) -> tuple[tuple[Arrangement, float], ...]:
-        """Arrangements unlike the chosen one that explain the motion as well."""
+        """Other arrangements that explain the motion as well as the chosen arrangement."""
         others = [each for each in neighbours(chosen, self.sections) if self._differs(each, chosen)]
         if not others:
             return ()

@@ -36,7 +36,7 @@ def start_of(robot: Robot, trajectory: Trajectory) -> Start:
 
 
 def _start(robot: Robot, markers: Sequence[str], first: Float[np.ndarray, "marker 3"]) -> Start:
-    """The same for markers at ``first`` [m], NaN if not seen."""
+    """The start of markers at ``first`` [m]; NaN for markers that were not seen."""
     chosen = [(index, list(markers).index(name)) for index, name in enumerate(robot.marker_names) if name in markers]
     seen = [(i, j) for i, j in chosen if np.isfinite(first[j]).all()]
     rest = robot.marker_points()[[i for i, _ in seen]]
@@ -85,7 +85,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     Args:
         robot: robot with the undeformed markers.
         trajectory: the recording, transformed by ``axes`` and ``origin``.
-        columns: table used to read it. A hint has the corrected line.
+        columns: table that maps the recording's columns. A hint has the corrected line.
     """
     start = start_of(robot, trajectory)
     length = robot.length
@@ -104,7 +104,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
 def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: CsvColumns) -> list[str]:
     """Lines of [data.columns], axes and origin, that bring a first row to the undeformed robot.
 
-    Empty if it is near already, or if no frame brings it near.
+    Empty if the first row is near already, or if no frame brings it near.
 
     Args:
         robot: robot with the undeformed markers.

@@ -176,7 +176,8 @@ def model_of(fit: Calibration) -> Model:
     """The model of a calibration.
 
     Raises:
-        InputError: its files do not describe the model, or the model has another integrator than the fit.
+        InputError: the files of the calibration do not describe the model, or the model has another integrator than the
+        fit.
     """
     if fit.model is not None:
         fitted = fitted_integrator(fit.record.attrs, fit.folder)

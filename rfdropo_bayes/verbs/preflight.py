@@ -1,10 +1,10 @@
 """Before a fit: parameter combinations that recordings cannot determine, measurements that would, and the cost of the
 fit.
 
-The derivatives of the measurements, at draws of the prior, give the Fisher information there. In coordinates in which
+The derivatives of the measurements at prior draws give the Fisher information at these draws. In coordinates in which
 the prior is a standard normal distribution (logarithms of scale parameters), with information :math:`F_d` at draw
 :math:`d`, a direction :math:`v` keeps the share :math:`\\sqrt{\\overline{v^T (1 + F_d)^{-1} v}}` of its prior standard
-deviation. Directions that keep most of it are undetermined. Further measurements add their own information. Posterior
+deviation. Directions that keep most of it are undetermined. Further measurements add information. Posterior
 variances are averaged, not informations: a draw with a snap-through may have more information than all others together.
 """
 
@@ -61,7 +61,7 @@ class Direction:
 
     @property
     def needs_own_measurement(self) -> bool:
-        """Whether it is a single parameter that nothing but a measurement of its own would determine."""
+        """Whether the direction is a single parameter that only a separate measurement would determine."""
         return len(self.together) == 1 and bool(self.ended_by) and all(BY_ITSELF in what for what in self.ended_by)
 
 
@@ -99,7 +99,7 @@ class Preflight:
         return rows
 
     def _undetermined(self) -> list[str]:
-        """Sentences; parameters that nothing but a measurement of their own would determine share one."""
+        """Sentences; parameters that only separate measurements would determine share one sentence."""
         lonely = [each for each in self.directions if each.needs_own_measurement]
         if len(lonely) < 2:
             return [direction.sentence for direction in self.directions]
@@ -172,7 +172,7 @@ def preflight(
         runs: recordings to fit.
         method: and ``rollouts``: its budget; by default from the model's experiment.
         seed: seed of the prior draws.
-        share: rows of ``runs`` over those of the fit, if they are some of its rows only.
+        share: number of rows in ``runs`` divided by the number in the fit.
 
     Raises:
         InputError: no parameter to infer, or no prior draw whose rollouts succeed.
@@ -373,9 +373,7 @@ def innovations(
     valid: Bool[np.ndarray, "time marker"],
     noise: _Noise,
 ) -> Float[np.ndarray, "time *many marker 3"]:
-    """Series whitened by white plus correlated noise: each row less its prediction from earlier rows (Kalman filter),
-    in linear time; zero for invalid rows.
-    """
+    """Series whitened under white plus correlated noise: innovations of a Kalman filter; zero for invalid rows."""
     whitened = np.zeros_like(series)
     mean, variance = np.zeros(series.shape[1:]), np.full(valid.shape[1], noise.lasting**2)
     for row, seen in enumerate(valid):
@@ -487,7 +485,7 @@ _OWN = f"nothing but the parameter {BY_ITSELF} would end it"
 
 
 def _sentence(parts: Mapping[str, float], smaller: int, logs: bool, kept: float, ended: Mapping[str, float]) -> str:
-    """A direction in words: its largest parts, and the number of smaller parts."""
+    """A direction in words: the largest parts, and the number of smaller parts."""
     names = list(parts)
     if len(names) == 1:
         subject = names[0]

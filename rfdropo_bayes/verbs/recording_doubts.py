@@ -30,12 +30,12 @@ FEWEST_DRAWS = 8  # least number of prior draws whose median may replace the nom
 def recording_cautions(
     robot: Workpiece, recordings: Sequence[Trajectory], columns: CsvColumns | None = None
 ) -> list[Caution]:
-    """Doubts about recordings: their reading, their first rows, and their commands.
+    """Doubts about recordings: about columns and units, first rows, and commands.
 
     Args:
         robot: recorded robot.
         recordings: recordings as read.
-        columns: table used to read them; None for formats that have none.
+        columns: table that maps the recordings' columns; None for formats without this table.
     """
     cautions = [
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
@@ -67,7 +67,7 @@ def cautions_of_fit(
 
 
 def cautions_of_audit(model: Model, recordings: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
-    """The same for an audit, with ``paths`` of the nominal model."""
+    """Doubts for an audit, with ``paths`` of the nominal model."""
     return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
 
 

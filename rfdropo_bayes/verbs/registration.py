@@ -54,7 +54,7 @@ class Frame(NamedTuple):
 
 
 class Registration(NamedTuple):
-    """How a recording lies to its robot at rest."""
+    """Frame and arrangement of a recording relative to its robot at rest."""
 
     # frame that brings the robot to the recording; None if the robot explains the motion in no frame
     frame: Frame | None
@@ -101,9 +101,9 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
 
     Args:
         spec: model of a robot that can be at rest.
-        recording: recording as it is read at present.
+        recording: recording, read with the present settings.
         scaled: whether the body's length is not known, so that lengths may be scaled.
-        bends: whether it is not known how far a command bends the body.
+        bends: whether the bending per command is unknown.
     """
     nothing = Registration(None)
     try:

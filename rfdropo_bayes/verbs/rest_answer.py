@@ -112,7 +112,7 @@ def _ways(fit: RestFit) -> list[str]:
 
 
 def estimate_words(estimate: Estimate) -> str:
-    """A parameter with its standard deviation, in its displayed unit."""
+    """A parameter with its standard deviation, in the displayed unit."""
     if estimate.logarithmic:
         return f"{display_name(estimate.name)} {estimate.value:.3g} {estimate.unit} (to {100.0 * estimate.sd:.2g} %)"
     factor, unit = SHOWN_UNITS.get(estimate.unit, (1.0, "" if estimate.unit == "-" else estimate.unit))

@@ -148,9 +148,9 @@ def fit_at_rest(
         robot: robot with the markers of all recordings.
         scopes: scopes of the inferred parameters.
         fit: recordings to fit.
-        test: unseen recordings; without any, errors are those of the fitted recordings.
+        test: unseen recordings; without these, errors are computed on the fitted recordings.
         late: delay [s] of the body behind its commands.
-        sent: commands of the channels from the recorded commands.
+        sent: map from recorded commands to commands of the channels.
     """
     scales = scales_of(scopes, [spec.name for spec in robot.simulator.parameters])
     every = rows_of(fit, robot.shown, late)

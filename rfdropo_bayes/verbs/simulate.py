@@ -123,7 +123,6 @@ def simulate_all(model: Model, out: Path, *, overwrite: bool = False) -> dict[st
 
 
 def _simulate_into(out: Path, model: Model) -> dict[str, Any]:
-    """See `simulate_all`."""
     simulator, measured = model.simulator, model.settings.data is not None
     values = physical_values(model.spec, simulator)
     sources = _sources(model)

@@ -15,7 +15,6 @@ from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import command_of, run_folder
-from rfdropo_bayes.policies.critic import varied_parameters
 from rfdropo_bayes.policies.episodes import Episodes
 from rfdropo_bayes.policies.evaluation import tension_sentence, without_end
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
@@ -118,8 +117,7 @@ def train(
             facts |= _tension_facts(training.best, table)
         policy = ExportedPolicy(export_policy(training.model, training.normalisation, layout, out / POLICY, facts))
         _check_parity(policy, training)
-        sees = varied_parameters(randomisation).names if table.critic == "parameters" else ()
-        summary = _summary(table, training, policy, facts) | {"critic_sees": list(sees)}
+        summary = _summary(table, training, policy, facts)
         summary["cautions"] = [caution.as_dict() for caution in cautions]
         curve_figure(training.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
@@ -168,7 +166,7 @@ def _summary(
 ) -> dict[str, Any]:
     return {
         "task": table.task,
-        "algorithm": table.algorithm,
+        "algorithm": "PPO",
         "steps": training.curve[-1]["steps"],
         "seconds": training.seconds,
         "diverged_episodes": training.diverged,

@@ -1,4 +1,4 @@
-"""``rfdropo view``: a rollout as pictures, an animation, or surfaces for ParaView."""
+"""``rfdropo view``: a rollout as a picture or an animation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import robot_of
 from rfdropo_bayes.model.experiment_file import ROBOT_COPY
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.report.motion import DrawnMotion, cube_corners, save_frames, save_vtk, smooth_line, upright
+from rfdropo_bayes.report.motion import DrawnMotion, cube_corners, smooth_line, upright
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
 from rfdropo_bayes.results.predicted import OBJECT
 from rfdropo_bayes.robots import Robot, known_robots
@@ -29,39 +29,28 @@ RATE = 20  # frames per second of an animation, in real time
 STILLS, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
-def run_view(
-    source: Path, out: Path, overrides: list[str], recording: str | None, robot: Path | None = None
-) -> list[Path]:
+def run_view(source: Path, out: Path, overrides: list[str], recording: str | None, robot: Path | None = None) -> None:
     """Draw a motion.
 
     Args:
         source: an experiment to simulate, or a NetCDF file of ``rfdropo simulate`` or ``rfdropo predict``, whose mean
             prediction is drawn.
-        out: .png, .svg or .pdf for several instants in one picture, .gif or .mp4 for an animation, a name that ends in
-            .vtk for a folder of surfaces, any other name for a folder of frames.
+        out: .png, .svg or .pdf for several instants in one picture, .gif or .mp4 for an animation.
         recording: name of the recording, if the experiment has several.
         robot: file of the robot, if a NetCDF file has none beside it and the robot is not bundled.
-
-    Returns:
-        the files written, the first to open first.
 
     Raises:
         InputError: bad input, or a format that needs a missing package.
     """
     motion = _from_file(source, robot) if source.suffix == ".nc" else _from_experiment(source, overrides, recording)
-    if out.suffix == ".vtk":
-        return save_vtk(motion, out)
-    if out.suffix == "":
-        return save_frames(motion, out, RATE)
     if out.suffix not in STILLS + ANIMATIONS:
-        known = ", ".join((*STILLS, *ANIMATIONS, ".vtk"))
-        raise InputError(f"unknown format {out.suffix!r}", where=str(out), remedy=f"use {known}, or a folder")
+        known = ", ".join((*STILLS, *ANIMATIONS))
+        raise InputError(f"unknown format {out.suffix!r}", where=str(out), remedy=f"use {known}")
     output_folder(out.parent)
     if out.suffix in STILLS:
         save_still(motion, out)
     else:
         save_animation(motion, out, RATE)
-    return [out]
 
 
 def _from_file(path: Path, robot: Path | None) -> DrawnMotion:

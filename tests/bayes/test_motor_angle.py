@@ -241,10 +241,10 @@ def test_a_mechanism_of_a_user_is_inside_the_drive_unless_it_says_otherwise():
     assert inside_drive(Own())
     Own.inside_drive = False
     assert not inside_drive(Own())
-    transmission = {"backlash", "cable_gain", "cable_slack", "spool_growth", "drive_creep", "drive_drift"}
-    transmission |= {"cable_gain_drift", "gain_drift", "guide_azimuth"}
-    actuation = {name for name, kind in REGISTRY.items() if kind.stage == "actuation"}
-    assert {name for name in actuation if not inside_drive(REGISTRY[name]())} == transmission
+    transmission = {"backlash", "cable_gain", "cable_slack", "spool_growth", "drive_creep", "drive_zero_drift"}
+    transmission |= {"cable_gain_drift", "command_gain_drift", "cable_slack_drift", "guide_azimuth"}
+    drive = {"command_delay", "actuator_lag", "command_gain", "end_stop", "travel_stop", "rate_limit"}
+    assert {name for name in transmission | drive if inside_drive(REGISTRY[name]())} == drive
 
 
 def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms():
@@ -286,9 +286,9 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
 def test_what_cannot_be_used_is_refused():
     with pytest.raises(InputError, match="has no motor angles"):
         MotorAngle.gather([recording(angles=False)], 200)
-    with pytest.raises(InputError, match="its commands are in m"):
+    with pytest.raises(InputError, match="the commands are in m"):
         MotorAngle.gather([recording(60, unit="m")], 60)
-    with pytest.raises(InputError, match="none of its motor angles is a new reading"):
+    with pytest.raises(InputError, match="no row has a new reading of the motor angles"):
         MotorAngle.gather([recording(60, hold=3).slice_rows(1, 2)], 2)
     silent = ServoAndBody()
     silent.tells = False

@@ -17,7 +17,7 @@ from rfdropo_bayes.robots import Robot
     ("unit", "settings", "message"),
     [
         ("m", {}, None),
-        ("rad", {}, "commands are in rad, the robot's in m"),
+        ("rad", {}, "recording has commands in rad, the robot in m"),
         ("m", {"mode": "shadow"}, "no drive has carried its commands out"),
     ],
 )

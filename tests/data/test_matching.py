@@ -41,8 +41,8 @@ def test_markers_are_those_that_all_recordings_share_in_the_robot_s_order(build)
             "m",
             r"made: recording has 2 channels of commands \(a, b\), robot has 1 channel of commands \(u\); list",
         ),
-        (["b", "a"], "m", "its commands are in the order a, b, the robot's are b, a; list"),
-        (["u", "v"], "rad", "the recording's commands are in m, the robot's in rad; correct command_unit"),
+        (["b", "a"], "m", "commands are in the order a, b, channels of the robot in the order b, a; list"),
+        (["u", "v"], "rad", "the recording has commands in m, the robot in rad; correct command_unit"),
     ],
 )
 def test_channels_that_do_not_fit(build, channels, unit, message):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
-from rfdropo_bayes.discrepancy.held_out import HELD_OUT_ROWS, later_rows
+from rfdropo_bayes.discrepancy.held_out import BLOCKS, HELD_OUT_ROWS, blocks_of_rows, later_rows
 from rfdropo_bayes.discrepancy.omnibus import block_squares
 from rfdropo_bayes.discrepancy.remainder import describe_remainder
 
@@ -58,3 +58,16 @@ def test_blocks_of_rows_are_as_large_as_noise_where_some_were_not_measured():
     np.testing.assert_allclose(found[:5], 1.0, atol=0.6)
     np.testing.assert_allclose(found[:2], 1.0, atol=0.25)
     assert np.isnan(found[5])
+
+
+def test_blocks_of_poses_share_all_measured_rows_evenly():
+    rng = np.random.default_rng(4)
+    valid = rng.random((2, 23, 1)) < 0.8
+    blocks = blocks_of_rows(valid)
+    assert len(blocks) == BLOCKS
+    np.testing.assert_array_equal(np.sum(blocks, axis=0), valid[:, :, 0].astype(int))
+    counts = np.array([block.sum(axis=1) for block in blocks])
+    assert np.ptp(counts, axis=0).max() <= 1
+    for block in blocks:  # of successive measured rows
+        for own, seen in zip(block, valid[:, :, 0], strict=True):
+            assert np.all(np.diff(np.flatnonzero(own[seen])) == 1)

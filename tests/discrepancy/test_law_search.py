@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -172,7 +173,7 @@ def test_a_model_that_is_far_off_is_told_no_size_of_a_signal(left, said):
 
 @pytest.mark.slow
 def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
-    """A search whose second term brings nothing: it is the first one again."""
+    """A search whose later terms bring nothing, because they are the first term again, ends after two of them."""
     question = asked(5, Pushed())
     target, base = base_model(question, question.seed)
     options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
@@ -180,8 +181,11 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     once = search.find(target, base)
 
     class Twice:
-        def find(self, *_):
-            return replace(once, terms=[*once.terms] * 2, afterwards=[*once.afterwards] * 2)
+        def laws(self, *_):
+            yield from (
+                replace(once, terms=[*once.terms] * count, afterwards=[*once.afterwards] * count)
+                for count in itertools.count(1)
+            )
 
     monkeypatch.setattr(described_module, "law_search", lambda *_: Twice())
     said = []
@@ -189,7 +193,7 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     assert found.holds
     assert [refit.term.port.name for refit in found.found.terms] == ["marker m3 x"]
     assert len(found.held_out.predictions) == 2
-    assert said == ["unseen recordings do not support more than 1 of 2 terms"]
+    assert said == ["unseen recordings do not support more than 1 of 3 terms: the search ends"]
 
 
 @pytest.mark.slow

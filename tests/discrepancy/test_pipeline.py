@@ -298,7 +298,7 @@ def test_an_audit_whose_time_is_up_before_a_refit_says_which_candidates_stand_ou
     assert (content["verdict"], content["out_of_time"], content["stopped"]) == ("no_verdict", True, "time")
     assert content["candidates"][0]["mechanism"] == "play"
     assert content["not_done"] == ["naming causes"]
-    assert "play stand" in content["sentence"]
+    assert "significant: play" in content["sentence"]
     assert "Not done: naming causes" in content["sentence"]
     assert "Not done: naming causes" in render_audit(shown(answer), content, "", "")
 

@@ -30,14 +30,23 @@ DRIVES = (
     "cable_slack",
     "drive_creep",
     "cable_gain_drift",
-    "drive_drift",
-    "gain_drift",
+    "cable_slack_drift",
+    "drive_zero_drift",
+    "command_gain_drift",
     "end_stop",
     "travel_stop",
     "rate_limit",
     "spool_growth",
 )
-CAMERAS = ("camera_drift", "camera_turn", "camera_zoom", "camera_offset", "clock_offset", "marker_offset", "sensor_lag")
+CAMERAS = (
+    "camera_offset_drift",
+    "camera_rotation_drift",
+    "camera_scale_drift",
+    "camera_offset",
+    "clock_offset",
+    "marker_offset",
+    "sensor_lag",
+)
 
 
 def applied(name: str, values: dict):
@@ -255,7 +264,7 @@ def test_markers_beside_their_places_turn_with_the_body():
 
 def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
     """Sizes are shares of usual commands, in their unit; the limit of a stop is in one over it."""
-    names = ["backlash", "cable_slack", "end_stop", "travel_stop", "spool_growth", "drive_drift", "rate_limit"]
+    names = ["backlash", "cable_slack", "end_stop", "travel_stop", "spool_growth", "drive_zero_drift", "rate_limit"]
     robots = [Robot.load(robot) for robot in ("smooth_arm", "asl_trunk")]
     cables, motors = (mechanisms_named(names, robot) for robot in robots)
     units = [spec.unit for mechanism in motors for spec in mechanism.parameters]
@@ -271,12 +280,12 @@ def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
 
 
 def test_a_drift_of_actuation_is_the_mechanism_with_the_size_of_each_step():
-    drifted = applied("gain_drift", {"command_gain_error_rate": jnp.asarray(0.2)})
+    drifted = applied("command_gain_drift", {"command_gain_error_rate": jnp.asarray(0.2)})
     elapsed = STEP * np.arange(1, len(COMMAND) + 1)[:, None]
     np.testing.assert_allclose(drifted, (1.0 + 0.2 * elapsed) * COMMAND, rtol=1e-12)
 
 
 def test_a_drift_of_a_camera_is_the_mechanism_with_the_size_of_each_row():
-    drifted = applied("camera_zoom", {"camera_scale_error_rate": jnp.asarray(0.01)})
+    drifted = applied("camera_scale_drift", {"camera_scale_error_rate": jnp.asarray(0.01)})
     elapsed = (TIME - TIME[0])[:, None, None]
     np.testing.assert_allclose(drifted, (1.0 + 0.01 * elapsed) * POSITION, rtol=1e-12)

@@ -287,3 +287,11 @@ def test_a_model_says_its_laws_as_a_file_has_them():
     simulator = build_robot_simulator(spec(given))
     (own,) = [each for each in simulator.parameters if each.name == "c"]
     assert (own.unit, own.nominal, own.prior) == ("m", 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0})
+
+
+def test_features_that_depend_on_seconds_are_those_that_another_clock_changes():
+    """A law of poses without times may follow the order of commands, and no clock."""
+    levels = jnp.asarray(np.random.default_rng(5).normal(size=(12, 2)).cumsum(axis=0))
+    for feature in dictionary(2, 1.0):
+        same = np.allclose(feature.over(levels, 0.1), feature.over(levels, 0.4))
+        assert same != feature.in_time, feature

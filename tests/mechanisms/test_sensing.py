@@ -41,6 +41,6 @@ def test_the_camera_drifts_from_the_first_row_whatever_its_clock_says():
     values = {
         f"camera_offset_{axis}_rate": jnp.asarray(speed) for axis, speed in zip("xyz", (0.01, 0.0, -0.02), strict=True)
     }
-    moved = REGISTRY["camera_drift"]().sense_over_time(values, POINTS, jnp.array([7.0, 7.5, 8.0, 9.0])) - POINTS
+    moved = REGISTRY["camera_offset_drift"]().sense_over_time(values, POINTS, jnp.array([7.0, 7.5, 8.0, 9.0])) - POINTS
     np.testing.assert_allclose(moved[0], 0.0, atol=1e-15)
     np.testing.assert_allclose(moved[3], np.broadcast_to([0.02, 0.0, -0.04], (3, 3)), atol=1e-12)

@@ -7,6 +7,7 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.mechanisms.sizes import POWERS, USUAL, Scales, scales_of, sized
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.mechanisms import obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 RATIOS = Scales(pull=3.0, length=3.0, mass=7.0, force=5.0)
@@ -35,7 +36,7 @@ def test_mechanisms_scale_as_their_units_do():
     small, large = arm(), arm(length=0.6, mass=0.7, modulus=1e6 * 5.0 / 9.0)
     assert np.array(scales_of(large)) / scales_of(small) == pytest.approx(np.array(RATIOS))
     before, after = priors(small), priors(large)
-    commanded = {"cable_slack", "backlash", "drive_drift"}
+    commanded = {"cable_slack", "backlash", "drive_zero", "cable_slack_rate", "drive_zero_rate"}
     for name, (unit, size) in before.items():
         if name in commanded or unit in POWERS:
             powers = np.array(Scales(1, 0, 0, 0) if name in commanded else POWERS[unit])
@@ -54,3 +55,12 @@ def test_a_usual_command_that_is_stated_sets_the_sizes_of_drives():
 def test_the_usual_trunk_keeps_its_numbers():
     spec = ParameterSpec("give", "m/N", 0.0, 0.1, 0.0, {"distribution": "HalfNormal", "scale": 5e-4}, "stretch")
     assert sized(spec, USUAL) == spec
+
+
+def test_a_mechanism_in_time_needs_rows_with_times():
+    """A lag and a drift have a time in the unit of a parameter; slack and a payload have none."""
+    robot = Robot.load("smooth_arm")
+    chosen = mechanisms_named(["actuator_lag", "camera_offset_drift", "rate_limit", "cable_slack", "payload"], robot)
+    whys = [obstacle(mechanism, "rod", "numba", "quasi-static", timed=False) for mechanism in chosen]
+    assert [why is None for why in whys] == [False, False, False, True, True]
+    assert all(obstacle(m, "rod", "numba", "quasi-static") is None for m in chosen)

@@ -6,57 +6,45 @@ from typing import Any
 
 import numpy as np
 import pytest
-import stable_baselines3
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies import parity
 from rfdropo_bayes.policies import training as run
-from rfdropo_bayes.policies.algorithms import algorithm_options
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy
 from rfdropo_bayes.policies.parity import check_exportable, difference, observations
+from rfdropo_bayes.policies.ppo import ppo_options
 from rfdropo_bayes.policies.training import Trained, train
 from rfdropo_bayes.policies.training_config import TrainingTable
 from tests.policies.toys import Points, layout
 
-SMALL = {"net_arch": [16], "learning_starts": 50, "buffer_size": 1000}
 SQUASHED = {"use_sde": True, "policy_kwargs": {"squash_output": True}}
 
 
-def untrained(algorithm: str, given: dict[str, Any], kind: str = "continuous", normalise: bool = True) -> Trained:
-    venv = Points(4, kind)
-    normalisation = VecNormalize(venv, epsilon=1e-4) if normalise else None
-    options = algorithm_options(algorithm, kind, 0.9, given, 4)
-    maker = getattr(stable_baselines3, algorithm)
-    return Trained(
-        maker("MlpPolicy", normalisation or venv, seed=0, device="cpu", **options), normalisation, [], 0, 0.0
-    )
+def untrained(given: dict[str, Any], kind: str = "continuous") -> Trained:
+    normalisation = VecNormalize(Points(4, kind), epsilon=1e-4)
+    model = PPO("MlpPolicy", normalisation, seed=0, device="cpu", **ppo_options(kind, 0.9, given, 4))
+    return Trained(model, normalisation, [], 0, 0.0)
 
 
 def check(policy: Trained, kind: str = "continuous") -> None:
     check_exportable(policy.model, policy.normalisation, policy.act, layout(kind))
 
 
-@pytest.mark.parametrize("normalise", [True, False])
 @pytest.mark.parametrize(
-    ("algorithm", "options"),
+    "options",
     [
-        ("SAC", SMALL | {"use_sde": True}),
-        ("SAC", SMALL | {"use_sde": True, "policy_kwargs": {"clip_mean": 0.5}}),
-        ("SAC", SMALL | {"use_sde": True, "policy_kwargs": {"clip_mean": 0.0}}),
-        ("PPO", {"use_sde": True}),
-        ("PPO", SQUASHED),
-        ("A2C", SQUASHED),
-        ("PPO", {"policy_kwargs": {"share_features_extractor": False, "net_arch": {"pi": [8], "vf": []}}}),
-        ("TD3", SMALL | {"net_arch": {"pi": [8, 8], "qf": [4]}, "activation": "elu"}),
-        ("DDPG", SMALL | {"net_arch": []}),
+        {"use_sde": True},
+        SQUASHED,
+        {"policy_kwargs": {"share_features_extractor": False, "net_arch": {"pi": [8], "vf": []}}},
     ],
 )
-def test_an_export_acts_as_the_model_where_its_limits_are_met(tmp_path, algorithm, options, normalise) -> None:
+def test_an_export_acts_as_the_model_where_its_limits_are_met(tmp_path, options) -> None:
     """As `predict` itself, with weights so large that a tanh differs from a limit by a quarter."""
-    policy = untrained(algorithm, options, normalise=normalise)
+    policy = untrained(options)
     check(policy)
     with torch.no_grad():
         for parameter in policy.model.policy.parameters():
@@ -92,52 +80,31 @@ class Features(BaseFeaturesExtractor):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "kind", "kwargs", "words"),
+    ("kind", "kwargs", "words"),
     [
-        ("PPO", "continuous", {"activation_fn": torch.nn.GELU}, "GELU"),
-        ("DQN", "discrete", {"activation_fn": torch.nn.Mish}, "Mish"),
-        ("SAC", "continuous", {"activation_fn": Absolute}, "Absolute"),
-        ("PPO", "continuous", {"features_extractor_class": Features}, "Features"),
-        ("PPO", "discrete", {"features_extractor_class": Features, "share_features_extractor": False}, "Features"),
-        ("SAC", "continuous", {"features_extractor_class": Features}, "Features"),
-        ("TD3", "continuous", {"features_extractor_class": Features}, "Features"),
-        ("DQN", "discrete", {"features_extractor_class": Features}, "Features"),
+        ("continuous", {"activation_fn": torch.nn.GELU}, "GELU"),
+        ("continuous", {"activation_fn": Absolute}, "Absolute"),
+        ("continuous", {"features_extractor_class": Features}, "Features"),
+        ("discrete", {"features_extractor_class": Features, "share_features_extractor": False}, "Features"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(algorithm, kind, kwargs, words) -> None:
-    given = {"policy_kwargs": kwargs} | ({} if algorithm == "PPO" else SMALL)
+def test_what_cannot_be_exported_is_refused(kind, kwargs, words) -> None:
     with pytest.raises(InputError, match=f"{words} cannot be exported"):
-        check(untrained(algorithm, given, kind), kind)
+        check(untrained({"policy_kwargs": kwargs}, kind), kind)
 
 
-def forgotten(layers: Any, squashed: bool, what: str) -> tuple[Any, bool]:
-    """Layers of a policy as an export would read them that has no notion of one."""
-    if what == "tanh":
-        return layers, False
-    return [*layers[:-1], layers[-1][:-1]], squashed
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "options", "what"),
-    [
-        ("PPO", SQUASHED, "tanh"),
-        ("SAC", SMALL, "tanh"),
-        ("SAC", SMALL | {"use_sde": True}, "hardtanh"),
-        ("DDPG", SMALL, "last tanh"),
-    ],
-)
-def test_an_export_that_leaves_out_a_layer_is_refused(monkeypatch, algorithm, options, what) -> None:
-    """The actions of an untrained policy are near zero, where none of these layers does anything."""
+def test_an_export_that_leaves_out_a_tanh_is_refused(monkeypatch) -> None:
+    """The actions of an untrained policy are near zero, where a tanh does nothing."""
     real = parity.policy_layers
-    policy = untrained(algorithm, options)
+    policy = untrained(SQUASHED)
     check(policy)
-    monkeypatch.setattr("rfdropo_bayes.policies.onnx_export.policy_layers", lambda model: forgotten(*real(model), what))
+    monkeypatch.setattr("rfdropo_bayes.policies.onnx_export.policy_layers", lambda model: (real(model)[0], False))
     with pytest.raises(InputError, match="would act otherwise"):
         check(policy)
 
 
 def test_an_export_without_the_limits_of_the_normalisation_is_refused(monkeypatch) -> None:
-    policy = untrained("PPO", {})
+    policy = untrained({})
     unlimited = VecNormalize(Points(4), epsilon=1e-4, clip_obs=1e9)
     monkeypatch.setattr(parity, "export_policy", lambda model, _, *rest: export_policy(model, unlimited, *rest))
     with pytest.raises(InputError, match="would act otherwise"):
@@ -145,19 +112,18 @@ def test_an_export_without_the_limits_of_the_normalisation_is_refused(monkeypatc
 
 
 def test_another_choice_among_discrete_actions_is_a_difference(tmp_path) -> None:
-    policy = untrained("DQN", SMALL, "discrete")
+    policy = untrained({}, "discrete")
     path = export_policy(policy.model, policy.normalisation, layout("discrete"), tmp_path / "policy.onnx", {})
     seen = observations(policy.normalisation, 2)
     assert difference(ExportedPolicy(path), policy.act, seen) is None
     assert "100%" in str(difference(ExportedPolicy(path), lambda seen: (policy.act(seen) + 1) % 3, seen))
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
-def test_the_check_leaves_a_training_as_it_was(tmp_path, monkeypatch, algorithm) -> None:
+def test_the_check_leaves_a_training_as_it_was(tmp_path, monkeypatch) -> None:
     """Weights, moments and random numbers: the curve is the same, bit for bit, without the check."""
-    given = {"use_sde": True} | (SMALL if algorithm == "SAC" else {"n_steps": 20, "net_arch": [16]})
+    given = {"use_sde": True, "n_steps": 20, "net_arch": [16]}
     sizes = {"steps": 320, "environments": 16, "evaluate_every": 160, "evaluation_episodes": 4}
-    table = TrainingTable(algorithm=algorithm, options=given, **sizes)
+    table = TrainingTable(options=given, **sizes)
     checked = train(Points, table, tmp_path / "checked", seed=1, gamma=0.9)
     monkeypatch.setattr(run, "check_exportable", lambda *rest: None)
     bare = train(Points, table, tmp_path / "bare", seed=1, gamma=0.9)
@@ -167,21 +133,18 @@ def test_the_check_leaves_a_training_as_it_was(tmp_path, monkeypatch, algorithm)
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "options", "words"),
+    ("options", "words"),
     [
-        ("PPO", {"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "cannot be stored in a file"),
-        ("PPO", {"policy_kwargs": {"squash_output": True}}, "only available when using gSDE"),
-        ("PPO", {"policy_kwargs": {"activation_fn": "gelu"}}, "PPO cannot be made"),
-        ("PPO", {"policy_kwargs": {"n_critics": 3}}, "unexpected keyword argument 'n_critics'"),
-        ("PPO", {"policy_kwargs": [1]}, "policy_kwargs is not a table"),
-        ("SAC", SMALL | {"net_arch": {"pi": [8]}}, "no key 'qf'"),
-        ("TD3", SMALL | {"action_noise": 0.1}, "action_noise is an object of Python"),
-        ("DDPG", SMALL | {"buffer_size": 10**13}, "Unable to allocate"),
+        ({"policy_kwargs": {"activation_fn": torch.nn.GELU}}, "cannot be stored in a file"),
+        ({"policy_kwargs": {"squash_output": True}}, "only available when using gSDE"),
+        ({"policy_kwargs": {"activation_fn": "gelu"}}, "PPO cannot be made"),
+        ({"policy_kwargs": {"n_critics": 3}}, "unexpected keyword argument 'n_critics'"),
+        ({"policy_kwargs": [1]}, "policy_kwargs is not a table"),
     ],
 )
-def test_options_that_make_no_policy_are_refused_in_one_line(tmp_path, algorithm, options, words) -> None:
+def test_options_that_make_no_policy_are_refused_in_one_line(tmp_path, options, words) -> None:
     with pytest.raises(InputError, match=words) as error:
-        train(Points, TrainingTable(algorithm=algorithm, options=options), tmp_path, seed=1, gamma=0.9)
+        train(Points, TrainingTable(options=options), tmp_path, seed=1, gamma=0.9)
     assert "[training.options]" in str(error.value)
     assert "\n" not in str(error.value)
 

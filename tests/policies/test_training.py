@@ -15,7 +15,6 @@ from scipy.stats import binomtest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies import onnx_export as export
 from rfdropo_bayes.policies import training as run
-from rfdropo_bayes.policies.algorithms import ALGORITHMS, algorithm_class, algorithm_options
 from rfdropo_bayes.policies.evaluation import (
     Case,
     Episode,
@@ -27,6 +26,7 @@ from rfdropo_bayes.policies.evaluation import (
     success,
 )
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
+from rfdropo_bayes.policies.ppo import ppo_options
 from rfdropo_bayes.policies.training import train
 from rfdropo_bayes.policies.training_config import TrainingTable
 from tests.policies.toys import STEP, Points, layout
@@ -177,21 +177,6 @@ def test_tensorboard_has_the_losses_and_the_evaluations(trained) -> None:
     assert sorted(tags["evaluation/reward"]) == pytest.approx(sorted(row["reward"] for row in policy.curve), rel=1e-5)
 
 
-def test_exploration_lasts_for_its_share_of_the_whole_run(tmp_path, monkeypatch) -> None:
-    """Half of four legs: after the first it is halfway down, after the second at its end."""
-    options = {"learning_starts": 100, "net_arch": [16], "exploration_fraction": 0.5, "exploration_final_eps": 0.0}
-    sizes = {"steps": 1600, "environments": 4, "evaluate_every": 400, "evaluation_episodes": 4}
-    table, rates, save = TrainingTable(algorithm="DQN", options=options, **sizes), [], run._save
-
-    def noted(model, *rest) -> None:
-        rates.append(model.exploration_rate)
-        save(model, *rest)
-
-    monkeypatch.setattr(run, "_save", noted)
-    train(partial(Points, kind="discrete"), table, tmp_path, seed=1, gamma=0.9)
-    assert rates == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=0.02)
-
-
 def test_a_kill_between_two_renames_loses_nothing(trained, tmp_path) -> None:
     source, _ = trained
     shutil.copytree(source / "checkpoints", tmp_path / "checkpoints.old")
@@ -230,22 +215,6 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, change, se
         train(Points, TABLE.model_copy(update=change), tmp_path, seed=seed, gamma=0.9, resume=True)
 
 
-def test_a_checkpoint_without_its_replay_buffer_is_refused(tmp_path) -> None:
-    options = {"learning_starts": 32, "net_arch": [8]}
-    shared = {
-        "algorithm": "SAC",
-        "options": options,
-        "environments": 16,
-        "evaluate_every": 64,
-        "evaluation_episodes": 2,
-    }
-    train(Points, TrainingTable(steps=64, **shared), tmp_path, seed=3, gamma=0.9)
-    (lost,) = tmp_path.rglob("replay.pkl")
-    lost.unlink()
-    with pytest.raises(InputError, match="has no replay"):
-        train(Points, TrainingTable(steps=64, **shared), tmp_path, seed=3, gamma=0.9, resume=True)
-
-
 class KilledEarly(Points):
     """Points whose process ends before the first checkpoint."""
 
@@ -273,28 +242,9 @@ def test_a_checkpoint_that_cannot_be_read_is_refused(tmp_path) -> None:
         train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)
 
 
-@pytest.mark.parametrize(
-    ("kind", "algorithm", "options"),
-    [
-        ("continuous", "PPO", OPTIONS),
-        ("discrete", "PPO", OPTIONS | {"activation": "elu"}),
-        ("continuous", "SAC", {"learning_starts": 100, "net_arch": [16]}),
-        ("continuous", "TD3", {"learning_starts": 100, "net_arch": [16]}),
-        ("discrete", "DQN", {"learning_starts": 100, "net_arch": [16]}),
-        ("continuous", "A2C", {"net_arch": [16]}),
-    ],
-)
-@pytest.mark.parametrize("normalise", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_an_exported_policy_acts_as_the_trained_one(tmp_path, kind, algorithm, options, normalise) -> None:
-    table = TrainingTable(
-        algorithm=algorithm,
-        options=options,
-        steps=640,
-        environments=16,
-        evaluate_every=640,
-        evaluation_episodes=4,
-        normalise=normalise,
-    )
+@pytest.mark.parametrize(("kind", "options"), [("continuous", OPTIONS), ("discrete", OPTIONS | {"activation": "elu"})])
+def test_an_exported_policy_acts_as_the_trained_one(tmp_path, kind, options) -> None:
+    table = TrainingTable(options=options, steps=640, environments=16, evaluate_every=640, evaluation_episodes=4)
     policy = train(partial(Points, kind=kind), table, tmp_path, seed=1, gamma=0.9)
     path = export_policy(policy.model, policy.normalisation, layout(kind), tmp_path / "policy.onnx", {"seed": "1"})
     exported = ExportedPolicy(path)
@@ -415,20 +365,12 @@ def test_the_table_has_a_row_for_every_policy_and_case() -> None:
     assert median_episode(episodes).distance == np.sort([e.distance for e in episodes])[2]
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "words"),
-    [("PPo", "continuous", "did you mean 'PPO'"), ("SAC", "discrete", "cannot drive"), ("DQN", "continuous", "use")],
-)
-def test_algorithms_that_do_not_fit_are_refused(name, kind, words) -> None:
-    with pytest.raises(InputError, match=words):
-        algorithm_class(name, kind)
-
-
-def test_options_are_checked_by_name_for_every_algorithm() -> None:
-    for name in ALGORITHMS:
-        kind = "discrete" if name == "DQN" else "continuous"
-        assert algorithm_options(name, kind, 0.95, {"gamma": 0.9})["gamma"] == 0.9
-        with pytest.raises(InputError, match="did you mean 'learning_rate'"):
-            algorithm_options(name, kind, 0.95, {"learning_rat": 1.0})
-        with pytest.raises(InputError, match="unknown activation"):
-            algorithm_options(name, kind, 0.95, {"activation": "rulu"})
+def test_options_are_checked_by_name() -> None:
+    assert ppo_options("discrete", 0.95, {"gamma": 0.9})["gamma"] == 0.9
+    for wrong, words in (
+        ({"learning_rat": 1.0}, "did you mean 'learning_rate'"),
+        ({"activation": "rulu"}, "unknown activation"),
+        ({"rollout_buffer_class": "mine"}, "is an object of Python"),
+    ):
+        with pytest.raises(InputError, match=words):
+            ppo_options("continuous", 0.95, wrong)

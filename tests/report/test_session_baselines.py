@@ -47,7 +47,7 @@ def test_recordings_of_other_commands_are_not_copied():
     *_, found = of_a_day(COMMAND[::-1])
     assert found["first_row"].test is not None
     assert found["copied"].test is None
-    assert "no fitted recording has its commands" in found["scaled_copy"].reason
+    assert "no fitted recording has the same commands" in found["scaled_copy"].reason
 
 
 def test_a_marker_that_was_lost_in_an_earlier_day_is_not_copied():

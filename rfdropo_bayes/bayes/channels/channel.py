@@ -1,4 +1,4 @@
-"""Interface of every channel of measurements: parameters, residuals, density, and a draw of its noise."""
+"""Interface of every channel of measurements: parameters, residuals, density, and draws of the noise."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Channel(ABC):
     @property
     @abstractmethod
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of its noise and of its gain."""
+        """Parameters of the channel's noise and gain."""
 
     @property
     @abstractmethod
@@ -69,12 +69,10 @@ class Series(Channel):
 
     @property
     def measured(self) -> Float[Any, "recording time *reading"]:
-        """See `Channel.measured`."""
         return self.readings
 
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Channel.specs`."""
         return self.gain_specs + (() if self.known is not None else self.noise_specs)
 
     @property
@@ -85,11 +83,11 @@ class Series(Channel):
     @property
     @abstractmethod
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of its noise, if inferred."""
+        """Inferred parameters of the channel's noise."""
 
     @property
     def independent(self) -> bool:
-        """Whether its noise is independent from row to row and from column to column."""
+        """Whether the channel's noise is independent between rows and between columns."""
         return self.known is not None and self.known.order == 0 and self.known.correlation is None
 
     @abstractmethod
@@ -110,7 +108,7 @@ class Series(Channel):
 
     @abstractmethod
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """Its noise as a known one, at values of its parameters, in rows that are ``step`` seconds apart."""
+        """The channel's noise at given values of its parameters, in rows that are ``step`` seconds apart."""
 
     def log_size(
         self, about: Float[Any, "recording time *reading"], measured: Float[Any, "recording time *reading"]
@@ -119,7 +117,7 @@ class Series(Channel):
         return None
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Series:
-        """The same channel of some recordings, and of their first rows, only."""
+        """The channel restricted to some recordings and their first rows."""
         own = {"readings": self.readings[index, :rows], "valid": self.valid[index, :rows]}
         return replace(self, **own, known=self.known_of(index))
 
@@ -161,7 +159,6 @@ class Series(Channel):
         return jnp.concatenate([white, size_residuals(size, self.log_size(measured, measured), self.valid)], axis=-1)
 
     def row_log_density(self, seen: Seen, measured: Float[Any, "recording time *reading"]) -> Float[Array, " time"]:
-        """See `Channel.row_log_density`."""
         about = self.expected(seen)
         white, scale = self.whiten(self.deviation(measured, about), seen.values)
         size = self.log_size(about, measured)
@@ -176,23 +173,19 @@ class WhiteSeries(Series):
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.noise_specs`."""
         return (self.size,)
 
     @property
     def independent(self) -> bool:
-        """See `Series.independent`."""
         return self.known is None or super().independent
 
     def whiten_inferred(
         self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
     ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
-        """See `Series.whiten_inferred`."""
         size = values[self.size.name]
         return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
 
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """See `Series.stated`."""
         return Autoregression(np.full(self.valid.shape[-1], values[self.size.name]), np.ones(1), STATED, np.inf)
 
     def draw_errors(self, key: PRNGKeyArray, values: Mapping[str, Any]) -> Float[Any, "recording time column"]:
@@ -217,10 +210,10 @@ def padded_readings(
         length: rows.
         needed: number of recordings, from the first, that must have readings; all by default.
         read: readings of one recording and their mask; None without readings.
-        key: key of [model] that makes them data; words: their name.
+        key: key of [model] that uses the readings as data; words: name of the readings.
 
     Raises:
-        InputError: a recording without readings that needs them.
+        InputError: a recording lacks the readings.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     for index, trajectory in enumerate(trajectories):
@@ -246,7 +239,8 @@ def size_residuals(
 ) -> Float[Any, "recording time column"]:
     """Residuals whose squares add to twice the logarithms of the sizes, up to a constant; zero if not valid.
 
-    With them the log likelihood is a sum of squares but for terms in the noise alone, as Gauss-Newton wants it.
+    With these residuals the log likelihood is a sum of squares, plus terms of the noise alone, as Gauss-Newton
+    requires.
     """
     return jnp.where(valid, jnp.sqrt(2.0 * (ABOVE_ZERO + size - (0.0 if read is None else read))), 0.0)
 

@@ -51,7 +51,7 @@ class Markers(Series):
         """The positions of other recordings, under the same noise.
 
         Raises:
-            InputError: known noise, and a marker of which it is not known.
+            InputError: the noise is known, but not for all markers.
         """
         known = self.known
         if known is not None:
@@ -59,23 +59,19 @@ class Markers(Series):
         return self.gather(recordings, self.model, known)
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Markers:
-        """See `Series.of_recordings`."""
         readings, valid = self.readings[index, :rows], self.valid[index, :rows]
         recordings = self.recordings.of(index, rows)
         return replace(self, readings=readings, valid=valid, recordings=recordings, known=self.known_of(index))
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.noise_specs`."""
         return noise_specs(self.model)
 
     @property
     def independent(self) -> bool:
-        """See `Series.independent`."""
         return self.model == "white" if self.known is None else super().independent
 
     def expected(self, seen: Seen) -> Float[Any, "recording time marker 3"]:
-        """See `Series.expected`."""
         return seen.observation.position
 
     def deviation(
@@ -87,7 +83,6 @@ class Markers(Series):
     def whiten_inferred(
         self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
     ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
-        """See `Series.whiten_inferred`."""
         noise = noise_values(self.model, values)
         residual = errors.reshape(*errors.shape[:2], -1, 3)
         white, scale = jax.vmap(lambda r, line: whiten(r, noise, line))(residual, self.recordings.line)
@@ -110,7 +105,6 @@ class Markers(Series):
         return draw_noise(key, time, markers, noise_values(self.model, values))
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time marker 3"]:
-        """See `Channel.draw`."""
         keys = jax.random.split(key, len(self.readings))
         noise = jax.vmap(lambda k, t: self.draw_noise(k, t, seen.values))(keys, jnp.asarray(self.recordings.time))
         return jnp.where(self.recordings.line.valid[..., None], self.expected(seen) + noise, 0.0)
@@ -126,7 +120,6 @@ class Markers(Series):
 
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
-        """See `FeatureChannel`."""
         return self.valid
 
     def features(self, readings: Float[Any, "recording time marker 3"]) -> Float[Any, "recording time feature"]:
@@ -136,11 +129,9 @@ class Markers(Series):
     def draw_features(
         self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
     ) -> Float[Array, "time feature"]:
-        """See `FeatureChannel`."""
         return self.draw_noise(key, time, values).reshape(len(time), -1)
 
     def feature_deviation(self, values: Mapping[str, Any]) -> Float[np.ndarray, " feature"]:
-        """See `FeatureChannel`."""
         if self.known is not None:
             return self.known.scale
         return np.full(3 * self.readings.shape[2], float(noise_values(self.model, values).deviation))

@@ -42,7 +42,7 @@ class MotorAngle(WhiteSeries):
     def gather(cls, trajectories: Sequence[Trajectory], length: int, needed: int | None = None) -> MotorAngle:
         """Motor angles of recordings padded to ``length`` rows; only the first ``needed`` recordings must have them.
 
-        They belong to the columns of commands, and these to the robot's channels, in the order in which they stand.
+        Columns of angles follow the order of the columns of commands, which follow the order of the robot's channels.
 
         Raises:
             InputError: a recording without motor angles, or commands that are no angles.
@@ -53,7 +53,7 @@ class MotorAngle(WhiteSeries):
                 return None
             if trajectory.command_unit != "rad":
                 raise InputError(
-                    f"its commands are in {trajectory.command_unit}: motor angles inform commands in rad only",
+                    f"the commands are in {trajectory.command_unit}; motor angles need commands in rad",
                     where=trajectory.name,
                     remedy="leave [model] motor_angle = true out, or give the commands as angles of the motors",
                 )
@@ -61,7 +61,7 @@ class MotorAngle(WhiteSeries):
             valid = np.ones(angle.shape, dtype=bool) if mask is None else mask
             if not valid.any():
                 raise InputError(
-                    "none of its motor angles is a new reading",
+                    "no row has a new reading of the motor angles",
                     where=trajectory.name,
                     remedy="resample less coarsely: only rows with a new reading count",
                 )
@@ -90,5 +90,4 @@ class MotorAngle(WhiteSeries):
         return measured - about
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
-        """See `Channel.draw`."""
         return jnp.where(self.valid, self.expected(seen) + self.draw_errors(key, seen.values), 0.0)

@@ -1,10 +1,11 @@
 """Measured poses of a pushed body: effects of contact that the robot's markers do not show.
 
-The body starts at its first measured pose (`Placing.with_object_at`); its centre and its turn since then are measured.
+The pushed body starts at its first measured pose (`Placing.with_object_at`). Channels are its centre and its rotation
+since then.
 Model errors of a push are correlated in time, since a body at rest keeps its pose: the noise is an Ornstein-Uhlenbeck
 process (`bayes.noise`) with its own sizes and its own correlation time. If the noise of the positions is white, this
-noise is also white, and `inference.modes.lasting` weights the rows: noise as long as the recording would also absorb a
-wrong push.
+noise is also white, and `inference.modes.lasting` weights the rows: noise that lasts for the whole recording would also
+absorb a wrong push.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Placing(Protocol):
     """A simulator whose object can be placed at a measured pose.
 
     Attributes:
-        pushes: whether it has an object.
+        pushes: whether the simulator has an object.
     """
 
     pushes: bool
@@ -109,7 +110,7 @@ class ObjectPose(Series):
             seen = np.isfinite(pose).all(axis=1)
             if not seen[0]:
                 raise InputError(
-                    "its first row has no pose of the pushed body",
+                    "the first row has no pose of the pushed body",
                     where=trajectory.name,
                     remedy="remove [model] object_pose = true, or start at a row in which the body is seen",
                 )
@@ -136,7 +137,6 @@ class ObjectPose(Series):
         return cls(pose, np.repeat(counted[..., None], 6, axis=-1), line=line, time=time, lasting=lasting)
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> ObjectPose:
-        """See `Series.of_recordings`."""
         line = Timeline(*(part[index, :rows] for part in self.line))
         readings, valid = self.readings[index, :rows], self.valid[index, :rows]
         time, known = self.time[index, :rows], self.known_of(index)
@@ -144,12 +144,10 @@ class ObjectPose(Series):
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.noise_specs`."""
         return (OBJECT_NOISE, OBJECT_TURN_NOISE, *([OBJECT_CORRELATION_TIME] if self.lasting else []))
 
     @property
     def independent(self) -> bool:
-        """See `Series.independent`."""
         return not self.lasting if self.known is None else super().independent
 
     def expected(self, seen: Seen) -> Float[Any, "recording time 7"]:
@@ -192,21 +190,18 @@ class ObjectPose(Series):
         return np.concatenate([used[..., :3].sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None], turn], axis=-1)
 
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """See `Series.stated`."""
         sizes = np.repeat([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]], 3)
         tau = values.get(OBJECT_CORRELATION_TIME.name)
         memory = [] if tau is None else [float(np.exp(-step / tau))]
         return Autoregression(sizes, np.array([1.0, *memory]), STATED, np.inf, step=step)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time 7"]:
-        """See `Channel.draw`."""
         clean, keys = self.expected(seen), jax.random.split(key, len(self.readings))
         drawn = jax.vmap(lambda k, p, t: draw_object_error(k, p, t, seen.values, self.known))
         return jnp.where(self.line.valid, drawn(keys, clean, jnp.asarray(self.time)), 0.0)
 
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
-        """See `FeatureChannel`."""
         return np.repeat(self.line.valid, 6, axis=-1)
 
     def features(self, readings: Float[Any, "recording time 7"]) -> Float[Any, "recording time feature"]:

@@ -87,7 +87,6 @@ class Orientation(WhiteSeries):
 
     @property
     def gain_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.gain_specs`."""
         return FRAME_TURNS
 
     def expected(self, seen: Seen) -> Float[Any, "recording time reading"]:
@@ -115,13 +114,11 @@ class Orientation(WhiteSeries):
         return turns.reshape(*turns.shape[:2], -1)
 
     def draw_errors(self, key: PRNGKeyArray, values: Mapping[str, Any]) -> Float[Any, "recording time column"]:
-        """See `WhiteSeries.draw_errors`."""
         if self.known is not None:
             return super().draw_errors(key, values)
         return values[self.size.name] * jax.random.normal(key, self.valid.shape)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time reading"]:
-        """See `Channel.draw`."""
         errors = self.draw_errors(key, seen.values)
         turns = of_rotation_vector(errors.reshape(*errors.shape[:2], -1, 3))
         return product(turns, _quaternions(self.expected(seen))).reshape(self.readings.shape)

@@ -21,8 +21,9 @@ def product(a: Float[Array, "... 4"], b: Float[Array, "... 4"]) -> Float[Array, 
 
 
 def turn_between(first: Float[Any, "... 4"], second: Float[Any, "... 4"]) -> Float[Any, "... 3"]:
-    """Twice the vector of the quaternion from one turn to another: of a small one the rotation vector [rad], and of a
-    large one without a singularity."""
+    """Twice the vector of the quaternion from one turn to another: the rotation vector [rad] for small turns, without a
+    singularity for large turns.
+    """
     between = product(second, inverse(first))
     return 2.0 * jnp.where(between[..., 3:] < 0.0, -1.0, 1.0) * between[..., :3]
 

@@ -88,11 +88,9 @@ class Tension(WhiteSeries):
 
     @property
     def gain_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.gain_specs`."""
         return (TENSION_GAIN,)
 
     def expected(self, seen: Seen) -> Float[Any, "recording time cable"]:
-        """See `Series.expected`."""
         gain = seen.values.get(TENSION_GAIN.name, TENSION_GAIN.nominal)
         return gain * seen.observation.tension[..., self.cables]
 
@@ -105,11 +103,9 @@ class Tension(WhiteSeries):
     def log_size(
         self, about: Float[Any, "recording time cable"], measured: Float[Any, "recording time cable"]
     ) -> Float[Any, "recording time cable"]:
-        """See `Series.log_size`."""
         return jnp.log(reading_size(about, self.valid, measured))
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time cable"]:
-        """See `Channel.draw`."""
         clean = self.expected(seen)
         error = self.draw_errors(key, seen.values)
         return jnp.where(self.valid, clean + error * reading_size(clean, self.valid, clean), 0.0)

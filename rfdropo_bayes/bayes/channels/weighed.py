@@ -1,4 +1,4 @@
-"""Parts that were weighed, and other sums of parameters known from a measurement of their own.
+"""Weighed parts, and other sums of parameters known from separate measurements.
 
 With cables that impose a displacement, all stiffnesses and masses times one factor give the same motion. A mass from a
 balance fixes the factor, as a tension reading does.
@@ -23,7 +23,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Weighed(NamedTuple):
-    """A parameter, or the sum of several, known from a measurement of its own."""
+    """A parameter, or a sum of parameters, known from a separate measurement."""
 
     parameters: tuple[str, ...]  # names; their sum was measured
     value: float  # measured value in their unit
@@ -38,7 +38,7 @@ class WeighedParts(Channel):
     entries: tuple[Weighed, ...]
 
     def named(self, inferred: Sequence[ParameterInfo]) -> WeighedParts:
-        """The same, each parameter by the name under which it is inferred.
+        """The weighings with the names under which parameters are inferred.
 
         The whole recording's name denotes its only piece: ``payload_mass@a`` for ``payload_mass@a[0:99]``.
 
@@ -73,12 +73,10 @@ class WeighedParts(Channel):
         return (measured - self._sums(seen.values)) / self._sd
 
     def row_log_density(self, seen: Seen, measured: Float[Any, " weighed"]) -> Float[Array, " 1"]:
-        """See `Channel.row_log_density`."""
         normaliser = np.sum(np.log(self._sd * np.sqrt(2.0 * np.pi)))
         return (-0.5 * jnp.sum(self.residuals(seen, measured) ** 2) - normaliser)[None]
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Array, " weighed"]:
-        """See `Channel.draw`."""
         return self._sums(seen.values) + self._sd * jax.random.normal(key, (len(self.entries),))
 
 

@@ -2,8 +2,8 @@
 
 Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
 predicted from the min(k, p) rows before it (Levinson-Durbin). Noise shared by columns, such as from a shaking mount,
-has the memory of the other columns (a separable covariance); across a gap in some of the columns alone its whitening is
-approximate.
+has the memory of the other columns (a separable covariance); whitening is approximate across a gap in only some
+columns.
 
 Memory is defined in seconds, not in rows: in recordings of another rate each row is predicted under the autocorrelation
 at its own lags (`Autoregression.at`).
@@ -64,7 +64,7 @@ class Autoregression:
 
     @property
     def doubtful(self) -> bool:
-        """Whether it was taken from residuals of a model that change more slowly than the noise of a measurement."""
+        """Whether the noise was estimated from a model's residuals that change more slowly than measurement noise."""
         slow = self.source == RESIDUALS and self.remembered > SLOW
         return slow or self.source == INNOVATIONS
 
@@ -100,7 +100,7 @@ class Autoregression:
         return self if self.paces is None else replace(self, paces=tuple(self.paces[i] for i in index))
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values without recordings; `from_dict` is the inverse."""
+        """The noise as plain values without recordings; `from_dict` is the inverse."""
         arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
         values = {name: None if array is None else array.tolist() for name, array in arrays.items()}
         freedom = self.freedom if np.isfinite(self.freedom) else None
@@ -127,8 +127,8 @@ class Autoregression:
     def _autocorrelation_at(self, pace: Float[Any, "..."]) -> Float[Any, "... lag"]:
         """Autocorrelation at lags of rows that are ``pace`` steps apart.
 
-        It is linear between the lags of steps, which keeps the process stationary (its spectrum is the periodic one
-        times a squared sinc); of a first-order process whose memory is positive it is exact.
+        The autocorrelation is interpolated linearly between whole lags. The process stays stationary (the periodic
+        spectrum times a squared sinc). Interpolation is exact for a first-order process with positive memory.
         """
         numbers: Any = jnp if isinstance(pace, jax.Array) else np
         lags = numbers.asarray(pace)[..., None] * np.arange(self.order + 1)
@@ -191,7 +191,7 @@ class Autoregression:
     def separate(
         self, innovations: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[Any, "*batch time column"]:
-        """Innovations of which each column has its own; `gather` undoes it."""
+        """Independent innovations of each column; `gather` is the inverse."""
         return innovations if self.correlation is None else mixed(innovations, valid, self.correlation, -0.5)
 
     def gather(
@@ -264,7 +264,7 @@ def rows_before(valid: Bool[np.ndarray, "*batch time column"]) -> np.ndarray:
 
 
 def _pace(ratio: Any, numbers: Any) -> Any:
-    """Time between rows in steps: exactly one for rows of one rate."""
+    """Time between rows in steps: exactly 1 if all rows have the same rate."""
     same = (ratio < ONE_RATE) & (ratio > 1.0 / ONE_RATE)
     return numbers.where(same, 1.0, ratio) if numbers is jnp else (1.0 if same else ratio)
 
@@ -311,7 +311,7 @@ def estimate_noise(
         freedom_share: degrees of freedom per value: (n - 1) / n for deviations from the mean of n repeats.
         source: source of the deviations.
         steps: time between rows of each series [s]; with several rates, memory is estimated from the series of the rate
-            that has the most values. All of one unknown rate by default.
+            that has the most values. By default all recordings have the same, unknown rate.
         order: order of the process; by default with the smallest BIC up to `MAX_ORDER`.
         pooled: whether all columns have the same standard deviation; by default chosen by BIC.
         shared: whether columns share noise; None to test it.

@@ -3,7 +3,7 @@
 ``auto`` is the sum of white noise and of a stationary Ornstein-Uhlenbeck process (AR(1) for evenly spaced rows), equal
 for every coordinate of every marker. It becomes ``white`` if the correlated part vanishes, and ``ar1`` if the white
 part vanishes. Its density given the rows before comes from a Kalman filter with one state (Sarkka, Bayesian Filtering
-and Smoothing, 2013, section 4.3), which takes irregular and masked rows as they are. ``ar1`` needs no filter: given the
+and Smoothing, 2013, section 4.3), which handles irregular and masked rows. ``ar1`` needs no filter: given the
 last valid row, ``gap`` seconds before, the residual is normal with mean ``phi r`` and variance ``sigma^2 (1 - phi^2)``,
 ``phi = exp(-gap / tau)``. ``student-t`` is independent in time; its tails absorb single outliers.
 """
@@ -83,7 +83,7 @@ LONG_AGO = 1e6
 
 
 class Timeline(NamedTuple):
-    """For every row and marker: is it valid, which valid row came before it, and how long ago."""
+    """For every row and marker: whether the row is valid, the last valid row before, and the time between them."""
 
     valid: Bool[np.ndarray, "time marker"]  # False for masked positions
     previous: Int[np.ndarray, "time marker"]  # index of the last valid row before; its own index if there is none

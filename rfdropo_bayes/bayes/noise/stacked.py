@@ -1,4 +1,4 @@
-"""The known noise of several channels side by side: each has its own memory, and shares no noise with another."""
+"""The known noise of several channels side by side: the channels have different memories and independent noise."""
 
 from __future__ import annotations
 
@@ -44,7 +44,6 @@ class Stacked:
         return side_by_side([len(part.scale) for part in self.parts])
 
     def at(self, steps: Sequence[float] | Float[np.ndarray, " recording"]) -> Stacked:
-        """See `Autoregression.at`."""
         return Stacked(tuple(part.at(steps) for part in self.parts))
 
     def whiten(
@@ -53,13 +52,11 @@ class Stacked:
         valid: Bool[np.ndarray, "*rest time column"],
         count: Float[np.ndarray, "*rest time column"] | None = None,
     ) -> Float[np.ndarray, "*batch time column"]:
-        """See `Autoregression.whiten`."""
         return self._each(lambda part, *own: part.whiten(*own), series, valid, *([] if count is None else [count]))
 
     def colour(
         self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
     ) -> Float[np.ndarray, "*batch time column"]:
-        """See `Autoregression.colour`."""
         return self._each(lambda part, x, ok: part.colour(x, ok), white, valid)
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time column"]:

@@ -43,7 +43,7 @@ class Plant(Protocol):
             duration: time since the last call [s]; 0 at the first, which starts at rest with these lengths.
 
         Raises:
-            InputError: if it has no state at the end.
+            InputError: the plant has no state at that time.
         """
         ...
 
@@ -81,7 +81,7 @@ def build_plant(name: str, robot: Robot, settings: Mapping[str, Any] | None = No
     """The plant of that name: "springs", or MODULE:CALLABLE, called with the robot and the settings.
 
     Raises:
-        InputError: if there is no such plant, or it does not take the settings.
+        InputError: the plant does not exist, or does not take the settings.
     """
     try:
         if name == "springs":
@@ -116,7 +116,7 @@ class PlantHere:
 
 
 class PlantProcess:
-    """A plant in its own process, which drives never wait for: they get the newest state that it has sent.
+    """A plant in a separate process. Drives never wait for the plant: they use the newest state that it has sent.
 
     A plant slower than real time lags behind; ``late`` is the delay.
 
@@ -159,7 +159,7 @@ class PlantProcess:
         return self._sent - self._answered
 
     def close(self) -> None:
-        """End the process: it exits by itself once requests stop, and is terminated otherwise."""
+        """End the process, which exits by itself once requests stop, and is terminated otherwise."""
         self._pipe.close()
         self._process.join(_END)
         self._process.terminate()

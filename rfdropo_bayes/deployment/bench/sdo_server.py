@@ -40,7 +40,7 @@ class StrictNode(canopen.LocalNode):
         """An object.
 
         Raises:
-            SdoAbortedError: if it is not in the data sheet.
+            SdoAbortedError: the object is not in the data sheet.
         """
         return self._find_object(index, subindex)
 

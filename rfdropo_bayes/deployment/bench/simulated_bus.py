@@ -232,7 +232,7 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
     """The drives in their own process; yields the bus to find them on.
 
     Raises:
-        InputError: if they do not start; includes their output.
+        InputError: the drives do not start; the message includes their output.
     """
     with tempfile.TemporaryDirectory(prefix="rfdropo_") as folder:
         ready, errors = Path(folder) / "ready", Path(folder) / "errors"

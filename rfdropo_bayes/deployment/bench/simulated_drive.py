@@ -100,7 +100,7 @@ class SimulatedDrive:
             self.state = DriveState.SWITCH_ON_DISABLED  # "disable drive function": the motor coasts
 
     def fail(self, code: int) -> None:
-        """Transitions 13 and 14: the reaction of this drive takes no time, since gear and drum hold themselves."""
+        """Transitions 13 and 14: this drive reacts at once, since gear and drum are self-locking."""
         self.state, self.velocity = DriveState.FAULT, 0.0
         self.error_code = int(code)
         self._node.emergency(code, register=0x21)

@@ -1,7 +1,7 @@
 """A CANopen node in software: object dictionary, process data applied on SYNC, guards, faults on request.
 
 The object dictionary and the SDO server are canopen's (`sdo_server`); everything that they lack (PDOs linked to the
-dictionary, NMT, SYNC, heartbeats both ways, emergencies) is here. Power and motion of its axes are `SimulatedDrive`'s.
+dictionary, NMT, SYNC, heartbeats both ways, emergencies) is here. `SimulatedDrive` has the power and motion of an axis.
 One thread feeds it: `receive` for every frame, `tick` between.
 """
 

@@ -202,7 +202,7 @@ def factor(pattern, pivot, lower, token):
 
 @mesh_kernel
 def forward_substitute(pattern, pivot, lower, token):
-    """Turn border row 0, written anew after `factor`, into (L^-1 b)'."""
+    """Replace border row 0, a new row b' after `factor`, by (L^-1 b)'."""
     for column in range(len(pattern.first) - 1):
         block = pattern.first[column + 1] - pattern.border
         t, j = 9 * block, 6 * column
@@ -298,8 +298,8 @@ def extend_border(pattern, pivot, lower, rows, panels, reached, count, token):
 
 @kernel
 def condense_rows(pattern, target, rows, panels, others, other_panels, own, reached, count, token):
-    """``target`` = products of `extend_border`'s rows and others, in tiles by columns: the same rows if ``own``, else
-    the rows of the factor's border.
+    """Write products of the rows of `extend_border` into ``target``, in tiles by columns: with the same rows if
+    ``own``, else with the rows of the factor's border.
     """
     zero = fill(0.0, target, token)
     for tile in range(panels * other_panels):

@@ -78,7 +78,7 @@ def _factor_tile(target, row, block, pivot_row, length, token):
 def eliminate(pivot, coupling, border, condensed, station, last, panels, active, token):
     """Factorise one station and carry it over to the next, ``station - 1``, and to the condensed matrix.
 
-    ``panels`` is the height of the border, of which the first ``active`` are not zero here. ``last`` says that no
+    ``panels`` is the height of the border; only its first ``active`` rows are not zero. ``last`` says that no
     station follows.
     """
     p, b = station * BLOCK, station * panels * PANEL

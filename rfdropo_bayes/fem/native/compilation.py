@@ -114,7 +114,7 @@ class DeferredCompiler(CompilerBase):
 
 
 class WholeCompiler(DeferredCompiler):
-    """As `DeferredCompiler`, for the kernel at the top."""
+    """Like `DeferredCompiler`, for the outermost kernel."""
 
     lowering = WholeLowering
 

@@ -1,8 +1,8 @@
 """Which compilers the kernels of rods take: ours, or Numba's own if ours do not fit the installed Numba.
 
 Ours (`compilation`) rest on private parts of Numba. They are used without asking with the versions that they are tested
-with. With another version a small program is compiled and run first; if that fails in any way, Numba compiles the
-kernels its own way, which takes longer to compile and gives the same numbers. See CONTRIBUTING.md.
+with. With another version of Numba a small program is compiled and run first. If that fails, Numba's standard compiler
+is used, which is slower and gives the same numbers. See CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TESTED = ((0, 68),)
 
 
 class Compilers(NamedTuple):
-    """Compilers of kernels, and of functions that only kernels call; both take options of `njit`."""
+    """Compilers of kernels (`whole`) and of functions that only kernels call (`part`), with options of `njit`."""
 
     name: str
     part: Callable[..., Any]
@@ -45,7 +45,7 @@ def chosen_compilers(wanted: str | None, version: str) -> Compilers:
         version: version of Numba.
 
     Raises:
-        InputError: another word, or "ours" if they do not fit.
+        InputError: an unknown word, or "ours" with a version of Numba that the compilers do not support.
     """
     if wanted not in (None, "", OURS, NUMBA):
         raise InputError(f"{wanted!r} is not a compiler", where=VARIABLE, remedy=f"use {OURS} or {NUMBA}, or unset it")

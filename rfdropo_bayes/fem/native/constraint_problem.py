@@ -145,8 +145,8 @@ def _line(p, i, cables, velocity, token):
 
 @kernel
 def _contact_state(p, c, u, v, w, token):
-    """Quantities of a contact at a relative velocity: impulses if it sticks, their tangential size, the normal impulse
-    if it slides, and friction.
+    """Quantities of a contact at a relative velocity: impulses in sticking, their tangential size, the normal impulse
+    in sliding, and friction.
     """
     friction, one = load(p.friction, 0, token), fill(1.0, p.free, token)
     y = (-load(p.opening, c, token) - u) * load(p.normal, c, token)
@@ -416,12 +416,13 @@ def _residual(p, lines, n, token):
 
 @kernel
 def _doubt(p, lines, n, rounding, settled, each, token):
-    """Slope along the change that rounded velocities would make: all by the ``rounding`` of the largest velocity, or
-    ``each`` by the rounding of its own size.
+    """Slope of the problem's function that rounding errors of velocities would cause: all errors with the ``rounding``
+    of the largest velocity, or ``each`` relative to its own velocity.
 
-    Loose cables at 3 m/s are no scale for a cube at rest, whose contacts go from sticking to sliding within 1 um/s: in
-    single precision 19 of 512 prior draws of TrunkPush do not converge in steps of SDIRK2 with the largest, 4 with
-    each. With the largest it is 3 in implicit Euler, on whose digits recordings and policies rest.
+    The velocity of loose cables (3 m/s) is no scale for a cube at rest, whose contacts change from sticking to sliding
+    within 1 um/s. In single precision with SDIRK2, 19 of 512 prior draws of TrunkPush do not converge with the largest
+    velocity, and 4 with each. The largest number is 3 in implicit Euler; stored recordings and policies depend on its
+    digits.
     """
     zero, total = fill(0.0, p.free, token), fill(0.0, p.free, token)
     for i in range(n):

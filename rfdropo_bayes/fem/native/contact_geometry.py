@@ -86,7 +86,7 @@ def _place_frame(touch, slot, x, y, z, token):
 
 @kernel
 def _list(touch, slot, pair, gap, x, y, z, nx, ny, nz, token):
-    """Write a candidate: its gap, its place from the cube's centre, and its normal."""
+    """Write a candidate: gap, place relative to the cube's centre, and normal."""
     touch.pair[slot] = pair
     store(touch.gap, slot, gap)
     store(touch.arm, 3 * slot, x, y, z)

@@ -110,8 +110,9 @@ def rod_scene(scene: PushGeometry, dtype: type) -> ContactScene:
 
 
 def mesh_scene(scene: PushGeometry, number: Int[np.ndarray, " nodes"], dtype: type) -> ContactScene:
-    """Tables of a scene whose spheres are bound to the nodes of a mesh; ``number``: of every node in the engine's
-    order."""
+    """Tables of a scene whose spheres are bound to nodes of a mesh; ``number`` has each node's index in the engine's
+    order.
+    """
     spheres = scene.spheres
     weight = np.concatenate([spheres.centre[..., None], spheres.gradient], axis=2)
     first, within, place, values = [0], [], [], []

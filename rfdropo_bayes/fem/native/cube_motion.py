@@ -79,7 +79,9 @@ def stop_cube(touch, p, lines, contacts, token):
 
 @kernel
 def remember_impulses(scene, touch, p, lines, contacts, narrow, accepted, token):
-    """Keep the impulses of a step that was taken, in space: the next step starts from them, and friction continues."""
+    """Keep the impulses of an accepted step, in space. The next step starts from these impulses, so that friction
+    continues.
+    """
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     for i in range(3 * (CORNERS + 2 * scene.spheres)):
         store(touch.memory, i, zero)
@@ -95,7 +97,7 @@ def remember_impulses(scene, touch, p, lines, contacts, narrow, accepted, token)
 
 @kernel
 def find_impacts(touch, p, lines, contacts, token):
-    """Impulses of contacts into ``before``, as far as they are impacts: as they change the closing speed."""
+    """Copy the impact part of contact impulses, which changes the closing speed, into ``before``."""
     for c in range(contacts):
         slot, i = touch.contact[c], lines + 3 * c
         start = load(touch.rate, 3 * slot, token)
@@ -133,8 +135,9 @@ def predict_cubes(touch, time, token):
 
 @kernel
 def _move_cube(touch, time_step, moved, lane, lanes):
-    """Let the cube move on with ``after``, less the share of its velocity and spin with which it has ``moved`` already;
-    see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
+    """Move the cube with the velocity and spin ``after`` minus the share with which the cube has ``moved`` already; see
+    ``fem.rigid_body.moved``. Returns False if that leads nowhere.
+    """
     wx, wy, wz = (
         0.5 * time_step * (touch.after[3 * lanes + lane] - moved * touch.cube[10 * lanes + lane]),
         0.5 * time_step * (touch.after[4 * lanes + lane] - moved * touch.cube[11 * lanes + lane]),

@@ -105,7 +105,7 @@ def kernel_folder() -> Path:
 
 
 def kept_for_user(kernel: Any) -> Any:
-    """The same kernel, kept in the user's folder if that can be written to and no other was chosen."""
+    """The same kernel, cached in the user's folder if that is writable and no other folder was chosen."""
     folder = kernel_folder()
     if os.environ.get("NUMBA_CACHE_DIR"):
         return kernel

@@ -23,8 +23,9 @@ IMPORT = re.compile(rb"^from (\S+) import", re.MULTILINE)
 
 
 def kernel_sources(module: str) -> str:
-    """Digest of a module of kernels, of all modules of kernels that it imports, directly or not, and of the modules
-    that these take their constants from; and of the compiler that is used."""
+    """Digest of a module of kernels, of all imported modules of kernels and their sources of constants, and of the
+    compiler.
+    """
     sources: dict[str, bytes] = {}
     waiting = [f"{__package__}.{module}"]
     while waiting:

@@ -393,8 +393,9 @@ def _less_turn(rows, matrix, token):
 
 @kernel
 def _turning(rows, token):
-    """How the forces of a section and of its cables turn with it: force by rotation of the middle, moment by that
-    (lower half), and moment by the rotations of both sections; in leading order."""
+    """Geometric terms of a section and its cables, in leading order: force by rotation of the middle, moment by
+    rotation of the middle (lower half), and moment by the rotations of both sections.
+    """
     force = plus(load3(rows, NET, token), combined(rows, DIRECTOR, load3(rows, STRESS, token), token))
     moment = plus(load3(rows, NET + 3, token), combined(rows, DIRECTOR, load3(rows, STRESS + 3, token), token))
     half = fill(0.5, rows, token)

@@ -115,7 +115,7 @@ def _row_of(i, slips, corners, lines, cables):
 
 @kernel
 def _condense(tables, rows, work, p, n, panels, slips, corners, top, token):
-    """Add the extra rows to the problem: their products with each other, the cables and the right-hand side."""
+    """Add the extra rows to the problem: products with each other, with cable rows and with the right-hand side."""
     held, cables, others = tables.held, tables.cables, tables.panels
     lines = cables + slips
     extend_border(work.pivot, work.coupling, rows.border, held, top, panels, token)

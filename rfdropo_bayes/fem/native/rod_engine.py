@@ -260,7 +260,7 @@ class NativeRod:
         return self.with_output(Run(batch, cubes, schedule))
 
     def with_output(self, run: Run) -> Run:
-        """The same run with allocated output."""
+        """A run with allocated output."""
         count, records = run.batch.count, 1 + run.schedule.steps // run.schedule.stride
         output = RodOutput(
             np.zeros((count, records, self.points, 3)),

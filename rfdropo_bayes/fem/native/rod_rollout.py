@@ -1,4 +1,4 @@
-"""Rollouts of a rod: one lane block from its parameters to the recorded motion, or continued from its state."""
+"""Rollouts of a rod: one lane block, from parameters or from a state to the recorded motion."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ class RodSession:
         return self.memory.transpose(0, 2, 1).reshape(-1, self.memory.shape[1])[: self.count].copy()
 
     def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """Set lanes to rows of the result of `save`, of this or another session of the same body and effects.
+        """Set lanes to rows that `save` returned, in this session or in another session of the same body and effects.
 
         Raises:
             InputError: a session that was not started, or a state of another body or precision.

@@ -1,7 +1,7 @@
 """Static equilibrium of a rod in SIMD lanes: where a rollout starts, and every row of a quasi-static motion.
 
-Newton's method, with all that turns with the sections in leading order. A lane that has come to rest is not moved
-again: how long others take changes nothing of it.
+Newton's method, with all that turns with the sections in leading order. A lane at rest is not moved again, so its
+result does not depend on other lanes.
 """
 
 from __future__ import annotations
@@ -203,7 +203,8 @@ def _set_least(tables, samples, work, token):
 @kernel
 def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
     """Find the equilibrium from the present state in at most ``most`` iterations, to the increment ``bound`` relative
-    to the body's length. A lane that missed an earlier equilibrium is not moved: its rollout counts as failed.
+    to the body's length. A lane without an equilibrium in an earlier row is not moved, and its rollout counts as
+    failed.
     """
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)

@@ -30,7 +30,7 @@ LARGEST = 1e30
 
 @kernel
 def turn_station(work, station, a, token):
-    """Turn a section by a rotation vector in space: right to fifth order in its angle."""
+    """Turn a section by a rotation vector in space, accurate to fifth order in the angle."""
     t, one = 4 * station, fill(1.0, work.turn, token)
     a = scaled(a, fma(dot(a, a), 1.0 / 24.0, 0.5 * one))
     w, q = load(work.turn, t, token), load3(work.turn, t + 1, token)

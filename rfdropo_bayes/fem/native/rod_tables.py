@@ -1,6 +1,6 @@
 """Constants of a rod, its cables and its recorded points for the kernels: arrays in the precision of the kernels.
 
-A station has six velocities: its section's velocity and its spin, both in space. It has twelve rows of `frame`: the
+A station has six velocities: velocity and spin of the section, both in space. It has twelve rows of `frame`: the
 position of the centre line and the three directors, the columns of the section's rotation. A material point is a sum of
 such rows with fixed weights.
 """

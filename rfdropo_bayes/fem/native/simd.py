@@ -1,12 +1,12 @@
 """A vector of lanes as a value inside compiled kernels: one lane is one sample, and lanes never mix.
 
 A `Simd` value is an LLVM vector of 32- or 64-bit floats. The arithmetic operators act lane by lane; a plain number met
-on the way fills all lanes. Nothing is reordered or contracted behind the kernel's back: fused multiply-add happens only
-for `fma` and `fnma`, so that a lane's result depends neither on its neighbours nor on the compiler's inlining.
+on the way fills all lanes. The compiler neither reorders nor contracts operations: only `fma` and `fnma` become fused
+multiply-adds. So a lane's result depends neither on other lanes nor on inlining.
 
 Kernels keep their data in C-contiguous arrays ``(n, lanes)``, or know their `addresses`, and move rows with `load` and
-`store`. The number of lanes must be known to the compiler: kernels take it as the tuple made by `lane_token`, whose
-length is part of its type.
+`store`. The compiler must know the number of lanes: kernels take a tuple, made by `lane_token`, whose length is part of
+its type.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ ALIGNMENT = 64
 def kernel(function: Callable, **options: bool) -> Callable:
     """Decorator of functions that only kernels call.
 
-    They have no wrappers for calls from Python. With our compilers they become machine code only in the `whole` that
-    they are part of.
+    They have no wrappers for calls from Python. With our compilers, parts become machine code only inside a `whole`.
     """
     return COMPILERS.part(function, nogil=True, error_model="numpy", no_cpython_wrapper=True, **options)
 
@@ -174,7 +173,7 @@ def addresses(typing_context, record):
     """A named tuple of arrays as one of bare addresses, its numbers as they are.
 
     Arrays are structures whose owners are counted; handing addresses from kernel to kernel compiles several times
-    faster. An address takes one index and knows no bounds. The arrays must outlive it.
+    faster. An address takes one index, without a check of bounds. The arrays must outlive the address.
     """
 
     def bare(kind):

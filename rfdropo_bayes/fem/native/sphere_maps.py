@@ -3,7 +3,8 @@ body.
 
 A sphere of a mesh follows the affine motion of nodes around it; a sphere of a rod is bound to sections. An entry of a
 sphere is a triple of the body's velocities. Entries of a rod come in pairs, translation and spin of a section.
-``gradient``, of the scene, is None for a rod and ``arm`` for a mesh: the compiled kernel lacks a part that is None.
+The scene's ``gradient`` is None for a rod, and ``arm`` is None for a mesh; the compiled kernel omits parts that are
+None.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def _mesh_entry(scene, offset, way, centre, k, r):
 
 @kernel
 def _rod_entry(scene, touch, offset, way, entry, k, r, token):
-    """Entry of a section: of its translation as it is, else of its spin."""
+    """Entry of a section: unchanged for its translation, with a lever for its spin."""
     if scene.place[k] % SIZE == 0:
         return entry
     lever = load3(touch.lever, 3 * (k - 1), token)

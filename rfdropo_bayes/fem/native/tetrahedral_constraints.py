@@ -214,7 +214,7 @@ def end_stage(scene, touch, work, p, cables, contacts, free, schedule, stage, la
 
 @kernel
 def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, stage, schedule, token):
-    """As `hold`, for the residual of a step's solution: the change of the impulses since."""
+    """Like `hold`, for the residual of a step's solution, with the change of the impulses since then."""
     n = cables + 3 * contacts
     for i in range(cables):
         store(p.free, i, load(work.slack, i, token))

@@ -1,7 +1,8 @@
 """Rollouts of a tetrahedral body in SIMD lanes: cables, the stages of a step, and one lane block through all steps.
 
-In single precision the elimination loses digits that the motion of a long soft body needs: there the stage is refined
-once. Its residual costs one pass over the elements, without tangents, and the factor is used again.
+In single precision the elimination loses digits that the motion of a long soft body needs. In single precision each
+stage is therefore refined once. Its residual costs one pass over the elements, without tangents, and the factor is used
+again.
 """
 
 from __future__ import annotations
@@ -108,7 +109,8 @@ def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
 def set_targets(cables, commanded, share, work, token):
     """Displacement that a stage imposes on every cable, a share of the way to the commanded one.
 
-    The commanded one may differ from that measured a step before by no more than ``rate``, and never exceeds the limit.
+    The commanded displacement may differ from the displacement measured a step before by at most ``rate``, and never
+    exceeds the limit.
     """
     one = fill(1.0, work.position, token)
     for c in range(len(cables.limit)):

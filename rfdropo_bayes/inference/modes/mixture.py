@@ -1,9 +1,9 @@
-"""Several optima: which of them explain the data about as well, and how a posterior mixes them.
+"""Several optima: selection of the optima that explain the data about equally well, and their weights in a posterior.
 
-Densities alone do not decide this. Errors of a simulator last from row to row, so that neighbouring rows repeat one
-piece of evidence: under white noise optima that follow the data equally well lie hundreds of nats apart. Optima are
-therefore compared by the rows' log densities, whose differences are as certain as their autocorrelation lets them be
-(as the differences between models of Vehtari, Gelman & Gabry 2017, for series).
+Densities alone do not decide this. Errors of a simulator are correlated between rows. Under white noise, optima that
+explain the data equally well then differ by hundreds of nats. Optima are therefore compared by sums over rows of
+differences of log densities, with standard errors that include the autocorrelation (Vehtari, Gelman & Gabry 2017, for
+series).
 """
 
 from __future__ import annotations

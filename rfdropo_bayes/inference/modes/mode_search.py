@@ -239,7 +239,7 @@ def _heights(problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger
     """Log posterior of a prefix at some points.
 
     Raises:
-        NoLikelihoodError: none has a positive likelihood.
+        NoLikelihoodError: no start has a positive likelihood.
     """
     density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
     if not np.isfinite(density).any():
@@ -604,8 +604,9 @@ def _with_scales(
     config: LaplaceConfig,
     key: PRNGKeyArray,
 ) -> tuple[Draws, list[Laplace]]:
-    """Draws of a hierarchy whose modes were found at fixed standard deviations, and the modes in the order of their
-    evidence once these are integrated out."""
+    """Draws of a hierarchy with modes at fixed standard deviations; and the modes in the order of their evidence after
+    the standard deviations are integrated out.
+    """
     members = [[problem.names.index(name) for name in whole.scales[scale]] for scale in fixed]
     order_key, *keys = jax.random.split(key, len(modes) + 1)
     values = np.array(list(fixed.values()))

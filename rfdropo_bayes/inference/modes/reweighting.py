@@ -62,8 +62,7 @@ def reweighted(
         ledger: counts rollouts, and candidates without a likelihood.
         count: number of draws.
 
-    Returns:
-        None if there are too few candidates, or none has a posterior density.
+    Returns: None for too few candidates, or if no candidate has a posterior density.
     """
     if candidates < FEWEST_CANDIDATES:
         return None

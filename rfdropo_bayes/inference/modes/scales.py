@@ -1,9 +1,9 @@
 """Standard deviations of groups of coordinates, integrated out of a normal approximation instead of optimised.
 
-The joint mode of a hierarchy is no place to approximate it at: a standard deviation runs to zero there, or to the end
-of its prior. Given the standard deviations, the group parameters are as normal as the others. The optimisation
-therefore fixes the standard deviations. Their posterior follows from the likelihood's quadratic form at the mode, which
-does not depend on them (nested Laplace approximation, Rue, Martino & Chopin 2009).
+A hierarchy cannot be approximated at its joint mode, at which a standard deviation is zero or at the end of its prior.
+Given the standard deviations, the group parameters are as normal as the others. The optimisation therefore fixes the
+standard deviations. Their posterior follows from the likelihood's quadratic form at the mode, which does not depend on
+them (nested Laplace approximation, Rue, Martino & Chopin 2009).
 """
 
 from __future__ import annotations

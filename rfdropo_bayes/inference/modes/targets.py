@@ -53,7 +53,6 @@ class Target(NamedTuple):
     bounds: tuple[Any, Any] = UNBOUNDED  # lowest and highest value of each coordinate
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
-        """See `Optimisable.along`."""
         differences = self.differences
         if differences is None:
             return None
@@ -68,7 +67,6 @@ class Target(NamedTuple):
         return self._replace(linearise=linearise)
 
     def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
-        """See `Optimisable.quadratic`."""
         residual, jacobian = self.linearise(u)
         jacobian = _known(jacobian)
         gradient = -jacobian.T @ residual

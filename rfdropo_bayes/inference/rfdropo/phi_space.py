@@ -100,7 +100,7 @@ def search_space(
     """Search ranges: the given ranges, else the central 99 % of the prior, which lie inside the bounds, like the
     paper's.
 
-    Hard bounds are not suitable: they exclude the impossible and span decades, whereas a search range is linear.
+    Hard bounds exclude impossible values and span decades; a search range is linear and needs narrower bounds.
 
     Raises:
         InputError: an unknown parameter, or a range that is empty or outside the bounds.

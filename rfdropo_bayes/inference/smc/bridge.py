@@ -1,13 +1,13 @@
 """The bridge: tempered SMC from Student-t distributions around known optima to the posterior.
 
-The start is close to the posterior, so few stages are needed, all at the full horizon: an evidence with a small
-deviation for a small part of the rollouts that a start at the prior takes. Only the few particles that start at the
-prior can reach modes that no optimisation found.
+The start is close to the posterior, so few stages are needed, all at the full horizon. The evidence is precise, and
+takes a small part of the rollouts of a start at the prior. Only the few particles that start at the prior can reach
+modes that no optimisation found.
 
 Particles move in logarithms of positive parameters. Data that determine a product or a ratio of parameters, such as
 stiffness over mass, leave a thin ridge. In logarithms it is a straight line, which a covariance can describe; in
-coordinates that bend towards the bounds of a prior it is a curve, on which a sampler hardly moves. The disadvantage
-is a wall at each bound: there is no density beyond it.
+coordinates that bend towards the bounds of a prior it is a curve, on which a sampler hardly moves. The disadvantage is
+a wall at each bound, beyond which the density is zero.
 
 The curvature of the prior at an optimum is a poor guide in directions without information from the likelihood. Along a
 ridge between two bounds the optimum lies at an end, and the density falls off within a short distance of it. Each
@@ -55,7 +55,8 @@ NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, 
 class BridgedProblem(ProblemDefaults):
     """A problem whose "prior" is a `ModeMixture` of another, in its coordinates.
 
-    Its one row is ``log prior + log likelihood - log mixture``, so that its evidence is the other's.
+    The problem has one row, ``log prior + log likelihood - log mixture``, and the same evidence as the original
+    problem.
     """
 
     def __init__(self, problem: Problem, modes: list[Laplace]) -> None:
@@ -136,8 +137,8 @@ def sample_from_modes(
 class ModeMixture:
     """Inflated Student-t distributions around modes, with a share of draws from the prior.
 
-    The prior's share is a defence: modes that no optimisation found still have particles, and every weight of the
-    posterior against the mixture is bounded by the likelihood over that share.
+    The prior has a share as a safeguard: unfound modes still have particles, and importance weights are bounded by the
+    likelihood over that share.
 
     Args:
         problem: problem whose prior is mixed in.

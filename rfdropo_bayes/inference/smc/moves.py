@@ -70,8 +70,8 @@ def adapt_scale(scale: float, acceptance: float, target: float) -> float:
 def host_generator(key: PRNGKeyArray) -> np.random.Generator:
     """NumPy generator that is a function of a JAX key.
 
-    Population bookkeeping runs on the host: it is cheap, and its shapes change from run to run, so that compiling it
-    would take longer than running it.
+    Population bookkeeping runs in NumPy: the shapes change from run to run, and compilation would take longer than the
+    computation.
     """
     return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
 
@@ -204,7 +204,7 @@ class StraightProblem:
 
 
 class BlockProblem(ProblemDefaults):
-    """Blocks of a problem's rows as its rows, added by a sampler in shares: it tempers a whole block at once."""
+    """A problem whose rows are blocks of another problem's rows; a sampler tempers a whole block at once."""
 
     def __init__(self, problem: StraightProblem, horizons: tuple[int, ...]) -> None:
         self.problem, self.horizons = problem, horizons

@@ -57,8 +57,8 @@ class SmcConfig(MethodOptions, called="SMC"):
     Attributes:
         rollouts: budget in full-length rollouts, of all replicates together; None for no limit.
         particles: number per replicate; None takes the largest number that the budget allows, or 1000 without a budget.
-        replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation. None
-            takes up to four as the budget allows, or 1 without a budget: see `decided`.
+        replicates: independent repetitions, the chains of the posterior; their scatter is the deviation of the
+            evidence. None takes up to four as the budget allows, or 1 without a budget: see `decided`.
         blocks: number of times the horizon is lengthened.
         start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
         draws: least number of draws; fewer particles are moved further with the rest of a budget: see

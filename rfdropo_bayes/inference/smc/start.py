@@ -208,8 +208,8 @@ class Way(NamedTuple):
 def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray, ledger: Ledger) -> Way:
     """The way to a posterior that is as sharp as the likelihood at the best of `PRIOR_DRAWS` prior draws.
 
-    Noise is taken at its prior's median: with the noise that fits such a draw the likelihood would be far too flat.
-    About log scales of noise, m residuals hold the information 2 m.
+    Noise parameters are at the prior median, since the noise that fits a prior draw would make the likelihood far too
+    flat. About log scales of noise, m residuals hold the information 2 m.
 
     Args:
         problem: problem to sample.

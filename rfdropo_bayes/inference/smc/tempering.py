@@ -122,9 +122,9 @@ def advance(population: Population, stop: float, *, leap: bool) -> tuple[Populat
 def cross_references(population: Population) -> tuple[Reference, Reference]:
     """References for the moves of the first and of the second half of the particles, each fitted to the other half.
 
-    A proposal fitted to the very particles that it moves is not independent of them: second-order errors of its
-    d (d + 1) / 2 covariances then bias the evidence, by about -20 / N nats a stage in 8 dimensions (measured; crosswise
-    the same runs show a fifth of it, which is the scatter's own share).
+    A proposal that is fitted to the particles that it moves depends on them. Errors of its d (d + 1) / 2 covariances
+    then bias the evidence by about -20 / N nats a stage in 8 dimensions (measured). With references from the other
+    half, a fifth of this remains, the effect of scatter alone.
     """
     n = len(population.log_weights)
     weights = np.exp(population.log_weights)
@@ -270,8 +270,7 @@ def next_step(
         longest: length of the step to the end of the path.
         target: effective sample size to keep, as a share of the particles that have weight at the end of the path.
 
-    Returns:
-        the length, and whether it reaches the end of the path with the target kept.
+    Returns: the length, and whether the end of the path is reached at the target effective size.
     """
     end = log_weights_at(longest)
     alive = np.isfinite(end)

@@ -1,4 +1,4 @@
-"""Other simulators: their names in an experiment, and adapters that make each a `BlackBox`.
+"""Other simulators: names for experiment files, and adapters that make a `BlackBox`.
 
 An adapter is a callable that returns a `BlackBox`. A bundled adapter is chosen by the suffix of a model's file; any
 other adapter is named, ``package.module:attribute`` or ``file.py:attribute``, and gets the keys of the experiment's

@@ -25,15 +25,14 @@ TURNING, SLIDING = "rotational", "linear"
 class Attribute(NamedTuple):
     """An attribute of a kind of element."""
 
-    # its fields of MjModel, each with a column (None for all of them) and the sign it enters with; all of them change
-    # by the same factor
+    # fields of MjModel that change by the same factor, each with a column (None for all columns) and a sign
     fields: tuple[tuple[str, int | None, float], ...]
     unit: str | tuple[str, str]  # SI unit; one for linear and one for rotational motion if these differ
-    signed: bool  # whether it may be negative
-    sigma: float  # standard deviation of its logarithm under the default prior
-    # scale of the default prior if its nominal value is zero or it may be negative; in ``unit``
+    signed: bool  # whether the attribute may be negative
+    sigma: float  # standard deviation of the logarithm under the default prior
+    # scale of the default prior for attributes that are zero or may be negative; in ``unit``
     typical: float | tuple[float, float]
-    words: str  # its description
+    words: str  # description
 
 
 def _plain(field: str, unit: str | tuple[str, str], sigma: float, typical: Any, words: str) -> Attribute:

@@ -34,7 +34,9 @@ def model_text(rollouts: Any, model: Any, path: Path, names: Iterable[str], rema
         if written is not None and _same(rollouts, model, written):
             return written
     raise InputError(
-        "its file cannot contain the calibrated values", where=str(path), remedy="export --phi, and set it there"
+        "the file of the MuJoCo model cannot contain the calibrated values",
+        where=str(path),
+        remedy="export --phi, and set it there",
     )
 
 
@@ -114,7 +116,6 @@ def _words(values: Any) -> str:
 
 
 def _write(root: ET.Element, element: ET.Element, model: Any, kind: str, number: int, attribute: str) -> None:
-    """Write one attribute of an element."""
     if kind == "body" and attribute in ("mass", "inertia", "com_x", "com_y", "com_z"):
         _write_inertial(root, element, model, number)
     elif kind == "body" and attribute == "gravcomp":
@@ -203,7 +204,7 @@ def _write_option(root: ET.Element, model: Any, attribute: str) -> None:
 
 
 def _find_files(root: ET.Element, folder: Path) -> None:
-    """Name meshes and textures such that they are found from any folder."""
+    """Give meshes and textures absolute paths."""
     compiler = root.find("compiler")
     settings = {} if compiler is None else compiler.attrib
     places = [folder / settings.get(key, "") for key in ("meshdir", "texturedir", "assetdir")] + [folder]

@@ -34,7 +34,6 @@ class MuJoCoLanes:
         self._values = np.full((count, len(rollouts.edits)), np.nan)
 
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
-        """See `BodyLanes`."""
         self._take_values(rows, np.stack([np.asarray(given.material[name], float) for name in self.rollouts.edits], 1))
         first = np.asarray(given.start, float)
         state, valid = self.rollouts.begun([self._models[row] for row in rows], self._ctrl(first[:, None])[:, 0])
@@ -42,15 +41,12 @@ class MuJoCoLanes:
         return self._moved(rows, np.zeros((len(rows), 0, first.shape[1])), first)
 
     def advance(self, displacement: Float[np.ndarray, "lane step channel"]) -> Motion:
-        """See `BodyLanes`."""
         return self._moved(np.arange(len(self._models)), displacement, displacement[:, -1])
 
     def save(self) -> Float[np.ndarray, "lane values"]:
-        """See `BodyLanes`."""
         return np.concatenate([self._state, self._failed[:, None], self._values], axis=1)
 
     def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """See `BodyLanes`."""
         size = self._state.shape[1]
         self._state[rows], self._failed[rows] = state[:, :size], state[:, size] > 0.0
         self._take_values(rows, state[:, size + 1 :])

@@ -202,7 +202,7 @@ class MuJoCoRollouts:
         channels: actuators that are commanded.
         start: see `MuJoCo`.
         threads: see `MuJoCo`.
-        path: path of its source file.
+        path: path of the model's source file.
 
     Attributes:
         spec: unchanged specification of the file.
@@ -381,7 +381,7 @@ class MuJoCoRollouts:
         return self._models[:count]
 
     def written(self, values: Mapping[str, float], remarks: Sequence[str]) -> tuple[str, str]:
-        """The model under some values as a file: its suffix and its text, which begins with ``remarks``.
+        """Suffix and text of a file of the model with some values; the text begins with ``remarks``.
 
         Raises:
             InputError: the file cannot describe the model.
@@ -425,7 +425,7 @@ class MuJoCoRollouts:
         return MuJoCoLanes(self, count)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:
-        """Mask of complete rollouts: MuJoCo stops the clock of one with a warning."""
+        """Mask of complete rollouts; MuJoCo stops the clock of a rollout with a warning."""
         late = state[:, 0] - self.first[0][0] - steps * self.model.opt.timestep
         return (np.abs(late) < 0.5 * self.model.opt.timestep) & np.isfinite(state).all(axis=1)
 
@@ -459,7 +459,7 @@ class MuJoCoRollouts:
 
 @contextmanager
 def _unheard() -> Iterator[None]:
-    """Warnings of unstable rollouts go nowhere: a rollout that diverged has a status of its own."""
+    """Warnings of unstable rollouts are dropped, since a status marks diverged rollouts."""
     import mujoco
 
     kept = mujoco.get_mju_user_warning()
