@@ -28,6 +28,7 @@ from rfdropo_bayes.fem.derivatives import pushed_forward
 from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, accept, displaced, stage_body, state_at_rest
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.integrators import Stage
+from rfdropo_bayes.fem.rod_elements import Six
 from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Way, all_rows, linearised, solved_stage, stresses
 
 ITERATIONS = 60
@@ -49,6 +50,8 @@ STEADY = 0.8
 LEAST, FIRMER, EASED = 10.0, 4.0, 0.25
 """Least share of the mass in a matrix that has no solution without, over E I / m L^3; its factor if that is too little,
 and its factor after an increment far from rest."""
+HOPELESS = 1e9
+"""A share of the mass beyond this many times the least: the body is lost."""
 CALM = 0.01
 """Increments above this many body lengths are far from rest."""
 TINY = 1e-300
@@ -164,7 +167,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
         body = _body(system, task, current.place, current.shift)
         solution, softness = solved_stage(way, body._replace(turning=current.turning), bonds)
         count = current.iterations + 1.0
-        again = ~jnp.isfinite(jnp.sum(solution.change**2))
+        again = ~jnp.isfinite(jnp.sum(solution.change**2)) & (current.shift < HOPELESS * least)
         increment = solution.change / scales
         far, wide = jnp.max(jnp.abs(increment[:3])), jnp.max(jnp.abs(increment[3:]))
         size = jnp.maximum(far, wide)

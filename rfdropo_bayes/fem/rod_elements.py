@@ -9,12 +9,13 @@ depends on the strains alone (``cables.taut_cables``).
 An element bends within itself as the forces at its ends let it, up to the second order in its length. Its flexibility
 in shear is 1 / k G A + h^2 / 12 E I: the second part is bending to the shape of an S. Its stretch is
 
-    Gamma_3 + (h^2 / 24) (1 + a Gamma_3) K^2 + sum over x and y of (c + c' Gamma_3) Gamma_i^2
+    Gamma_3 + (h^2 / 24) (1 + a e) K^2 + sum over x and y of (c + c' e) Gamma_i^2,   e = Gamma_3 / (1 + 4 Gamma_3^2)
 
 with Gamma of the chord, K the curvature, a = 1 - E A / k G A, f = k G A h^2 / 12 E I, g = k G A / E A, and
 c = ((1 - g) f + 3/5 f^2) / (1 + f)^2, c' = (1 - g) a f / 2 (1 + f)^2. An arc and an S are longer than their chords. The
 terms follow from the energy for a constant force in space, of which the rotation within the element is a minimum.
-Without them a pressed element is too stiff, and the error of a body is several times larger.
+Without them a pressed element is too stiff, and the error of a body is several times larger. The bound on e keeps steps
+of bodies whose cables press them to a fraction of their length.
 
 Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
 moment, or velocity and spin, in space.
@@ -89,10 +90,12 @@ def shape(length: Float[Array, "..."], position: Vector, orientation: Quaternion
     way = position[:, 1:] - position[:, :-1]
     chord = transposed_times(frame, way) / length
     shear, along, curvature = chord[:2], chord[2] - 1.0, 2.0 * (straight - across) / length
-    arc, wide = length**2 * dot(curvature[:2], curvature[:2]) / 24.0, 1.0 + inner.arc * along
-    slope = (inner.shear + inner.pressed * along) * shear
+    less = 1.0 / (1.0 + 4.0 * along**2)
+    bounded, rise = less * along, (2.0 * less - 1.0) * less
+    arc, wide = length**2 * dot(curvature[:2], curvature[:2]) / 24.0, 1.0 + inner.arc * bounded
+    slope = (inner.shear + inner.pressed * bounded) * shear
     stretch = along + arc * wide + dot(slope, shear)
-    steep = 1.0 + inner.arc * arc + dot(inner.pressed * shear, shear)
+    steep = 1.0 + rise * (inner.arc * arc + dot(inner.pressed * shear, shear))
     strain = jnp.concatenate([shear, stretch[None], curvature])
     lean, bow = jnp.concatenate([2.0 * slope, steep[None]]), length**2 / 12.0 * wide / steep * curvature[:2]
     return Elements(length, frame, way, straight + across, 1.0 / (1.0 + scalar), strain, lean, bow)

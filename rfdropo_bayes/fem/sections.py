@@ -57,7 +57,7 @@ def sections(
 def inner_bending(body: Rod, poisson_ratio: Scalar) -> tuple[Inner, Float[Array, "2 elements"]]:
     """Coefficients of bending within elements, and the share of the stiffness in shear that it leaves."""
     soft = SHEAR / (2.0 * (1.0 + jnp.asarray(poisson_ratio, dtype=float)))
-    ratio = shear_ratios(body).T * (soft / SHEAR)
+    ratio = jnp.asarray(shear_ratios(body).T) * (soft / SHEAR)
     left, arc = 1.0 / (1.0 + ratio), 1.0 - 1.0 / soft
     pressed = (1.0 - soft) * ratio * left**2
     return Inner(arc, pressed + 0.6 * (ratio * left) ** 2, 0.5 * arc * pressed), left

@@ -80,10 +80,11 @@ def strains(body: Any, material: Any, shape: Shape, e: int) -> tuple[np.ndarray,
     share, stiff = shear_share(body, material, e), SHEAR / (2.0 * (1.0 + material.poisson_ratio))
     arc, left, along = h**2 / 24.0 * strain[3:5] @ strain[3:5], 1.0 / (1.0 + share), strain[2]
     shorter, first = 1.0 - 1.0 / stiff, (1.0 - stiff) * share * left**2
-    slope = first * (1.0 + 0.5 * shorter * along) + 0.6 * (share * left) ** 2
-    steep = 1.0 + shorter * (arc + 0.5 * first @ strain[:2] ** 2)
-    strain[2] += arc * (1.0 + shorter * along) + slope @ strain[:2] ** 2
-    bow = h**2 / 12.0 * (1.0 + shorter * along) * strain[3:5]
+    bounded, rise = along / (1.0 + 4.0 * along**2), (1.0 - 4.0 * along**2) / (1.0 + 4.0 * along**2) ** 2
+    slope = first * (1.0 + 0.5 * shorter * bounded) + 0.6 * (share * left) ** 2
+    steep = 1.0 + rise * shorter * (arc + 0.5 * first @ strain[:2] ** 2)
+    strain[2] += arc * (1.0 + shorter * bounded) + slope @ strain[:2] ** 2
+    bow = h**2 / 12.0 * (1.0 + shorter * bounded) * strain[3:5]
     straight = rows.copy()
     straight[2] += bow @ rows[3:5] / steep
     rows[2] = steep * straight[2] + 2.0 * slope * strain[:2] @ rows[:2]

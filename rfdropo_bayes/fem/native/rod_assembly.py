@@ -84,14 +84,18 @@ def measure_element(tables, samples, element, work, token):
     bow = scaled(load3(rows, TILTED, token), bend[0])
     inner, along = INNER * element, z - length
     curl, arc = load(samples.inner, inner, token), fma(bend[0], bend[0], bend[1] * bend[1]) * (1.0 / 24.0)
-    wide = fma(curl, along, length)
+    stretch = along / length
+    square = 4.0 * stretch * stretch
+    less = one / (square + one)
+    bounded, rise = along * less, (one - square) * less * less
+    wide = fma(curl, bounded, length)
     bow = added(load3(rows, TILTED + 3, token), bend[1], bow)
-    longer, steep = fma(arc, wide, along), fma(curl, arc, one)
+    longer, steep = fma(arc, wide, along), fma(curl * rise, arc, one)
     for i in range(2):
         strain, more = (x, y)[i], load(samples.inner, inner + 3 + i, token)
-        lean = fma(more, along, load(samples.inner, inner + 1 + i, token)) * strain
+        lean = fma(more, bounded, load(samples.inner, inner + 1 + i, token)) * strain
         store(rows, LEAN + i, lean + lean)
-        longer, steep = fma(lean, strain, longer), fma(more * strain, strain, steep)
+        longer, steep = fma(lean, strain, longer), fma(rise * more * strain, strain, steep)
     store(rows, LEAN + 2, steep)
     put(rows, BOW, scaled(bow, wide * (1.0 / 12.0) / steep))
     put(rows, STRAIN, (x, y, longer))

@@ -11,6 +11,7 @@ from rfdropo_bayes.fem.equilibrium import (
     EASED,
     FARTHEST,
     FIRMER,
+    HOPELESS,
     LEAST,
     LONGEST_STEP,
     NEAR,
@@ -148,7 +149,8 @@ def _found(tables, work, moving, token):
     """The lanes that move whose matrix had a solution, and those that try again with more mass in the matrix."""
     zero, bound = fill(0.0, work.frame, token), fill(UNBOUNDED, work.frame, token)
     total, least = _product(tables, work.solution, work.solution, token), load(work.least, 0, token)
-    found, shift = where_greater(bound, total, moving, zero), load(work.shift, 0, token)
+    shift = load(work.shift, 0, token)
+    found = where_greater(HOPELESS * least, shift, where_greater(bound, total, moving, zero), moving)
     more = where_greater(FIRMER * shift, least, FIRMER * shift, least)
     store(work.shift, 0, where_greater(moving - found, zero, more, shift))
     store(work.pace, 0, where_greater(found, zero, load(work.pace, 0, token), zero))
