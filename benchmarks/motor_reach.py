@@ -93,7 +93,7 @@ class Simulated:
             timing = timing.model_copy(update={"dead_time_s": timing.dead_time_s + later})
             simulator, values = true_simulator(robot, experiment, table, simulator.robot.with_changes(command=timing))
         seen, step = observed_of(layout, len(simulator.marker_names)), np.max(layout.moves, axis=0).tolist()
-        played = Settings(layout.kind, seen, layout.period_s, step, noise, layout.history)
+        played = Settings(layout.kind, seen, layout.period_s, step, noise)
         drawn = Layers((Point(values), Uniform(self.start)), "point")
         batch = Episodes(simulator, self.task, episodes, drawn, played)
         batch.layout.require(layout, where="policy")

@@ -44,7 +44,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "as it comes": {},
     "no noise in training": {"noise": 0.0},
     "noise of 2 mm in training": {"noise": 2e-3},
-    "three actions of history": {"history": 3},
     "twice as wide as the posterior": {"width": 2.0},
     "the posterior's middle alone": {"width": 1e-3},
     "entropy bonus of 0.005": {"options": {"ent_coef": 0.005}},

@@ -65,7 +65,9 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     for trajectory in trajectories:
         if trajectory.unsent:
             remedy = "leave it out: a shadow session has commands that were not executed"
-            raise InputError("no drive has carried its commands out", where=trajectory.name, remedy=remedy)
+            raise InputError(
+                "the recording is of a shadow session, in which no drive moved", where=trajectory.name, remedy=remedy
+            )
     length = max(len(trajectory.time) for trajectory in trajectories)
     markers = shared_markers(trajectories, simulator.marker_names)
     times, positions, valid, commands = [], [], [], []

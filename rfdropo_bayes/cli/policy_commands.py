@@ -42,7 +42,9 @@ def train(
 ) -> None:
     """Train a policy and play it. Writes report.html, policy.onnx, its card and its learning curve."""
     if (experiment is None) == (fit is None):
-        raise InputError("takes an experiment file or --from DIR", where="train", remedy="give one of them")
+        raise InputError(
+            "the command needs an experiment file or --from DIR, not both", where="train", remedy="give one of them"
+        )
     see_calibration(fit, "--from")
     if fit is not None:
         experiment, out = fit / "config.toml", out or fit.with_name(f"{fit.name}_train")

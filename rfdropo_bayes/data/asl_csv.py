@@ -93,20 +93,18 @@ def _origin(name: str, provenance: str, settings: Mapping[str, Any]) -> Origin:
     return Origin(name, "asl_trunk", FORMAT, provenance=provenance, frame=FRAME, settings=settings)
 
 
-def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most, from ``row`` of a file of observations; see `commands_alone`.
-
-    The motor angles of row 0 are read as well.
+def read_asl_start(commands: Path, observations: Path | None) -> Trajectory:
+    """Commands with the start pose at most, with motor angles, from the first row of a file of observations.
 
     Raises:
-        InputError: on a damaged file, or a file without that row.
+        InputError: on a damaged file.
     """
     command = _read_commands(commands)
     start = angle = None
     if observations is not None:
         table = CsvTable(observations, ["ID", *_DISKS])
         start = table.points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
-        if row == 0 and all(name in table for name in _ANGLES):
+        if all(name in table for name in _ANGLES):
             angle = np.full((len(command) + 1, MOTORS), np.nan)
             angle[0] = np.deg2rad(table.numbers(_ANGLES, allow_missing=True)[0])
     return commands_alone(
@@ -114,8 +112,6 @@ def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> T
         SentCommands(np.arange(len(command)) / RATE, command, "rad", _CABLES),
         _MARKERS,
         start=start,
-        row=row,
-        start_file=str(observations),
         motor_angle=angle,
     )
 

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
-from rfdropo_bayes.errors import InputError
 
 
 def commands_alone(
@@ -20,8 +19,6 @@ def commands_alone(
     marker_names: Sequence[str],
     *,
     start: Float[np.ndarray, "row marker 3"] | None = None,
-    row: int = 0,
-    start_file: str = "",
     motor_angle: Float[np.ndarray, "row channel"] | None = None,
     poses: bool = False,
 ) -> Trajectory:
@@ -33,14 +30,9 @@ def commands_alone(
         origin: origin of the commands.
         sent: the commands; the first was already in force before its time.
         marker_names: names of the robot's markers.
-        start: marker positions [m], of which one row is used; None if unknown.
-        row: number of the row with the start pose; ignored if there is a single row.
-        start_file: file of the start pose.
+        start: marker positions [m], of which the first row is used; None if unknown.
         motor_angle: motor angles [rad], NaN if unknown.
         poses: whether the pose of a row belongs to its own command, as with ``commands_with_poses``.
-
-    Raises:
-        InputError: a start without that row.
     """
     time = sent.command_time
     settled = poses and len(time) > 1
@@ -48,11 +40,8 @@ def commands_alone(
     position = np.zeros((len(clock), len(marker_names), 3))
     mask = np.zeros(position.shape[:2], dtype=bool)
     if start is not None:
-        if row >= len(clock) or (len(start) != 1 and row >= len(start)):
-            raise InputError(f"has no row {row} to start from", where=start_file, remedy="choose other --rows")
-        first = start[min(row, len(start) - 1)]
-        seen = np.isfinite(first).all(axis=1)
-        position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
+        seen = np.isfinite(start[0]).all(axis=1)
+        position[:], mask[0] = np.where(seen[:, None], start[0], 0.0), seen
     return Trajectory.build(
         replace(origin, settings={"unseen": True, **({"settled_poses": True} if settled else {})}),
         sent.of_poses() if settled else replace(sent, initial_command=sent.command[0]),

@@ -109,7 +109,7 @@ def _towards(step: np.ndarray, k: int, short: np.ndarray) -> float:
 
 
 def wraps_of(columns: Sequence[Column], motion: Motion) -> dict[str, Wraps]:
-    """The columns that jump by turns which the markers do not follow."""
+    """Columns with jumps of one turn that the markers do not follow."""
     by_name = {column.name: find_wraps(column.values, column.turns) for column in columns}
     wraps = {name: each for name, each in by_name.items() if each is not None}
     together = len(wraps) > 1 and len({row for each in wraps.values() for row in each.rows}) == 1

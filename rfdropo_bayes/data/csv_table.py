@@ -122,7 +122,7 @@ class CsvTable:
         self._parse(lines, names)
         if machine_written and not ended:
             raise InputError(
-                "the last line does not end: the file is cut short",
+                "the last line has no newline: the file is incomplete",
                 where=f"{path}, row {len(self) - 1}",
                 remedy="fetch it again, or drop that row, or end it with a newline if it is whole",
             )

@@ -57,7 +57,7 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
         rule, why = recognised(trajectory)
     elif settled:
         raise InputError(
-            "every row is the pose at rest under its own command",
+            "initial_command is set, but every row is the pose at rest under its own command",
             where=f"[data] initial_command, {trajectory.name}",
             remedy="leave initial_command out for it",
         )

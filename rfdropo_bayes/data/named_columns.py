@@ -150,8 +150,8 @@ class CsvColumns(BaseModel):
     )
     base_marker: tuple[str, str, str] | None = Field(
         default=None,
-        description="columns of x, y and z of a marker that is fixed to the base, if cameras or base were moved: "
-        "positions and origin are relative to this marker",
+        description="columns of x, y and z of a marker on the base, if cameras or base moved; positions and origin "
+        "are then relative to this marker",
     )
     markers: list[str] | None = Field(
         default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"

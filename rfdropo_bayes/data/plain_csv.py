@@ -54,11 +54,11 @@ def command_table(path: Path | None, columns: CsvColumns) -> CsvTable | None:
     return CsvTable(path, columns.commands, names=columns.command_names, machine_written=False)
 
 
-def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most, from ``row`` of the observations ``start``; see `commands_alone`.
+def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None) -> Trajectory:
+    """Commands with the start pose at most, from the first row of the observations ``start``; see `commands_alone`.
 
     Raises:
-        InputError: the file is damaged, or lacks a column or the start row.
+        InputError: the file is damaged, or lacks a column.
     """
     table = _commands_alone(path, columns)
     return commands_alone(
@@ -66,8 +66,6 @@ def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row:
         read_commands(table, columns),
         marker_names(columns),
         start=None if start is None else points(start, columns, mask_missing=True),
-        row=row,
-        start_file="" if start is None else str(start.path),
         poses=columns.commands_with_poses,
     )
 

@@ -43,7 +43,7 @@ def _span(trajectory: Trajectory) -> float:
 
 
 def _of_one_rate(one: float, other: float) -> bool:
-    """Whether two times are equal but for the jitter of clocks; a zero time means a single command."""
+    """Whether two times are equal within the jitter of clocks; a zero time means a single command."""
     return one == other or (min(one, other) > 0.0 and max(one, other) < ONE_RATE * min(one, other))
 
 

@@ -43,7 +43,7 @@ class Stamps(NamedTuple):
         """Seconds from the first stamp of ``origin``; InputError if dates meet numbers."""
         if self.dated != origin.dated:
             raise InputError(
-                "some times are dates and others numbers", where=where, remedy="give all on one clock, in one form"
+                "some times are dates, others are numbers", where=where, remedy="give all on one clock, in one form"
             )
         if self.ticks.dtype.kind == origin.ticks.dtype.kind == "i":
             finest = max(self.per_second, origin.per_second)

@@ -29,7 +29,6 @@ def load_unseen(
     base: Path,
     commands: str,
     start: str | None = None,
-    rows: tuple[int, int] | None = None,
     begun: str | None = None,
     episode: int | None = None,
 ) -> Trajectory:
@@ -44,7 +43,6 @@ def load_unseen(
         base: folder that paths are relative to.
         commands: the file of commands.
         start: file of observations, if separate; one row is used.
-        rows: keep observation rows first to last, both included; the start pose is then from row ``first``.
         begun: beginning of the fitted recordings, "zero" or "first" (`common_beginning`), if all begin by the same
             rule; it then applies to these commands unless [data] or the file has another.
         episode: number of the episode, if the file of observations is a LeRobotDataset.
@@ -55,8 +53,8 @@ def load_unseen(
     """
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
-        whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
-        return first_row_only(spec.piece(_begun(whole, spec, begun), rows))
+        whole = read_asl_start(find_data_file(commands, base), observations)
+        return first_row_only(spec.piece(_begun(whole, spec, begun), None))
     if spec.columns is not None:
         folders = spec.format in FOLDERS
         path = find_files(commands, base, folders=folders)[0]
@@ -65,8 +63,8 @@ def load_unseen(
             observations = None if start is None else find_data_file(start, base, folders=folders)
             known = None if observations is None else observed_table(spec.format, observations, spec.columns, episode)
             columns = spec.columns if known is None else known.columns
-            whole = read_csv_start(path, columns, None if known is None else known.table, rows[0] if rows else 0)
-            return spec.piece(_begun(whole, spec, begun), rows)
+            whole = read_csv_start(path, columns, None if known is None else known.table)
+            return spec.piece(_begun(whole, spec, begun), None)
     episodes = None if episode is None else [episode]
     if spec.columns is not None and start is not None:
         entry = RecordingEntry(observations=start, commands=commands, episodes=episodes)
@@ -85,7 +83,7 @@ def load_unseen(
     recordings = load_recordings(changed(spec, where="[data]", **changes), base)
     if len(recordings) > 1:
         raise one_at_a_time(spec, commands, len(recordings), "predict")
-    return first_row_only(spec.piece(_begun(recordings[0], spec, begun), rows))
+    return first_row_only(spec.piece(_begun(recordings[0], spec, begun), None))
 
 
 def one_at_a_time(spec: DataSpec, name: str, number: int, verb: str) -> InputError:

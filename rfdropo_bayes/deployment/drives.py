@@ -292,7 +292,9 @@ class Drive:
             if time.monotonic() > end:
                 break
         raise InputError(
-            "stays powered", where=self.name, remedy="switch it off, and find out which other master commands it"
+            "the drive stays powered after a command to switch off",
+            where=self.name,
+            remedy="switch it off, and find out which other master commands it",
         )
 
     def configure(self, period: float, guards: Guards, say: Callable[[str], None]) -> None:

@@ -21,13 +21,10 @@ from rfdropo_bayes.deployment.sensors import POSE
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, Robot
 from rfdropo_bayes.robots.policy_layout import (
-    EARLIER_COMMANDS,
-    EARLIER_MOVED,
     EVALUATED_EPISODES,
     PEAK_TENSION,
     STOPPED_EPISODES,
     TENSION_LIMIT,
-    Earlier,
     PolicyLayout,
 )
 
@@ -131,9 +128,9 @@ class OnnxPolicy:
         self.pull = Pull.told(self._session.get_modelmeta().custom_metadata_map)
         names = [part.name for part in self.layout.observation]
         if "goal" in names and not np.all(np.isfinite(self._goal)):
-            raise InputError("the policy wants a goal", where="[goal]", remedy="give x, y and z in metres")
+            raise InputError("the policy needs a goal", where="[goal]", remedy="give x, y and z in metres")
         self.rate_hz = 1.0 / self.layout.period_s
-        self.sees_markers = bool({"markers", "moved", EARLIER_MOVED} & set(names))
+        self.sees_markers = bool({"markers", "moved"} & set(names))
         self.sees_object = "object" in names
         self.start = np.zeros(len(robot.channel_names))
         moves = np.array(self.layout.moves)
@@ -142,8 +139,6 @@ class OnnxPolicy:
         self._input = self._session.get_inputs()[0]
         self._check_shapes(where)
         self._network = _bound(self._session, self.layout.size, len(self._reach))
-        self._earlier = Earlier(self.layout.history - 1, 1, len(self._reach), 3 * len(self._markers))
-        self._begun = False
         nowhere, still = np.zeros((len(robot.marker_names), 3)), np.zeros(len(robot.channel_names))
         self._last = PolicyScene(nowhere, nowhere, still, still, still, np.zeros(POSE))
 
@@ -157,11 +152,6 @@ class OnnxPolicy:
         Raises:
             Stop: the output of the policy is not finite, or exceeds the largest action.
         """
-        if not self._begun:
-            self._earlier.begin([0], scene.command[None])
-            self._begun = True
-        elif self.layout.history > 1:
-            self._earlier.add(self._last.command[None], self._last.moved[self._markers].reshape(1, -1))
         self._last = scene
         observation, raw = self._answer(scene)
         if not np.all(np.isfinite(observation)):
@@ -181,7 +171,6 @@ class OnnxPolicy:
             "commands": scene.command,
             "lengths": scene.length,
             "tensions": scene.tension,
-            **{name: part[0] for name, part in self._earlier.parts().items()},
         }
         return self.layout.assemble(parts)
 
@@ -270,8 +259,6 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
     channels = len(robot.channel_names)
     sizes = {"markers": seen, "moved": seen, "goal": 3, "object": POSE}
     sizes |= {"commands": channels, "lengths": channels, "tensions": channels}
-    before = layout.history - 1
-    sizes |= {EARLIER_COMMANDS: before * channels, EARLIER_MOVED: before * seen}
     for part in layout.observation:
         if part.name not in sizes:
             known = ", ".join(sizes)
@@ -281,7 +268,7 @@ def _check_layout(layout: PolicyLayout, robot: Robot, seen: int, where: str) -> 
                 f"needs {part.size} numbers of {part.name!r}; there are {sizes[part.name]}",
                 where=where,
                 remedy="name the markers that it sees: [policy] markers"
-                if part.name in ("markers", "moved", EARLIER_MOVED)
+                if part.name in ("markers", "moved")
                 else remedy,
             )
 

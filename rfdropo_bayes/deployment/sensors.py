@@ -170,7 +170,9 @@ class NatNetMarkers:
             raise InputError("two markers have the same rigid body", where="sensor.rigid_bodies", remedy=remedy)
         if table.object_body in self._identifiers:
             remedy = "give the identifier of the object's own"
-            raise InputError("a marker has the same rigid body", where="sensor.object_body", remedy=remedy)
+            raise InputError(
+                "a marker and the object have the same rigid body", where="sensor.object_body", remedy=remedy
+            )
         self._object = table.object_body
         self._rotation, self._origin = np.array(table.rotation), np.array(table.origin_m)
         self._lock = threading.Lock()

@@ -245,7 +245,11 @@ class _Session:
             seen = self.settings.sensor
             if self.source.sees_object and seen.kind == "natnet" and seen.object_body is None and not self.simulated:
                 remedy = "give the identifier of its rigid body"
-                raise InputError("the policy sees an object", where="sensor.object_body", remedy=remedy)
+                raise InputError(
+                    "the policy observes an object, but no sensor measures one",
+                    where="sensor.object_body",
+                    remedy=remedy,
+                )
         if self.mode is not Mode.CHECK:
             self.drives.configure(self.period, lambda text: self.log.event("note", text))
 

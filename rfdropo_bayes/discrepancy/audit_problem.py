@@ -65,11 +65,6 @@ class AuditProblem:
         """Whether rows have times."""
         return all(UNTIMED not in trajectory.notes for trajectory in self.trajectories)
 
-    @property
-    def clock(self) -> str:
-        """Unit of times in sentences: seconds, or rows if rows have no times."""
-        return "s" if self.timed else "rows"
-
     def candidate(self, name: str) -> Candidate | None:
         """A candidate by its name; None for the mesh and time step, which are not in the library."""
         return next((candidate for candidate in self.candidates if candidate.name == name), None)

@@ -17,7 +17,7 @@ from rfdropo_bayes.discrepancy.fit import Fit
 from rfdropo_bayes.discrepancy.gain import LEVELS, noise_distance
 from rfdropo_bayes.discrepancy.law_words import unknown_record
 from rfdropo_bayes.discrepancy.pipeline import Answer
-from rfdropo_bayes.discrepancy.prequential import in_words, prequential
+from rfdropo_bayes.discrepancy.prequential import in_words, prequential, span_in_words
 from rfdropo_bayes.discrepancy.score import likeness
 from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
 from rfdropo_bayes.discrepancy.sentence import sentence
@@ -191,7 +191,7 @@ def _watch(answer: Answer) -> str:
     worst, markers = int(np.argmax(found.surprise)), answer.problem.model.recordings.markers
     marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
     first, last = found.edges[worst : worst + 2]
-    return f"watch {marker} while the commands from {first:.2g} to {last:.2g} {answer.problem.clock} are sent again"
+    return f"watch {marker} while the commands {span_in_words(first, last, answer.problem.timed)} are sent again"
 
 
 def _other_noise(answer: Answer) -> dict[str, Any]:
@@ -335,7 +335,7 @@ def _where(answer: Answer) -> dict[str, Any]:
     markers = problem.model.recordings.markers
     misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
     return {
-        "sentence": in_words(found, markers, problem.rules.base_passes, problem.clock),
+        "sentence": in_words(found, markers, problem.rules.base_passes, problem.timed),
         "block_edges_s": found.edges.tolist(),
         "prequential_score": found.score.tolist(),
         "block_p": found.p.tolist(),

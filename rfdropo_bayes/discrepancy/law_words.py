@@ -13,6 +13,7 @@ from rfdropo_bayes.discrepancy.inadequacy import POOR
 from rfdropo_bayes.discrepancy.law_search import Refit, in_words
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.port_evidence import PortEvidence
+from rfdropo_bayes.discrepancy.prequential import span_in_words
 
 MILLIMETRES = 1e3
 MOST_TIES = 3
@@ -104,7 +105,7 @@ def law_sentence(answer: Answer) -> str:
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
     unknown = "no mechanism of the library describes" if answer.problem.candidates else "the model lacks"
-    head = f"An effect acts that {unknown}: {laws}{_when(described, answer.problem.clock)}"
+    head = f"An effect acts that {unknown}: {laws}{_when(described, answer.problem.timed)}"
     worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
     looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.found.terms))
     return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
@@ -125,13 +126,13 @@ def _shape(row: dict[str, Any]) -> str:
     return f", with {name} of {row['shape']:.3g} \u00b1 {row['shape_sd']:.2g} {row['shape_unit']}"
 
 
-def _when(described: Described, clock: str) -> str:
+def _when(described: Described, timed: bool) -> str:
     """When the signals at the members of the law's port are largest."""
     term = described.found.terms[0].term
     members = described.found.map.members(term.port)
     size = np.sqrt(np.mean([row.mean**2 for row in described.found.ports if row.port in members], axis=(0, 1)))
     large = described.found.centre[size > 0.7 * size.max()]
-    return f", most from {large.min():.4g} to {large.max():.4g} {clock}"
+    return f", most {span_in_words(large.min(), large.max(), timed)}"
 
 
 def _stand_ins(described: Described) -> str:

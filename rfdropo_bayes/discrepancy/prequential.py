@@ -75,14 +75,19 @@ def prequential(target: FitTarget, fit: Fit) -> Prequential:
     return Prequential(edges, np.array(scores), np.array(p), np.array(surprise), misfit)
 
 
-def in_words(found: Prequential, markers: tuple[str, ...], level: float, clock: str = "s") -> str:
+def span_in_words(first: float, last: float, timed: bool) -> str:
+    """A span of times [s], or of rows if rows have no times."""
+    return f"from {first:.4g} to {last:.4g} s" if timed else f"from row {first:.0f} to row {last:.0f}"
+
+
+def in_words(found: Prequential, markers: tuple[str, ...], level: float, timed: bool = True) -> str:
     """When the model first fails, when most, and at which marker.
 
     Args:
         found: the scores.
         markers: names, three channels each.
         level: level of the p-values, shared by all blocks.
-        clock: unit of the blocks' edges.
+        timed: whether rows have times.
     """
     failing = np.flatnonzero(found.p <= level / len(found.p))
     if len(failing) == 0:
@@ -90,7 +95,7 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float, clock: 
     first, worst = failing[0], int(np.argmax(found.surprise))
     at = int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))
     share = "in every block" if len(failing) == len(found.p) else f"in {len(failing)} of {len(found.p)} blocks"
-    early, late = (f"from {found.edges[k]:.4g} to {found.edges[k + 1]:.4g} {clock}" for k in (first, worst))
+    early, late = (span_in_words(*found.edges[k : k + 2], timed) for k in (first, worst))
     return f"The model fails {share} of rows, first {early}, most {late}, and most at marker {markers[at]}." + (
         f" {BEGINNING}" if begins_wrong(found, level) else ""
     )

@@ -102,7 +102,7 @@ def profile_rod(
         if values.shape != shape:
             raise InputError(f"shape {values.shape}, expected {shape}", where=f"body.{name}")
         if not (np.all(np.isfinite(values)) and np.all(values > 0.0)):
-            raise InputError("a value is not positive", where=f"body.{name}")
+            raise InputError("lengths, stiffnesses and masses of a rod must be positive", where=f"body.{name}")
         return values
 
     return Rod(

@@ -60,7 +60,7 @@ def _rate(spec: ParameterSpec) -> ParameterSpec:
         low=spec.low - spec.nominal,
         high=spec.high - spec.nominal,
         nominal=0.0,
-        prior=spec.prior | {"scale": spec.prior["scale"] / USUAL},
+        prior={**spec.prior, "scale": spec.prior["scale"] / USUAL},
         description=f"rate of the {spec.description}",
     )
 

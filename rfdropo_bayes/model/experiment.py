@@ -140,9 +140,7 @@ class SimulatorTable(ExperimentTable):
     """[simulator]: body, engine and discretisation; missing keys are the robot's own."""
 
     body: Literal["rod", "tetrahedra"] = Field(
-        default="rod",
-        description="a rod with the robot's section profile, or the mesh under [simulator.tetrahedra]; a body that is "
-        "not chosen has no effect",
+        default="rod", description="a rod with the robot's section profile, or the mesh under [simulator.tetrahedra]"
     )
     motion: Literal["dynamic", "quasi-static"] = Field(
         default="dynamic",

@@ -28,7 +28,6 @@ from rfdropo_bayes.policies.tasks import (
     reward,
     shown_of,
 )
-from rfdropo_bayes.robots.policy_layout import Earlier
 from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.parameters import check_names, check_value
@@ -61,7 +60,7 @@ class EpisodeStep(NamedTuple):
 class Settings:
     """Settings of a task."""
 
-    # actions, observed, period, step, history: see `layout_of`
+    # actions, observed, period, step: see `layout_of`
     actions: Actions = "discrete"
     observed: Observed = "paper"
     period: float = 0.05
@@ -69,7 +68,6 @@ class Settings:
     # standard deviation of white noise on the observed positions of markers and cube [m]. A marker's displacement is
     # the difference of two observations, as on a robot.
     noise: float = 0.0
-    history: int = 1
     # an episode ends within this distance of the goal [m]; None never, with the reward of staying there
     near: float | None = None
     # an episode ends once a cable pulls more [N], as drives stop then; None lets it pull
@@ -111,8 +109,7 @@ class Episodes:
             )
         if limit is not None and not simulator.cable_names:
             raise _without_tensions(self.robot.name, "name its cables, see docs/your_simulator.md, or leave it out")
-        asked = (settings.actions, settings.observed, settings.period, settings.step, settings.history)
-        self.layout = layout_of(task, self.robot, *asked)
+        self.layout = layout_of(task, self.robot, settings.actions, settings.observed, settings.period, settings.step)
         self.shown = shown_of(self.layout, self.robot)
         self._specs = {spec.name: spec for spec in simulator.parameters}
         self.randomisation = fitting(randomisation, simulator.parameters)
@@ -127,7 +124,6 @@ class Episodes:
         self.marker = np.zeros((lanes, markers, 3))
         self.pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (lanes, 1)) if task.push else None
         self.seen, self.seen_before, self.seen_pose = self.marker, self.marker, self.pose
-        self.earlier = Earlier(settings.history - 1, lanes, len(self.layout.channels), 3 * len(self.shown))
 
     def seed(self, lane: int, seed: int | np.random.SeedSequence) -> None:
         """Let a lane draw from a generator with this seed from now on; unseeded lanes draw fresh entropy."""
@@ -194,8 +190,6 @@ class Episodes:
                 remedy="look for NaN in the policy",
             )
         change = self.layout.change(actions.reshape(self.lanes, *actions.shape[1:]))
-        moved = (self.seen - self.seen_before)[:, self.shown]
-        self.earlier.add(self.commands, moved.reshape(self.lanes, -1))
         self.commands = np.clip(self.commands + change, self.layout.low, self.layout.high)
         observation = self.session.act(self.commands)
         good = (np.asarray(observation.status) == int(Result.OK)) & np.isfinite(observation.position).all(axis=(1, 2))
@@ -290,7 +284,6 @@ class Episodes:
             self.pose = self.pose.copy()
             self.pose[rows] = observation.object_pose
         self.commands[rows], self.age[rows], self.worst[rows] = 0.0, 0, FLOOR
-        self.earlier.begin(rows, self.commands[rows])
         self.first[rows] = self.distance()[rows]
         self._look(rows)
         self.seen_before = self.seen_before.copy()
@@ -315,7 +308,7 @@ class Episodes:
         seen, before = self.seen[rows], self.seen_before[rows]
         pose = None if self.seen_pose is None else self.seen_pose[rows]
         parts = parts_seen(self.shown, seen, before, self.goal[rows], self.commands[rows], pose)
-        return self.layout.assemble(parts | self.earlier.parts(rows))
+        return self.layout.assemble(parts)
 
 
 def pose_with_errors(

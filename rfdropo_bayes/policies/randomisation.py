@@ -316,7 +316,9 @@ def drawn_rows(
     names = tuple(info.name for info in record.free if info.name in known)
     if not names:
         raise InputError(
-            "the posterior shares no parameter with the simulator", where=where, remedy="use one of this robot"
+            "the posterior shares no parameter with the simulator",
+            where=where,
+            remedy="use a calibration of this robot",
         )
     rows = np.stack([record.flat(name) for name in names], axis=1)
     return Draws(names, rows, hashlib.sha256(np.ascontiguousarray(rows).tobytes()).hexdigest())
@@ -344,7 +346,9 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox
     _require_mechanisms([name for name in summary["phi"] if name not in known], robot, str(file))
     shared = {name: normal for name, normal in summary["phi"].items() if name in known}
     if not shared:
-        raise InputError("phi shares no parameter with the simulator", where=str(file), remedy="use one of this robot")
+        raise InputError(
+            "phi shares no parameter with the simulator", where=str(file), remedy="use a calibration of this robot"
+        )
     return Phi(shared)
 
 

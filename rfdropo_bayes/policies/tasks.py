@@ -16,13 +16,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import (
-    EARLIER_COMMANDS,
-    EARLIER_MOVED,
-    CommandUnit,
-    ObservationPart,
-    PolicyLayout,
-)
+from rfdropo_bayes.robots.policy_layout import CommandUnit, ObservationPart, PolicyLayout
 
 Actions = Literal["discrete", "continuous"]
 Observed = Literal["full", "paper", "markers"]
@@ -147,7 +141,6 @@ def layout_of(
     observed: Observed,
     period: float = PERIOD,
     step: float | Sequence[float] | None = None,
-    history: int = 1,
 ) -> PolicyLayout:
     """Observation and action of a task on a robot.
 
@@ -159,11 +152,9 @@ def layout_of(
         period: time from one action to the next [s].
         step: largest change of a channel per action, in the unit of its commands, or a value per channel; by default
             the command that pulls a cable by 5 mm, see `Commanded.command_of`.
-        history: number of past actions whose commands and marker displacements are observed.
 
     Raises:
-        InputError: a cube for a robot that has none, commands that nothing limits, or a history of unobserved
-            quantities.
+        InputError: a cube for a robot that has none, or commands that nothing limits.
     """
     if task.push and robot.push is None:
         raise InputError(f"robot {robot.name!r} has no cube to push", where="task", remedy="use a reaching task")
@@ -175,14 +166,6 @@ def layout_of(
         parts += [
             ObservationPart("commands", len(channels), robot.command_unit),
             ObservationPart("moved", 3 * shown, "m"),
-        ]
-    if history > 1:
-        if observed == "paper":
-            remedy = 'set observation = "full" or "markers"'
-            raise InputError('the observation "paper" has no history', where="history", remedy=remedy)
-        parts += [
-            ObservationPart(EARLIER_COMMANDS, (history - 1) * len(channels), robot.command_unit),
-            ObservationPart(EARLIER_MOVED, (history - 1) * 3 * shown, "m"),
         ]
     low, high = robot.command_limits()
     given = robot.command_of(STEP) if step is None else np.broadcast_to(step, len(channels))

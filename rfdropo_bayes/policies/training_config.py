@@ -33,12 +33,6 @@ class TrainingTable(BaseModel):
         "twentieth of the range of other commands",
     )
     noise: float = Field(default=0.0, ge=0.0, description="white noise on the observed markers [m]")
-    history: int = Field(
-        default=1,
-        ge=1,
-        le=10,
-        description="number of past actions whose commands and marker displacements are observed",
-    )
     tension_limit: float | None = Field(
         default=None,
         gt=0.0,

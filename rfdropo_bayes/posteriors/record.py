@@ -56,7 +56,7 @@ class RecordingPrediction:
         fits = np.shape(self.observed) == shape and np.shape(self.mask) == shape[:2]
         fits = fits and np.shape(self.predicted)[1:] == shape and np.shape(self.central) == shape
         if not fits or (self.prior_predicted is not None and np.shape(self.prior_predicted)[1:] != shape):
-            raise InputError("measured and predicted positions do not fit together", where=self.name)
+            raise InputError("measured and predicted positions differ in shape", where=self.name)
         if self.split not in ("fit", "test"):
             raise InputError(f"split is {self.split!r}", where=self.name, remedy='it must be "fit" or "test"')
 

@@ -140,7 +140,7 @@ def score(
     for path, row in zip(paths, settled_rows(paths), strict=True):
         predicted = predictions.get(path.name)
         if path.marker_names != markers or predicted is None or np.shape(predicted) != np.shape(path.position):
-            raise InputError("prediction and recording do not fit together", where=path.name)
+            raise InputError("prediction and recording differ in rows or markers", where=path.name)
         square = np.sum((np.asarray(predicted) - path.position) ** 2, axis=-1) * path.mask
         squares += square.sum(axis=0)
         counts += path.mask.sum(axis=0)

@@ -44,7 +44,7 @@ def commands_figure(session: Trajectory) -> Figure:
 
 @styled
 def goal_figure(time: Float[np.ndarray, " row"], distance: Float[np.ndarray, " row"]) -> Figure:
-    """Distance [m] from the goal in the rows that saw the marker or object that must reach it."""
+    """Distance [m] from the goal, in rows in which the last marker or the object was seen."""
     figure = Figure(figsize=(WIDTH, 2.4))
     axes = figure.add_subplot()
     axes.plot(time, MILLIMETRES * distance, marker="." if len(time) < 2 else None)

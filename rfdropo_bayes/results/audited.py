@@ -154,7 +154,11 @@ class Audit:
             InputError: the residual is noise only.
         """
         if self._shown().remainder is None:
-            raise InputError("the last model leaves nothing but noise", where="audit", remedy="draw another figure")
+            raise InputError(
+                "the residuals of the last model are noise: there is no remainder",
+                where="audit",
+                remedy="draw another figure",
+            )
         axes = axes_or_new(ax)
         figures.draw_remainder(axes, self._shown())
         axes.legend()
@@ -163,7 +167,7 @@ class Audit:
     def _shown(self) -> Shown:
         if self.shown is None:
             raise InputError(
-                "an audit that was read from files cannot draw",
+                "an audit read from files has no data for figures",
                 where="audit",
                 remedy="see its report.html, or audit again",
             )

@@ -28,7 +28,7 @@ class PointMass(RobotTable):
 
 
 class Body(RobotTable):
-    """A body of layers along z, from the clamp (first station) to the tip; each is one element of a rod or several.
+    """A body of layers along z, from the clamp (first station) to the tip; a layer is one or several elements of a rod.
 
     A layer's section is effective: the profile makes the layer's ends move like the real body's under unit moments,
     force and torque, for any true shape in between. Poisson's ratio acts on shear and torsion alone, unless

@@ -93,7 +93,9 @@ class RobotOutline:
         if self.shape == "disks" and len({self.end_of_cables(k) for k in range(self.segments)}) < self.segments:
             raise InputError("two segments end at one disk", where=where, remedy="give more disks")
         if self.pairs and self.command_unit == "Pa":
-            raise InputError("chambers make no pairs", where=where, remedy="give each chamber its own command")
+            raise InputError(
+                "pairs of chambers are not possible", where=where, remedy="give each chamber its own command"
+            )
         if self.pairs and self.cables % 2:
             raise InputError(f"{self.cables} cables make no pairs", where=where, remedy="give an even number")
         if self.shape == "disks" and self.number_of_disks % self.segments:

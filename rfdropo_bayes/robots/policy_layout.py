@@ -18,8 +18,6 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.errors import InputError
 
 CommandUnit = Literal["m", "rad", "N", "N m", "Pa", "-"]
-EARLIER_COMMANDS, EARLIER_MOVED = "earlier commands", "earlier moved"
-"""Parts of an observation that show more than the last action; see `Earlier`."""
 PEAK_TENSION = "peak_tension_n"
 """Metadata of an exported policy: the largest tension of a cable [N] in the evaluation that it was kept for."""
 TENSION_LIMIT, STOPPED_EPISODES, EVALUATED_EPISODES = "tension_limit_n", "stopped_episodes", "evaluated_episodes"
@@ -68,12 +66,6 @@ class PolicyLayout:
     def size(self) -> int:
         """Size of an observation."""
         return sum(part.size for part in self.observation)
-
-    @property
-    def history(self) -> int:
-        """Number of past actions in an observation, including the last."""
-        sizes = {part.name: part.size for part in self.observation}
-        return 1 + sizes.get(EARLIER_COMMANDS, 0) // len(self.channels)
 
     def assemble(self, parts: Mapping[str, Float[np.ndarray, "*lane size"]]) -> Float[np.ndarray, "*lane total"]:
         """An observation from its parts, of one lane or of many.
@@ -150,35 +142,6 @@ class PolicyLayout:
                     where=where,
                     remedy="use a policy that was trained for this layout",
                 )
-
-
-class Earlier:
-    """Commands and movements of earlier actions, the latest first, for the observation.
-
-    Args:
-        count: number of actions before the last; may be 0.
-        lanes: robots side by side.
-        channels, moved: sizes of a command and of a displacement vector.
-    """
-
-    def __init__(self, count: int, lanes: int, channels: int, moved: int) -> None:
-        self._commands, self._moved = np.zeros((lanes, count, channels)), np.zeros((lanes, count, moved))
-
-    def begin(self, rows: Any, commands: Float[np.ndarray, "row channel"]) -> None:
-        """Let robots have stood still under these commands."""
-        self._commands[rows], self._moved[rows] = commands[:, None], 0.0
-
-    def add(self, commands: Float[np.ndarray, "lane channel"], moved: Float[np.ndarray, "lane size"]) -> None:
-        """Store the previous command, and the displacement of the markers under it [m]."""
-        for kept, latest in ((self._commands, commands), (self._moved, moved)):
-            if kept.shape[1]:
-                kept[:, 1:] = kept[:, :-1].copy()
-                kept[:, 0] = latest
-
-    def parts(self, rows: Any = slice(None)) -> dict[str, Float[np.ndarray, "row size"]]:
-        """The two parts of an observation, of some robots."""
-        commands, moved = self._commands[rows], self._moved[rows]
-        return {EARLIER_COMMANDS: commands.reshape(len(commands), -1), EARLIER_MOVED: moved.reshape(len(moved), -1)}
 
 
 def _brief(value: Any) -> str:

@@ -98,10 +98,10 @@ class BlackBox:
             raise InputError("needs a marker, a channel and a positive time step", where=self.name)
         if self.one_shape and not self.batched:
             remedy = "give batched=True, and a function of many parameter sets"
-            raise InputError("arrays of one shape, of one parameter set", where=self.name, remedy=remedy)
+            raise InputError("one_shape needs batched = true", where=self.name, remedy=remedy)
         if self.command_unit not in STROKES:
             remedy = nearest(self.command_unit, STROKES)
-            raise InputError(f"commands in {self.command_unit!r}", where=self.name, remedy=remedy)
+            raise InputError(f"unknown command_unit {self.command_unit!r}", where=self.name, remedy=remedy)
         for name, ends in self.limits.items():
             if name not in self.channels:
                 raise InputError(f"limits of {name!r}", where=self.name, remedy=nearest(name, self.channels))
@@ -390,7 +390,9 @@ class BlackBoxSimulator(ExtendedSimulator):
         begin = getattr(self.box.function, "begin_lanes", None)
         if begin is None:
             remedy = "give the function a method begin_lanes, see docs/your_simulator.md"
-            raise InputError("simulates whole rollouts only", where=self.box.name, remedy=remedy)
+            raise InputError(
+                "the simulator has no begin_lanes: only whole rollouts are possible", where=self.box.name, remedy=remedy
+            )
         return begin(count)
 
     def session(self, lanes: int, period: float) -> Session:

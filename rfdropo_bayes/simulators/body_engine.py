@@ -131,11 +131,17 @@ class Engine:
         system = self.body.system
         if not self.is_rod:
             if self.from_equilibrium or self.at_rest:
-                raise InputError("a body of tetrahedra starts undeformed and moves", where="engine", remedy="use a rod")
+                raise InputError(
+                    "a body of tetrahedra has neither a start in equilibrium nor quasi-static motion",
+                    where="engine",
+                    remedy="use a rod",
+                )
             if self.backend.name == "jax":
                 raise InputError("JAX has no body of tetrahedra", where="engine", remedy='use engine = "numba"')
         if self.at_rest and self.scene is not None:
-            raise InputError("a body at rest pushes no cube", where="engine", remedy='use motion = "dynamic"')
+            raise InputError(
+                "quasi-static motion does not allow a cube", where="engine", remedy='use motion = "dynamic"'
+            )
         if self.integrator != "euler" and not isinstance(system, System) and np.isfinite(system.limits.rate):
             raise InputError(
                 f"integrator {self.integrator!r} with drives that SOFA limits: their limit is one of SOFA's own steps",

@@ -65,7 +65,7 @@ def body_lanes(engine: Engine, count: int) -> BodyLanes:
         InputError: an engine whose body is no rod.
     """
     if not engine.is_rod:
-        raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a rod")
+        raise InputError("a body of tetrahedra cannot run in control sessions", where="a session", remedy="use a rod")
     kind = ReferenceLanes if engine.backend.name == "jax" else CompiledLanes
     return kind(engine, count) if engine.scene is None else LanesBeforeCube(kind, engine, engine.scene, count)
 
@@ -168,7 +168,7 @@ class ReferenceLanes:
         if self._lanes is None:
             self._lanes = fresh
         elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):
-            raise InputError("a lane has other effects of the body than earlier lanes", where="reset")
+            raise InputError("a lane has other body effects than earlier lanes", where="reset")
         self._lanes = jax.tree.map(lambda new, old: old.at[rows].set(new[rows]), fresh, self._lanes)
         return Motion(*(None if part is None else part[rows] for part in self._shown(self._lanes.state.tension)))
 

@@ -131,7 +131,7 @@ def _check_cables(robot: Robot, table: TetrahedraTable) -> None:
         if name not in robot.cable_names:
             raise InputError(f"the robot has no cable {name!r}", where=where, remedy=f"its cables: {known}")
     if table.drive_rate is not None and table.drives != "sofa":
-        raise InputError("drive_rate has no effect", where=where, remedy='it belongs to drives = "sofa"')
+        raise InputError('drive_rate has no effect without drives = "sofa"', where=where, remedy="leave it out")
 
 
 def _markers(

@@ -155,7 +155,6 @@ def _episodes_for(
         period=table.period,
         step=np.max(layout.moves, axis=0).tolist(),
         noise=table.noise,
-        history=layout.history,
         tension_limit=table.tension_limit,
     )
     batch = Episodes(simulator, task, lanes, randomisation, settings)

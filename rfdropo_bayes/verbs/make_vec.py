@@ -130,13 +130,7 @@ def _check_length(task: Task, robot: Robot | BlackBox) -> None:
 def episode_settings(table: TrainingTable) -> Settings:
     """Settings of episodes in [training]."""
     return Settings(
-        table.actions,
-        table.observation,
-        table.period,
-        table.step,
-        table.noise,
-        table.history,
-        tension_limit=table.tension_limit,
+        table.actions, table.observation, table.period, table.step, table.noise, tension_limit=table.tension_limit
     )
 
 

@@ -134,7 +134,8 @@ def _motion(shown: Trajectory | _Shown, robot: Robot, measured: Trajectory | Non
     known = [index for index, name in enumerate(shown.marker_names) if name in rest]
     if not known:
         raise InputError(
-            f"none of its markers ({', '.join(shown.marker_names)}) is the robot's ({', '.join(rest)})",
+            f"no marker of the recording ({', '.join(shown.marker_names)}) is a marker of the robot "
+            f"({', '.join(rest)})",
             where=shown.name,
             remedy="give the robot that was recorded",
         )

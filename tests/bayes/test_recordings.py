@@ -18,7 +18,7 @@ from rfdropo_bayes.robots import Robot
     [
         ("m", {}, None),
         ("rad", {}, "recording has commands in rad, the robot in m"),
-        ("m", {"mode": "shadow"}, "no drive has carried its commands out"),
+        ("m", {"mode": "shadow"}, "the recording is of a shadow session, in which no drive moved"),
     ],
 )
 def test_commands_in_another_unit_or_that_nothing_followed_are_refused(

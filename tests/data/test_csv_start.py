@@ -10,7 +10,6 @@ import pytest
 
 from rfdropo_bayes.data import CsvColumns, DataSpec, common_beginning, load_unseen, start_is_known
 from rfdropo_bayes.data.plain_csv import command_columns
-from rfdropo_bayes.errors import InputError
 
 COLUMNS = {
     "time": "t",
@@ -55,8 +54,6 @@ def test_the_start_pose_is_one_row_of_another_file_in_the_base_frame(tmp_path: P
     assert start_is_known(found)
     assert np.asarray(found.position_mask).sum() == 2  # both markers, in the first row only
     np.testing.assert_allclose(found.position[0, 1], [0.200, 0.202, -0.201], atol=1e-12)
-    with pytest.raises(InputError, match="no row 2 to start from"):
-        load_unseen(spec, tmp_path, "next.csv", "start.csv", (2, 4))
 
 
 def test_new_commands_begin_as_the_fitted_recordings_do(tmp_path: Path, spec: DataSpec) -> None:

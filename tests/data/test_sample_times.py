@@ -100,7 +100,7 @@ def test_commands_are_on_the_clock_of_the_observations():
     dates = clock.astype("datetime64[ns]")
     found = Trajectory.from_arrays(time=dates, command_time=dates + np.timedelta64(2, "ms"), **given)
     np.testing.assert_allclose(found.command_time, TIME + 0.002, atol=1e-12)
-    with pytest.raises(InputError, match="some times are dates and others numbers"):
+    with pytest.raises(InputError, match="some times are dates, others are numbers"):
         Trajectory.from_arrays(time=dates, command_time=TIME, **given)
 
 

@@ -71,31 +71,6 @@ def test_every_part_finds_its_values(robot: Robot, tmp_path: Path) -> None:
         assert policy.sees_object
 
 
-def test_a_history_is_what_was_seen_at_earlier_acts(robot: Robot, tmp_path: Path) -> None:
-    """The latest first; before the first act the robot has stood still. Rehearsing is no act."""
-    markers = 3 * len(robot.marker_names)
-    names = {"commands": 4, "moved": markers, "earlier commands": 8, "earlier moved": 2 * markers}
-    parts = tuple(ObservationPart(name, size, "-") for name, size in names.items())
-    seen, width = [scene(robot, seed) for seed in range(4)], sum(names.values())
-    still, before = np.zeros(markers), []
-    for column in range(width):
-        weight = np.zeros((width, 4))
-        weight[column] = 1e-3
-        path = linear_policy(tmp_path / "p.onnx", robot, weight, np.zeros(4), observation=parts)
-        policy, given = OnnxPolicy(path, robot, {}), []
-        for each in seen:
-            policy.rehearse()
-            given.append(1e3 * policy.act(each).raw[0])
-        before.append(given)
-    found = np.array(before).T
-    for k, each in enumerate(seen):
-        past = [seen[max(k - back, 0)].command for back in (1, 2)]
-        moved = [seen[k - back].moved.ravel() if k >= back else still for back in (1, 2)]
-        np.testing.assert_allclose(
-            found[k], np.concatenate([each.command, each.moved.ravel(), *past, *moved]), atol=1e-6
-        )
-
-
 def test_commands_end_at_the_limits_of_the_layout(robot: Robot, tmp_path: Path) -> None:
     path = linear_policy(tmp_path / "p.onnx", robot, np.zeros((INPUTS, 4)), np.full(4, 9e-3), high=(0.001,) * 4)
     np.testing.assert_allclose(OnnxPolicy(path, robot, {}).act(scene(robot)).command, 0.001)
@@ -119,7 +94,7 @@ def test_outputs_that_cannot_be_meant_end_the_session(robot: Robot, tmp_path: Pa
         ({"observation": (ObservationPart("commands", 16, "m"),)}, "needs 16 numbers of 'commands'"),
         ({"observation": (ObservationPart("markers", 16, "m"),)}, "needs 16 numbers of 'markers'; there are 12"),
         ({"observation": (ObservationPart("wind", 16, "m"),)}, "needs 'wind', which no sensor measures"),
-        ({"observation": (ObservationPart("goal", 3, "m"),)}, "wants a goal"),
+        ({"observation": (ObservationPart("goal", 3, "m"),)}, "needs a goal"),
         ({"observation": (ObservationPart("commands", 4, "m"),)}, "takes .* of width 16, its layout 4"),
     ],
 )

@@ -175,7 +175,7 @@ def test_a_turn_of_the_object_is_about_the_same_axis_in_the_robots_frame(
         np.testing.assert_allclose(sensor.latest().object_pose, expected, atol=1e-12)
     sensor.receive(SimpleNamespace(rigid_bodies=[body(20, (0.1, 1.7, 0.2), valid=False)]))
     assert sensor.latest().object_pose is None
-    with pytest.raises(InputError, match=r"sensor.object_body: a marker has the same rigid body"):
+    with pytest.raises(InputError, match=r"sensor.object_body: a marker and the object have the same rigid body"):
         NatNetMarkers(table.model_copy(update={"object_body": 13}), robot)
 
 

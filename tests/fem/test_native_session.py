@@ -83,7 +83,7 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(InputError, match="not started"):
         session.advance(displacement)
     session.reset(np.arange(BATCH), material)
-    with pytest.raises(InputError, match="other effects"):
+    with pytest.raises(InputError, match="other body effects"):
         session.reset(np.arange(BATCH), material._replace(effects=all_effects(7)))
     with pytest.raises(InputError, match="drive has shape"):
         session.advance(displacement[:2])

@@ -171,33 +171,6 @@ def test_what_a_marker_has_moved_is_the_difference_of_two_sightings(task) -> Non
         assert np.linalg.norm(second[:, part["object"]][:, 3:], axis=1) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_history_shows_earlier_commands_and_movements(robot_arm) -> None:
-    """Each as it stood in the observations before, the latest first; an episode that begins has stood still."""
-    lanes = make_episodes(REACH, 2, actions="continuous", observed="markers", noise=0.001, history=3, **robot_arm)
-    part, start = {}, 0
-    for piece in lanes.layout.observation:
-        part[piece.name], start = slice(start, start + piece.size), start + piece.size
-    assert lanes.layout.history == 3
-    rng, seen = np.random.default_rng(0), [lanes.reset([0, 1])]
-    for _ in range(4):
-        seen.append(lanes.act(rng.uniform(-1.0, 1.0, (2, len(lanes.layout.channels)))).observation)
-    for now, name in ((4, "commands"), (4, "moved"), (1, "commands"), (1, "moved")):
-        before = [
-            seen[k][:, part[name]] if k >= 0 else np.zeros_like(seen[0][:, part[name]]) for k in (now - 1, now - 2)
-        ]
-        assert np.array_equal(seen[now][:, part[f"earlier {name}"]], np.concatenate(before, axis=1))
-    other = seen[4][1]
-    again = lanes.reset([0])
-    assert not again[:, part["earlier commands"]].any()
-    assert not again[:, part["earlier moved"]].any()
-    assert np.array_equal(lanes._observe(np.array([1]))[0], other)  # an episode of another lane goes on
-
-
-def test_a_history_of_what_is_not_seen_is_refused() -> None:
-    with pytest.raises(InputError, match="has no history"):
-        layout_of(TASKS[REACH], Robot.load("trunk_sofa"), "discrete", "paper", history=2)
-
-
 @pytest.mark.parametrize("width", [0.5, 2.0])
 def test_a_wider_posterior_keeps_its_middle_and_its_correlations(width) -> None:
     rng = np.random.default_rng(0)

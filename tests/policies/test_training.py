@@ -199,12 +199,12 @@ def test_keys_that_came_later_are_as_they_are_by_default(trained, tmp_path) -> N
     folder = tmp_path / "checkpoints"
     shutil.copytree(trained[0] / "checkpoints", folder)
     state = json.loads((folder / "state.json").read_text())
-    assert state["known"]["table"].pop("history") == 1
+    assert state["known"]["table"].pop("tension_limit") is None
     (folder / "state.json").write_text(json.dumps(state))
     assert train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True).curve[-1]["steps"] == 6400
     (folder / "state.json").write_text(json.dumps(state))
-    with pytest.raises(InputError, match=r"other settings: .*history"):
-        train(Points, TABLE.model_copy(update={"history": 2}), tmp_path, seed=3, gamma=0.9, resume=True)
+    with pytest.raises(InputError, match=r"other settings: .*tension_limit"):
+        train(Points, TABLE.model_copy(update={"tension_limit": 9.0}), tmp_path, seed=3, gamma=0.9, resume=True)
 
 
 @pytest.mark.parametrize(("change", "seed", "words"), [({"environments": 8}, 3, "environments"), ({}, 4, "seed")])

@@ -148,7 +148,7 @@ def test_an_unwritable_folder_is_refused(record: PosteriorRecord, tmp_path: Path
 
 
 def test_predictions_must_fit_the_measurements() -> None:
-    with pytest.raises(InputError, match="do not fit together"):
+    with pytest.raises(InputError, match="differ in shape"):
         RecordingPrediction(
             "r", "fit", np.arange(3.0), ("tip",), np.zeros((3, 1, 3)), np.ones((3, 1), bool), np.zeros((5, 4, 1, 3))
         )

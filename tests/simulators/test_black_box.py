@@ -125,7 +125,7 @@ def test_what_jax_compiles_is_compiled_once_for_all_batches_of_whole_recordings(
     np.testing.assert_allclose(part.position[1:16, 0, 0], filtered(1.4, 0.25, level)[:15], atol=1e-12)
     assert sizes == 4 * [(3, 41, 1)]  # the first look at the function, two for five sets, one for the part
     assert compiled._cache_size() == 1
-    with pytest.raises(InputError, match="of one shape, of one parameter set"):
+    with pytest.raises(InputError, match="one_shape needs batched"):
         BlackBox(lag, parameters=PARAMETERS, one_shape=True, **NAMES)
 
 

@@ -79,7 +79,7 @@ def test_markers_start_at_the_mean_of_the_guides_and_the_first_stays(sofa):
 
 def test_it_has_no_episodes_and_says_so(sofa):
     task, settings = task_named("TrunkReach-v0"), Settings()
-    with pytest.raises(InputError, match="a body of tetrahedra does not step"):
+    with pytest.raises(InputError, match="a body of tetrahedra cannot run in control sessions"):
         Episodes(sofa, task, 1, Point({}), settings)
 
 

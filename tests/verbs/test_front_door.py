@@ -268,7 +268,7 @@ def test_an_audit_of_a_black_box_names_a_hidden_delay(runs):
     assert next(line.get_label() for line in found.plot_unseen("x", Figure().add_subplot()).lines) == "measured"
     with pytest.raises(InputError, match="did you mean 'rate'"):
         found.plot_residual("rates")
-    with pytest.raises(InputError, match="cannot draw"):
+    with pytest.raises(InputError, match="has no data for figures"):
         replace(found, shown=None).plot_blocks()
 
 

@@ -209,15 +209,15 @@ def test_asl_commands_may_come_with_a_start_pose_or_without(datasets):
     from rfdropo_bayes.data import DataSpec, load_recordings, load_unseen
 
     observations, commands = (f"asl_trunk/{kind}_controlled_1.csv.gz" for kind in ("observations", "control_inputs"))
-    entry = {"observations": observations, "commands": commands, "rows": [10000, 10400]}
+    entry = {"observations": observations, "commands": commands}
     spec = DataSpec.parse({"format": "asl-csv", "fit": [entry]})
     measured = load_recordings(spec, datasets)[0]
-    seen = load_unseen(spec, datasets, commands, observations, (10000, 10400))
+    seen = load_unseen(spec, datasets, commands, observations)
     np.testing.assert_array_equal(seen.position[0], measured.position[0])
     assert not seen.position_mask[1:].any()
     np.testing.assert_array_equal(seen.command, measured.command)
     np.testing.assert_array_equal(seen.initial_command, measured.initial_command)
-    unknown = load_unseen(spec, datasets, commands, None, (10000, 10400))
+    unknown = load_unseen(spec, datasets, commands)
     assert not unknown.position_mask.any()
     np.testing.assert_array_equal(unknown.command, measured.command)
 

@@ -120,7 +120,7 @@ def test_a_policy_is_trained_under_a_calibration_with_one_command(tmp_path) -> N
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ([], "takes an experiment file or --from DIR"),
+        ([], "the command needs an experiment file or --from DIR, not both"),
         ([REACH, "--task", "lift"], "use reach or push"),
         ([REACH, "--goal", "1,2"], "is not X,Y,Z"),
     ],

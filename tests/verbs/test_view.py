@@ -155,5 +155,5 @@ def test_own_robots_are_found_beside_the_file_or_given(tmp_path):
 
 def test_a_robot_with_other_markers_is_refused(tmp_path):
     file = prediction(tmp_path)
-    with pytest.raises(InputError, match=r"none of its markers \(m1, m2, m3, m4\) is the robot's"):
+    with pytest.raises(InputError, match=r"no marker of the recording \(m1, m2, m3, m4\) is a marker of the robot"):
         run_view(file, tmp_path / "still.png", [], None, known_robots()["asl_trunk"])

@@ -70,7 +70,7 @@ class Orientation(WhiteSeries):
                     valid.append(np.zeros_like(valid[0]))
                     continue
                 remedy = "leave [model] orientation = true out, or record them"
-                raise InputError("has no orientations", where=trajectory.name, remedy=remedy)
+                raise InputError("the recording has no orientations", where=trajectory.name, remedy=remedy)
             names = trajectory.section_names
             unknown = [name for name in names if name not in known]
             if unknown or names != (named or names):

@@ -83,7 +83,9 @@ class Tension(WhiteSeries):
 
         readings, valid = padded_readings(trajectories, length, needed, read, cls.name, "cable tensions")
         if any(column != columns[0] for column in columns):
-            raise InputError("the recordings measure different cables", where="[model] tension", remedy="use one set")
+            raise InputError(
+                "the recordings have tensions of different cables", where="[model] tension", remedy="use one set"
+            )
         return cls(readings, valid, cables=np.array(columns[0]))
 
     @property

@@ -170,7 +170,7 @@ class PlantProcess:
             answer = self._pipe.recv()
         except (EOFError, ConnectionError):
             raise InputError(
-                "its process has died", where="plant", remedy="run it in this process to see why"
+                "the process of the plant has died", where="plant", remedy="run it in this process to see why"
             ) from None
         if isinstance(answer, str):
             raise InputError(answer, where="plant")

@@ -201,7 +201,7 @@ class RodSession:
             self._run = _taken(run, [0])
         elif rubs != self._rubs or not np.array_equal(run.batch.present, self._run.batch.present):
             raise InputError(
-                "a lane has other effects of the body than earlier lanes",
+                "a lane has other body effects than earlier lanes",
                 where="reset",
                 remedy="give every lane the same mechanisms; a null value switches one off",
             )

@@ -310,7 +310,7 @@ def move_stations(tables, accepted, work, token):
 
 @kernel
 def predict_stations(tables, time, work, token):
-    """Let the stations move on at their velocity and spin."""
+    """Move the stations with their velocity and spin."""
     for station in range(tables.held, tables.stations):
         frame, row = FRAME * station, SIZE * station
         there = added(load3(work.velocity, row, token), time, load3(work.frame, frame, token))

@@ -255,7 +255,7 @@ def _nominal(model: Any, places: Sequence[Place], where: str) -> float:
     field, entries, sign = places[0]
     values = np.unique(np.asarray(field_of(model, field)[entries]))
     if len(values) == 0:
-        raise InputError("has nothing of that kind", where=where, remedy="choose another attribute")
+        raise InputError("the element has no such attribute", where=where, remedy="choose another attribute")
     return float(sign * values[-1])
 
 
