@@ -44,7 +44,7 @@ def energies(system: System, prepared: Prepared, state: State) -> Energies:
     twist, length = twist_of(state), jnp.asarray(np.diff(system.body.station))
     return Energies(
         kinetic=0.5 * jnp.sum(twist * momentum(prepared, state, twist)),
-        elastic=jnp.sum(length * sections.energy(prepared.section, strains(system, state).T)),
+        elastic=jnp.sum(length * sections.energy(prepared.section, strains(system, prepared, state).T)),
         gravitational=-jnp.sum(prepared.weight * state.position),
     )
 

@@ -176,10 +176,10 @@ def state_at_rest(system: System) -> State:
     return State(none.at[:, 2].set(station), upright, none, none, jnp.zeros(len(system.cables.anchor)))
 
 
-def strains(system: System, state: State) -> Float[Array, "elements 6"]:
+def strains(system: System, prepared: Prepared, state: State) -> Float[Array, "elements 6"]:
     """Strains of all elements: shear (2), stretch; curvature (2) and twist [1/m]."""
     length = jnp.asarray(np.diff(system.body.station))
-    return rod_elements.shape(length, state.position.T, state.orientation.T).strain.T
+    return rod_elements.shape(length, state.position.T, state.orientation.T, prepared.section.inner).strain.T
 
 
 def twist_of(state: State) -> Float[Array, "stations 6"]:
@@ -221,7 +221,7 @@ def remembering(
     if effects.softening_rate is not None:
         memory = memory._replace(clock=jnp.zeros(()))
     if effects.viscoelasticity is not None:
-        memory = memory._replace(branch=strains(system, state))
+        memory = memory._replace(branch=strains(system, prepared, state))
     friction = start_slip(system.cables, effects, state.tension)
     return state._replace(memory=memory._replace(slip=friction.slip, segment=friction.segment))
 
@@ -254,7 +254,7 @@ def within(system: System, prepared: Prepared, state: State, time_step: Scalar, 
     memory = state.memory
     if memory.branch is not None:
         share = (1.0 + stage.carried) * _gain(prepared, stage.length * time_step)[0]
-        memory = memory._replace(branch=memory.branch + share * (strains(system, state) - memory.branch))
+        memory = memory._replace(branch=memory.branch + share * (strains(system, prepared, state) - memory.branch))
     if memory.clock is not None:
         memory = memory._replace(clock=memory.clock + stage.elapsed * time_step)
     return memory

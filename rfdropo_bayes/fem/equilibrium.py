@@ -26,8 +26,10 @@ from rfdropo_bayes.fem.components import turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.derivatives import pushed_forward
 from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, accept, displaced, stage_body, state_at_rest
+from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.integrators import Stage
-from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Turning, Way, all_rows, linearised, solved_stage, stresses
+from rfdropo_bayes.fem.rod_elements import Six
+from rfdropo_bayes.fem.stage_solve import Bonds, StageBody, Way, all_rows, linearised, solved_stage, stresses
 
 ITERATIONS = 60
 SETTLED, ROW_SETTLED = 1e-10, 1e-6
@@ -45,6 +47,13 @@ SHORTEST, FARTHEST = 0.3, 10.0
 """Least and greatest share of an increment by that rule."""
 STEADY = 0.8
 """Cosine between successive increments above which growing ones lead away from an unstable equilibrium."""
+LEAST, FIRMER, EASED = 10.0, 4.0, 0.25
+"""Least share of the mass in a matrix that has no solution without, over E I / m L^3; its factor if that is too little,
+and its factor after an increment far from rest."""
+HOPELESS = 1e9
+"""A share of the mass beyond this many times the least: the body is lost."""
+CALM = 0.01
+"""Increments above this many body lengths are far from rest."""
 TINY = 1e-300
 NO_TIME = Stage(0.0, 1.0, 0.0, True)
 """A stage whose "velocities" are the motion itself."""
@@ -84,7 +93,8 @@ class Equilibrium(NamedTuple):
 class _Iterate(NamedTuple):
     place: State
     impulse: Float[Array, " rows"]
-    turning: Turning
+    turning: Six  # forces and moments that turn with the sections in the matrix
+    shift: Float[Array, ""]  # share of the mass in the matrix [1/s2]
     largest: Float[Array, ""]  # increment of the iteration before, over the body's length
     increment: Float[Array, "6 stations"]  # and all of it, in body lengths and radians
     pace: Float[Array, ""]  # share of it that was gone; 0 if the matrix has changed its kind since
@@ -94,15 +104,15 @@ class _Iterate(NamedTuple):
     softness: Float[Array, " cables"]
 
 
-def _body(system: System, task: Task, place: State) -> StageBody:
-    """The body without inertia and without anything that time does to it."""
+def _body(system: System, task: Task, place: State, shift: Scalar = 0.0) -> StageBody:
+    """The body with a share of its inertia and without anything that time does to it."""
     prepared = task.prepared
     timeless = prepared._replace(effects=prepared.effects._replace(drag=None, viscoelasticity=None))
     still = place._replace(velocity=jnp.zeros_like(place.velocity), spin=jnp.zeros_like(place.spin))
     pressure = system.split(task.drive)[1]
     body = stage_body(system, timeless, still, 1.0, task.external, NO_TIME, pressure=pressure)
     none = jnp.zeros(())
-    light = body._replace(mass=jnp.zeros_like(body.mass), inertia=jnp.zeros_like(body.inertia))
+    light = body._replace(mass=shift * body.mass, inertia=shift * body.inertia)
     return light._replace(lookahead=jnp.ones(()), behind=none, loss=none, gain=None, branch=None)
 
 
@@ -124,6 +134,14 @@ def _bonds(system: System, task: Task, place: State, previous: Float[Array, " ca
     return bonds._replace(rows=rows, base=length - before, compliance=weight, slips=slips)
 
 
+def _least_shift(system: System, prepared: Prepared) -> Float[Array, ""]:
+    """Least share of the mass in the matrix, about the square of the first frequency [1/s2]."""
+    bending = prepared.section.bending
+    about_x = bending[0] if bending.ndim == prepared.section.stretch.ndim else bending[0, 0]
+    flexible = jnp.sum(jnp.asarray(np.diff(system.body.station)) / about_x)
+    return LEAST / (flexible * (jnp.sum(prepared.mass) + TINY) * system.body.length**2)
+
+
 def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Array, ""]:
     """Share of an increment by Aitken's rule in the form of Irons and Tuck (1969, Int. J. Numer. Methods Eng. 1:275):
     from the change that the last increment, and the share of it that was gone, made to the next."""
@@ -136,19 +154,20 @@ def _pace(current: _Iterate, increment: Float[Array, "6 stations"]) -> Float[Arr
 
 def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibrium:
     """Newton's method. Increments are limited in length, and halved if they do not shrink; near the end see `_pace`.
-    A system without a solution is solved again without the geometric terms, which make the matrix indefinite near a
-    loss of stability. The terms return after a whole increment. The increments to come are no more than a geometric
-    series that goes on as the last two did.
+
+    A matrix without a solution, as near a loss of stability, is tried again with a share of the mass: a body then goes
+    a step in time without damping. The share grows until there is a solution, and gets less far from rest. The
+    increments to come are no more than a geometric series that goes on as the last two did.
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
 
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
-        body = _body(system, task, current.place)
+        body = _body(system, task, current.place, current.shift)
         solution, softness = solved_stage(way, body._replace(turning=current.turning), bonds)
         count = current.iterations + 1.0
-        again = ~jnp.isfinite(jnp.sum(solution.change**2)) & (current.turning.share > 0.0)
+        again = ~jnp.isfinite(jnp.sum(solution.change**2)) & (current.shift < HOPELESS * least)
         increment = solution.change / scales
         far, wide = jnp.max(jnp.abs(increment[:3])), jnp.max(jnp.abs(increment[3:]))
         size = jnp.maximum(far, wide)
@@ -159,22 +178,21 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
         share = jnp.where(paced, jnp.minimum(limit, _pace(current, increment)), plain)
         remaining = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
         remaining = jnp.where(share > 1.0, share * size, remaining)
-        before, kind = current.turning
-        turning = Turning(
-            before + share * (stresses(body, solution.change) - before), jnp.where(share < 1.0, kind, 1.0)
-        )
-        pace = jnp.where(turning.share == kind, share, 0.0)
+        turning = current.turning + share * (stresses(body, solution.change) - current.turning)
+        shift = jnp.where(size > CALM, EASED, 1.0) * current.shift
+        pace = jnp.where(shift < current.shift, 0.0, share)
         place = displaced(current.place, share * solution.change.T)
         rest = remaining > bound, solution.converged, count, softness
-        taken = _Iterate(place, solution.impulse, turning, size, increment, pace, *rest)
-        waiting = current._replace(turning=Turning(before, none[0, 0]), pace=none[0, 0], iterations=count)
+        taken = _Iterate(place, solution.impulse, turning, shift, size, increment, pace, *rest)
+        more = jnp.maximum(FIRMER * current.shift, least)
+        waiting = current._replace(shift=more, pace=none[0, 0], iterations=count)
         return jax.tree.map(lambda old, new: jnp.where(again, old, new), waiting, taken)
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
-    turning = Turning(stresses(_body(system, task, task.start), none), jnp.ones(()))
+    turning, least = stresses(_body(system, task, task.start), none), _least_shift(system, task.prepared)
     rest = task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
-    first = _Iterate(task.start, impulse, turning, jnp.array(jnp.inf), none, jnp.zeros(()), *rest)
+    first = _Iterate(task.start, impulse, turning, none[0, 0], jnp.array(jnp.inf), none, none[0, 0], *rest)
     last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
     return Equilibrium(
         last.place.position,

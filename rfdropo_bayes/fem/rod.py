@@ -166,6 +166,13 @@ def tributary_lengths(body: Rod) -> Float[np.ndarray, " stations"]:
     return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
 
 
+def shear_ratios(body: Rod) -> Float[np.ndarray, "elements 2"]:
+    """Flexibility of every element in S-shaped bending, h^2 / 12 E I, over that in shear, 1 / k G A, along x and y;
+    divided by G / E."""
+    square = np.diff(body.station) ** 2
+    return (SHEAR * body.axial_area * square / 12.0)[:, None] / body.bending_moment_area
+
+
 def drag_areas(body: Rod) -> Float[np.ndarray, " stations"]:
     """Width times length [m2] that belongs to each station."""
     return tributary_lengths(body) * np.sum(body.half_width, axis=1)

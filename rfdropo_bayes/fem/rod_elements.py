@@ -6,8 +6,16 @@ Engng 58:79-116). Forces are the exact derivatives of their energy. The tangent 
 forces of guided cables rotate with the rod's: the sum of both is the stiffness of taut strings between sections, which
 depends on the strains alone (``cables.taut_cables``).
 
-An arc is longer than its chord: the stretch of an element is its chord's plus h^2 / 24 times its squared curvature.
-Without this term an axially compressed element would be too stiff in bending.
+An element bends within itself as the forces at its ends let it, up to the second order in its length. Its flexibility
+in shear is 1 / k G A + h^2 / 12 E I: the second part is bending to the shape of an S. Its stretch is
+
+    Gamma_3 + (h^2 / 24) (1 + a e) K^2 + sum over x and y of (c + c' e) Gamma_i^2,   e = Gamma_3 / (1 + 4 Gamma_3^2)
+
+with Gamma of the chord, K the curvature, a = 1 - E A / k G A, f = k G A h^2 / 12 E I, g = k G A / E A, and
+c = ((1 - g) f + 3/5 f^2) / (1 + f)^2, c' = (1 - g) a f / 2 (1 + f)^2. An arc and an S are longer than their chords. The
+terms follow from the energy for a constant force in space, of which the rotation within the element is a minimum.
+Without them a pressed element is too stiff, and the error of a body is several times larger. The bound on e keeps steps
+of bodies whose cables press them to a fraction of their length.
 
 Arrays have their components first, then stations or elements, see ``components``. A field of 6 components is force and
 moment, or velocity and spin, in space.
@@ -36,7 +44,7 @@ from rfdropo_bayes.fem.components import (
     transposed,
     transposed_times,
 )
-from rfdropo_bayes.fem.effects import Scalar
+from rfdropo_bayes.fem.sections import Inner
 
 Six = Float[Array, "6 ..."]
 
@@ -50,6 +58,8 @@ class Elements(NamedTuple):
     bend: Vector  # vector part of the quaternion from section to section, in space
     share: Float[Array, "..."]  # 1 / (1 + scalar part)
     strain: Six  # shear (2), stretch; curvature (2), twist [1/m]
+    lean: Vector  # derivative of the stretch by shear (2) and by the chord's stretch
+    bow: Float[Array, "2 ..."]  # and by the curvature [m], over the last
 
 
 class Stiffness(NamedTuple):
@@ -67,7 +77,7 @@ class Stiffness(NamedTuple):
     ba: Matrix
 
 
-def shape(length: Float[Array, "..."], position: Vector, orientation: Quaternion) -> Elements:
+def shape(length: Float[Array, "..."], position: Vector, orientation: Quaternion, inner: Inner) -> Elements:
     """Shape of the elements between neighbouring stations."""
     first, second = orientation[:, :-1], orientation[:, 1:]
     scalar = dot(first, second)
@@ -78,21 +88,22 @@ def shape(length: Float[Array, "..."], position: Vector, orientation: Quaternion
     straight = first[0] * second[1:] - second[0] * first[1:]
     frame = rotation(normalised(first + second))
     way = position[:, 1:] - position[:, :-1]
-    stretch = transposed_times(frame, way) / length
-    curvature = 2.0 * (straight - across) / length
-    longer = length**2 * dot(curvature[:2], curvature[:2]) / 24.0 - 1.0
-    strain = jnp.concatenate([stretch[:2], stretch[2:] + longer, curvature])
-    return Elements(length, frame, way, straight + across, 1.0 / (1.0 + scalar), strain)
+    chord = transposed_times(frame, way) / length
+    shear, along, curvature = chord[:2], chord[2] - 1.0, 2.0 * (straight - across) / length
+    less = 1.0 / (1.0 + 4.0 * along**2)
+    bounded, rise = less * along, (2.0 * less - 1.0) * less
+    arc, wide = length**2 * dot(curvature[:2], curvature[:2]) / 24.0, 1.0 + inner.arc * bounded
+    slope = (inner.shear + inner.pressed * bounded) * shear
+    stretch = along + arc * wide + dot(slope, shear)
+    steep = 1.0 + rise * (inner.arc * arc + dot(inner.pressed * shear, shear))
+    strain = jnp.concatenate([shear, stretch[None], curvature])
+    lean, bow = jnp.concatenate([2.0 * slope, steep[None]]), length**2 / 12.0 * wide / steep * curvature[:2]
+    return Elements(length, frame, way, straight + across, 1.0 / (1.0 + scalar), strain, lean, bow)
 
 
 def _less_turn(elements: Elements, vector: Vector) -> Vector:
     """W times a vector: W (da_b - da_a) is h times the change of curvature, in space."""
     return vector - elements.bend * (elements.share * dot(elements.bend, vector))
-
-
-def _bow(elements: Elements) -> Float[Array, "2 ..."]:
-    """Derivative of the stretch by the curvature [m]."""
-    return elements.length**2 / 12.0 * elements.strain[3:5]
 
 
 def strain_rates(elements: Elements, twist: Six) -> Six:
@@ -103,14 +114,21 @@ def strain_rates(elements: Elements, twist: Six) -> Six:
     middle = 0.5 * (spin[:, 1:] + spin[:, :-1]) - 0.5 * cross(lean, relative[3:])
     stretching = transposed_times(elements.frame, relative[:3] + cross(elements.way, middle))
     bending = transposed_times(elements.frame, _less_turn(elements, relative[3:]))
-    longer = dot(_bow(elements), bending[:2])
-    return jnp.concatenate([stretching[:2], stretching[2:] + longer, bending]) / elements.length
+    along = stretching[2] + dot(elements.bow, bending[:2])
+    longer = dot(elements.lean, jnp.concatenate([stretching[:2], along[None]]))
+    return jnp.concatenate([stretching[:2], longer[None], bending]) / elements.length
+
+
+def leant(elements: Elements, resultant: Six) -> Six:
+    """Forces and moments between the stations in the elements' frames, from the sections' own."""
+    force = elements.lean * resultant[2]
+    return jnp.concatenate([resultant[:2] + force[:2], force[2:], resultant[3:]])
 
 
 def station_forces(elements: Elements, resultant: Six) -> Six:
-    """Forces and moments on all stations from the sections' forces and moments in the elements' frames."""
+    """Forces and moments on all stations from those between them, see ``leant``."""
     force = times(elements.frame, resultant[:3])
-    bowed = jnp.concatenate([resultant[3:5] + _bow(elements) * resultant[2], resultant[5:]])
+    bowed = jnp.concatenate([resultant[3:5] + elements.bow * resultant[2], resultant[5:]])
     moment = _less_turn(elements, times(elements.frame, bowed))
     lever = cross(elements.way, force)
     half, lean = 0.5 * lever, 0.5 * cross(elements.share * elements.bend, lever)
@@ -121,26 +139,27 @@ def station_forces(elements: Elements, resultant: Six) -> Six:
 
 
 def taut_resultant(elements: Elements, taut: TautCables, rates: Six) -> Six:
-    """Forces and moments of the sections in the elements' frames, of cables that hold them against strain rates."""
+    """Forces and moments between the stations in the elements' frames, of cables that resist strain rates."""
+    along = (rates[2] - dot(elements.lean[:2], rates[:2])) / elements.lean[2]
+    rates = jnp.concatenate([rates[:2], along[None], rates[3:]])
     stretching, bending = (elements.length * times(elements.frame, part) for part in (rates[:3], rates[3:]))
     force = times(taut.force, stretching) + times(taut.mixed, bending)
     moment = transposed_times(taut.mixed, stretching) + times(taut.moment, bending)
     return jnp.concatenate([transposed_times(elements.frame, force), transposed_times(elements.frame, moment)])
 
 
-def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six, share: Scalar) -> Stiffness:
-    """The stiffness with a share of the geometric term: forces of sections and of cables turn with the elements. The
-    term is of leading order and symmetric.
+def turning(elements: Elements, stiffness: Stiffness, resultant: Six, pull: Six) -> Stiffness:
+    """The stiffness with the geometric term: forces of sections and of cables turn with the elements. The term is of
+    leading order and symmetric.
 
     Args:
         elements: shape of all elements.
         stiffness: stiffness of the elements without this term.
-        resultant: forces and moments of the sections in the elements' frames.
+        resultant: forces and moments between the stations in the elements' frames.
         pull: forces and moments of the cables in space.
-        share: share of this term, 1 for the whole.
     """
-    force = 0.5 * share * (pull[:3] + times(elements.frame, resultant[:3]))
-    moment = 0.5 * share * (pull[3:] + times(elements.frame, resultant[3:]))
+    force = 0.5 * (pull[:3] + times(elements.frame, resultant[:3]))
+    moment = 0.5 * (pull[3:] + times(elements.frame, resultant[3:]))
     lean = force[:, None] * elements.way[None]
     swing = 0.25 * (lean + transposed(lean)) - 0.5 * diagonal(jnp.stack([dot(force, elements.way)] * 3))
     tilt, roll = skew(force), skew(moment)
@@ -152,7 +171,8 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, taut:
     """Stiffness of the elements, from the stiffness of the sections, a diagonal and a diagonal or a matrix, and of the
     cables that hold them."""
     frame, way = elements.frame, elements.way
-    c = product(frame * (stretch / elements.length)[None], transposed(frame))
+    axes = jnp.concatenate([frame[:, :2], times(frame, elements.lean)[:, None]], axis=1)
+    c = product(axes * (stretch / elements.length)[None], transposed(axes))
     turned = frame * bending[None] if bending.ndim == stretch.ndim else product(frame, bending)
     bent = product(turned / elements.length, transposed(frame))
     if taut is not None:
@@ -162,7 +182,7 @@ def tangent(elements: Elements, stretch: Vector, bending: Vector | Matrix, taut:
         bent = transposed(bent - elements.bend[:, None] * (elements.share * row)[None])
     lean = elements.share * elements.bend
     turn, fold = 0.5 * skew(way), 0.5 * (lean[:, None] * way[None] - diagonal(jnp.stack([dot(lean, way)] * 3)))
-    bow = _less_turn(elements, times(frame[:, :2], _bow(elements)))
+    bow = _less_turn(elements, times(frame[:, :2], elements.bow))
     fold = fold - frame[:, 2][:, None] * bow[None]
     lever_a, lever_b = turn + fold, turn - fold
     a, b = product(c, lever_a), product(c, lever_b)

@@ -14,17 +14,26 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem.components import diagonal, dot, times
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Scalar
-from rfdropo_bayes.fem.rod import SHEAR, Rod
+from rfdropo_bayes.fem.rod import SHEAR, Rod, shear_ratios
 
 LEAST_TANGENT = 0.1
 """Least tangent stiffness under the fibre law, relative to the linear section's: matrices stay positive definite."""
 
 
+class Inner(NamedTuple):
+    """Coefficients of bending within the elements, see ``rod_elements``."""
+
+    arc: Scalar  # a
+    shear: Float[Array, "2 ..."]  # c, along x and y
+    pressed: Float[Array, "2 ..."]  # c'
+
+
 class Sections(NamedTuple):
     """Stiffness of the sections of all elements, at rest."""
 
-    stretch: Float[Array, "3 ..."]  # k G A twice, E A [N]
+    stretch: Float[Array, "3 ..."]  # against shear twice, E A [N]
     bending: Float[Array, "3 ..."] | Float[Array, "3 3 ..."]  # E I about x, about y, G J; with a bending law a matrix
+    inner: Inner
     fibre: Scalar | None = None  # c of the fibre law; with a bending law
 
 
@@ -34,14 +43,24 @@ def sections(
     """Stiffness of the sections of a rod."""
     young = scale * young_modulus
     shear = young / (2.0 * (1.0 + poisson_ratio))
-    stretch = jnp.stack([SHEAR * shear * body.axial_area] * 2 + [young * body.axial_area])
+    inner, left = inner_bending(body, poisson_ratio)
+    stretch = jnp.stack([*(left * SHEAR * shear * body.axial_area), young * body.axial_area])
     moment = body.bending_moment_area
     bending = jnp.stack([young * moment[:, 1], young * moment[:, 0], shear * body.torsion_constant])
     if effects.bending is None:
-        return Sections(stretch, bending)
+        return Sections(stretch, bending, inner)
     root = jnp.sqrt(bending)
     bending = diagonal(bending) + _coupling(effects.bending)[:, :, None] * root[:, None] * root[None]
-    return Sections(stretch, bending, jnp.asarray(effects.bending.fibre, dtype=float))
+    return Sections(stretch, bending, inner, jnp.asarray(effects.bending.fibre, dtype=float))
+
+
+def inner_bending(body: Rod, poisson_ratio: Scalar) -> tuple[Inner, Float[Array, "2 elements"]]:
+    """Coefficients of bending within elements, and the share of the stiffness in shear that it leaves."""
+    soft = SHEAR / (2.0 * (1.0 + jnp.asarray(poisson_ratio, dtype=float)))
+    ratio = jnp.asarray(shear_ratios(body).T) * (soft / SHEAR)
+    left, arc = 1.0 / (1.0 + ratio), 1.0 - 1.0 / soft
+    pressed = (1.0 - soft) * ratio * left**2
+    return Inner(arc, pressed + 0.6 * (ratio * left) ** 2, 0.5 * arc * pressed), left
 
 
 def _coupling(law: BendingLaw) -> Float[Array, "3 3"]:

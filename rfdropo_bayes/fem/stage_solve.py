@@ -53,13 +53,6 @@ from rfdropo_bayes.fem.rod_elements import Elements, Six
 from rfdropo_bayes.fem.sections import Sections, answer, linear, slopes
 
 
-class Turning(NamedTuple):
-    """Forces that turn with the sections in the matrix of an equilibrium."""
-
-    resultant: Six  # forces and moments of the sections in the elements' frames
-    share: Scalar  # 0 without them, 1 with them
-
-
 class StageBody(NamedTuple):
     """A rod in a stage; arrays have their components first."""
 
@@ -80,7 +73,7 @@ class StageBody(NamedTuple):
     gain: Scalar | None = None  # stiffness of a Prony branch, relative
     branch: Six | None = None  # strains of its dashpot
     blown: Six | None = None  # forces and moments that chambers take from the sections [N], [N m]
-    turning: Turning | None = None  # of an equilibrium
+    turning: Six | None = None  # forces and moments between the stations that turn, in an equilibrium's matrix
 
 
 class Bonds(NamedTuple):
@@ -147,7 +140,7 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
     frame = rotation(body.orientation)
     course = courses(way.layout, thread, body.position, frame)
     between = taut_cables(way.layout, course, tension, len(body.length))
-    elements = rod_elements.shape(body.length, body.position, body.orientation)
+    elements = rod_elements.shape(body.length, body.position, body.orientation, body.section.inner)
     slope = slopes(body.section, elements.strain)
     rates = rod_elements.strain_rates(elements, body.twist)
     resultant = answer(body.section, elements.strain) + body.behind * linear(slope, rates)
@@ -155,6 +148,7 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
         resultant = resultant + body.gain * linear(body.section, elements.strain - body.branch)
     if body.blown is not None:
         resultant = resultant - body.blown
+    resultant = rod_elements.leant(elements, resultant)
     if not way.predicted:
         resultant = resultant + body.span * rod_elements.taut_resultant(elements, between, rates)
     momentum = inertia_times(body, frame, body.twist)
@@ -169,16 +163,16 @@ def linearised(way: Way, body: StageBody, thread: Threads, tension: Float[Array,
 
 def stresses(body: StageBody, change: Six) -> Six:
     """Forces and moments of the sections after a change of all stations, linear in it."""
-    elements = rod_elements.shape(body.length, body.position, body.orientation)
+    elements = rod_elements.shape(body.length, body.position, body.orientation, body.section.inner)
     rates = rod_elements.strain_rates(elements, change)
-    stress = answer(body.section, elements.strain) + linear(slopes(body.section, elements.strain), rates)
-    return stress if body.blown is None else stress - body.blown
+    found = answer(body.section, elements.strain) + linear(slopes(body.section, elements.strain), rates)
+    return rod_elements.leant(elements, found if body.blown is None else found - body.blown)
 
 
 def matrix_times(body: StageBody, line: Linearised, change: Six) -> Six:
     """A times a field."""
     rates = rod_elements.strain_rates(line.elements, change)
-    strained = body.lookahead * linear(line.slope, rates)
+    strained = rod_elements.leant(line.elements, body.lookahead * linear(line.slope, rates))
     strained = strained + body.span * rod_elements.taut_resultant(line.elements, line.taut, rates)
     stiff = -body.span * rod_elements.station_forces(line.elements, strained)
     result = stiff + (1.0 + body.span * body.loss) * inertia_times(body, line.frame, change)
@@ -192,14 +186,16 @@ def matrix(body: StageBody, line: Linearised) -> Chain:
     """A."""
     scale = body.span * body.lookahead
     taut = TautCables(*(body.span**2 * part for part in line.taut))
-    bending = scale * line.slope.bending
+    stretch, bending = scale * line.slope.stretch, scale * line.slope.bending
     if body.turning is not None:
-        bow = body.turning.share * body.turning.resultant[2] * body.length**2 / 12.0
-        bow = jnp.stack([bow, bow, jnp.zeros_like(bow)])
+        axial = body.turning[2]
+        bow, none = axial * body.length**2 / 12.0, jnp.zeros_like(axial)
+        bow = jnp.stack([bow, bow, none])
+        stretch = stretch + jnp.stack([*(2.0 * axial * body.section.inner.shear), none])
         bending = bending + (bow if bending.ndim == bow.ndim else diagonal(bow))
-    element = rod_elements.tangent(line.elements, scale * line.slope.stretch, bending, taut)
+    element = rod_elements.tangent(line.elements, stretch, bending, taut)
     if body.turning is not None and line.pull is not None:
-        element = rod_elements.turning(line.elements, element, body.turning.resultant, line.pull, body.turning.share)
+        element = rod_elements.turning(line.elements, element, body.turning, line.pull)
     grown = 1.0 + body.span * body.loss
     straight = jnp.eye(3).reshape(3, 3, *[1] * body.mass.ndim) * (grown * body.mass)
     if body.added is not None:

@@ -54,14 +54,21 @@ class Shape:
         return new
 
 
-def strains(shape: Shape, length: np.ndarray, e: int) -> tuple[np.ndarray, np.ndarray]:
-    """Strains of an element, and their derivatives by the twists of both stations (6, 12)."""
+def shear_share(body: Any, material: Any, e: int) -> np.ndarray:
+    """Flexibility of an element in S-shaped bending over that in shear, along x and y."""
+    flexible = 2.0 * (1.0 + material.poisson_ratio) / (SHEAR * body.axial_area[e])
+    return np.diff(body.station)[e] ** 2 / (12.0 * body.bending_moment_area[e]) / flexible
+
+
+def strains(body: Any, material: Any, shape: Shape, e: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Strains of an element, their derivatives by the twists of both stations (6, 12), and these with the stretch of
+    the chord and its arc alone."""
     first, second = shape.turn[e], shape.turn[e + 1]
     if first @ second < 0.0:
         second = -second
     between = product(first * [1.0, -1.0, -1.0, -1.0], second)
     middle = matrix((first + second) / np.linalg.norm(first + second))
-    chord, h = shape.place[e + 1] - shape.place[e], length[e]
+    chord, h = shape.place[e + 1] - shape.place[e], np.diff(body.station)[e]
     strain = np.concatenate([middle.T @ chord / h - [0.0, 0.0, 1.0], 2.0 * between[1:] / h])
     u = middle @ between[1:]
     w, g = np.eye(3) - np.outer(u, u) / (1.0 + between[0]), hat(u / (1.0 + between[0]))
@@ -69,10 +76,19 @@ def strains(shape: Shape, length: np.ndarray, e: int) -> tuple[np.ndarray, np.nd
     none = np.zeros((3, 3))
     rows = np.block([[-np.eye(3), levers[0], np.eye(3), levers[1]], [none, -w, none, w]])
     rows = np.kron(np.eye(2), middle.T) @ rows / h
-    # An arc is longer than its chord.
-    rows[2] += h**2 / 12.0 * strain[3:5] @ rows[3:5]
-    strain[2] += h**2 / 24.0 * strain[3:5] @ strain[3:5]
-    return strain, rows
+    # An arc, and an S, are longer than their chords: the second order of both in the strains, with the stretch's share.
+    share, stiff = shear_share(body, material, e), SHEAR / (2.0 * (1.0 + material.poisson_ratio))
+    arc, left, along = h**2 / 24.0 * strain[3:5] @ strain[3:5], 1.0 / (1.0 + share), strain[2]
+    shorter, first = 1.0 - 1.0 / stiff, (1.0 - stiff) * share * left**2
+    bounded, rise = along / (1.0 + 4.0 * along**2), (1.0 - 4.0 * along**2) / (1.0 + 4.0 * along**2) ** 2
+    slope = first * (1.0 + 0.5 * shorter * bounded) + 0.6 * (share * left) ** 2
+    steep = 1.0 + rise * shorter * (arc + 0.5 * first @ strain[:2] ** 2)
+    strain[2] += arc * (1.0 + shorter * bounded) + slope @ strain[:2] ** 2
+    bow = h**2 / 12.0 * (1.0 + shorter * bounded) * strain[3:5]
+    straight = rows.copy()
+    straight[2] += bow @ rows[3:5] / steep
+    rows[2] = steep * straight[2] + 2.0 * slope * strain[:2] @ rows[:2]
+    return strain, rows, straight
 
 
 def stiffness(body: Any, material: Any, e: int) -> np.ndarray:
@@ -80,16 +96,24 @@ def stiffness(body: Any, material: Any, e: int) -> np.ndarray:
     young = material.young_modulus * material.stiffness_scale[e]
     shear = young / (2.0 * (1.0 + material.poisson_ratio))
     about_y, about_x = body.bending_moment_area[e]
-    area = body.axial_area[e]
+    area, left = body.axial_area[e], 1.0 / (1.0 + shear_share(body, material, e))
     return np.array(
-        [SHEAR * shear * area] * 2 + [young * area, young * about_x, young * about_y, shear * body.torsion_constant[e]]
+        [
+            *(left * SHEAR * shear * area),
+            young * area,
+            young * about_x,
+            young * about_y,
+            shear * body.torsion_constant[e],
+        ]
     )
 
 
 def energy(body: Any, material: Any, shape: Shape) -> float:
     """Elastic energy [J] of a linear rod."""
     length = np.diff(body.station)
-    parts = [(strains(shape, length, e)[0], stiffness(body, material, e), length[e]) for e in range(body.elements)]
+    parts = [
+        (strains(body, material, shape, e)[0], stiffness(body, material, e), length[e]) for e in range(body.elements)
+    ]
     return sum(0.5 * h * strain @ (stiff * strain) for strain, stiff, h in parts)
 
 
@@ -140,7 +164,7 @@ def cable_rows(system: Any, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     return np.array(lengths), np.reshape(rows, (len(lengths), 6 * len(system.body.station)))
 
 
-def held(system: Any, shape: Shape, tension: np.ndarray) -> np.ndarray:
+def held(system: Any, material: Any, shape: Shape, tension: np.ndarray) -> np.ndarray:
     """Stiffness (stations * 6, stations * 6) of the second derivatives of all ways by the strains of the elements that
     they run beside: a straight way that holds several elements is taken to hold each."""
     station, length = system.body.station, np.diff(system.body.station)
@@ -162,7 +186,7 @@ def held(system: Any, shape: Shape, tension: np.ndarray) -> np.ndarray:
                 arm = along * arms[g] + (1.0 - along) * arms[max(g - 1, 0)]
                 a, b = shape.turn[e], shape.turn[e + 1] * np.sign(shape.turn[e] @ shape.turn[e + 1])
                 middle = matrix((a + b) / np.linalg.norm(a + b))
-                rows = h * np.kron(np.eye(2), middle) @ strains(shape, length, e)[1]
+                rows = h * np.kron(np.eye(2), middle) @ strains(system.body, material, shape, e)[2]
                 change = rows[:3] - hat(arm) @ rows[3:]
                 share = (last - first) * np.linalg.norm(rest[g + 1] - rest[g]) / h**2
                 both = slice(6 * e, 6 * e + 12)
@@ -244,7 +268,7 @@ class Motion:
                 right[k] += mass[k] @ carried[k]
         length = np.diff(system.body.station)
         for e in range(system.body.elements):
-            strain, rows = strains(shape, length, e)
+            strain, rows, _ = strains(system.body, material, shape, e)
             stiff, h = stiffness(system.body, material, e), length[e]
             rate = rows @ velocity[e : e + 2].ravel()
             behind = p + beta if euler else beta
@@ -252,7 +276,7 @@ class Motion:
             right[e : e + 2] -= p * force.reshape(2, 6)
             both = slice(6 * e, 6 * e + 12)
             matrix_[both, both] += p * (p + beta) * h * (rows.T * stiff) @ rows
-        taut = p * p * held(system, shape, self.tension)
+        taut = p * p * held(system, material, shape, self.tension)
         matrix_ += taut
         if euler:
             right -= (taut @ velocity.ravel()).reshape(right.shape)
@@ -276,7 +300,7 @@ def unbalanced(system: Any, material: Any, shape: Shape, tension: np.ndarray) ->
     total = np.zeros((len(mass), 6))
     total[:, :3] = mass[:, 0, 0, None] * np.asarray(material.gravity)
     for e in range(system.body.elements):
-        strain, rows = strains(shape, length, e)
+        strain, rows, _ = strains(system.body, material, shape, e)
         force = rows.T @ (length[e] * stiffness(system.body, material, e) * strain)
         total[e : e + 2] -= force.reshape(2, 6)
     total -= (tension @ cable_rows(system, shape)[1]).reshape(total.shape)

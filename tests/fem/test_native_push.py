@@ -46,6 +46,7 @@ def case() -> tuple[fem.Material, np.ndarray, np.ndarray, np.ndarray]:
         gravity=np.tile([0.0, -9.81, 0.0], (BATCH, 1)),
         stiffness_scale=np.ones((BATCH, ELEMENTS)),
         point_mass=np.zeros((BATCH, ELEMENTS + 1)),
+        axial_scale=np.ones(BATCH),
     )
     pull = np.linspace(0.0, 6e-3, STEPS)[:, None] * np.array([0.0, 0.0, 1.0])
     displacement = np.cumsum(3e-4 * random.normal(size=(BATCH, STEPS, 3)), axis=1) + pull

@@ -35,7 +35,7 @@ def test_sag_and_modes_are_those_of_the_solid():
         prepared = fem.prepare(system, trunk.material(trunk.complete({"poisson_ratio": poisson_ratio})))
 
         def stored(way):
-            strain = strains(system, displaced(rest, way.reshape(stations, 6)))
+            strain = strains(system, prepared, displaced(rest, way.reshape(stations, 6)))
             return jnp.sum(length * energy(prepared.section, strain.T))
 
         mass = jnp.concatenate([jnp.repeat(prepared.mass[:, None], 3, axis=1), prepared.inertia], axis=1)

@@ -70,7 +70,7 @@ def law_rows(
     if law is None:
         return rows.reshape(len(rows), -1)
     modulus = np.stack([young_modulus, young_modulus, shear_modulus], axis=1)
-    root = np.sqrt(scale[:, :, None] * section_areas(body)[:, 2:] * modulus[:, None, :])
+    root = np.sqrt(scale[:, :, None] * section_areas(body)[:, 3:] * modulus[:, None, :])
     anisotropy, cross, twist_x, twist_y = (
         np.broadcast_to(value, len(rows))[:, None]
         for value in (law.anisotropy, law.cross_plane, law.twist_x, law.twist_y)

@@ -19,11 +19,13 @@ from __future__ import annotations
 from rfdropo_bayes.fem.native.chain_cholesky import BLOCK, PANEL
 from rfdropo_bayes.fem.native.rod_effects import BENDING, BRANCH, LOADED, add_branch, find_slopes, place_law_stress
 from rfdropo_bayes.fem.native.rod_records import (
+    ALONG,
     BOW,
     CHORD,
     DIRECTOR,
     GRADIENT,
     HELD,
+    LEAN,
     NET,
     RATE,
     SLOPE,
@@ -31,7 +33,7 @@ from rfdropo_bayes.fem.native.rod_records import (
     STRESS,
     TILTED,
 )
-from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
+from rfdropo_bayes.fem.native.rod_tables import FRAME, INNER, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import (
     any_greater,
     fill,
@@ -62,7 +64,7 @@ def _turn_between(turn, q, token):
 
 
 @kernel
-def measure_element(tables, element, work, token):
+def measure_element(tables, samples, element, work, token):
     """Directors in the middle of an element, these times W, chord, g and strains times length."""
     rows, one = work.element, fill(1.0, work.turn, token)
     w, (x, y, z), between, inverse = _turn_between(work.turn, 4 * element, token)
@@ -80,9 +82,23 @@ def measure_element(tables, element, work, token):
     x, y, z = components(rows, DIRECTOR, chord, token)
     bend, length = plus(between, between), fill(tables.length[element], work.element, token)
     bow = scaled(load3(rows, TILTED, token), bend[0])
-    put(rows, BOW, scaled(added(load3(rows, TILTED + 3, token), bend[1], bow), length * (1.0 / 12.0)))
-    longer = fma(bend[0], bend[0], bend[1] * bend[1]) * (1.0 / 24.0) - 1.0
-    put(rows, STRAIN, (x, y, fma(longer, length, z)))
+    inner, along = INNER * element, z - length
+    curl, arc = load(samples.inner, inner, token), fma(bend[0], bend[0], bend[1] * bend[1]) * (1.0 / 24.0)
+    stretch = along / length
+    square = 4.0 * stretch * stretch
+    less = one / (square + one)
+    bounded, rise = along * less, (one - square) * less * less
+    wide = fma(curl, bounded, length)
+    bow = added(load3(rows, TILTED + 3, token), bend[1], bow)
+    longer, steep = fma(arc, wide, along), fma(curl * rise, arc, one)
+    for i in range(2):
+        strain, more = (x, y)[i], load(samples.inner, inner + 3 + i, token)
+        lean = fma(more, bounded, load(samples.inner, inner + 1 + i, token)) * strain
+        store(rows, LEAN + i, lean + lean)
+        longer, steep = fma(lean, strain, longer), fma(rise * more * strain, strain, steep)
+    store(rows, LEAN + 2, steep)
+    put(rows, BOW, scaled(bow, wide * (1.0 / 12.0) / steep))
+    put(rows, STRAIN, (x, y, longer))
     put(rows, STRAIN + 3, bend)
 
 
@@ -98,7 +114,9 @@ def _measure_rates(element, work, token):
     drift = minus(load3(work.velocity, b, token), load3(work.velocity, a, token))
     drift = added(cross(chord, middle), half, drift)
     x, y, z = components(rows, DIRECTOR, drift, token)
-    put(rows, RATE, (x, y, z + dot(load3(rows, BOW, token), turning)))
+    z = z + dot(load3(rows, BOW, token), turning)
+    put(rows, RATE, (x, y, dot(load3(rows, LEAN, token), (x, y, z))))
+    store(rows, ALONG, z)
     put(rows, RATE + 3, components(rows, TILTED, turning, token))
 
 
@@ -121,7 +139,7 @@ def add_forces(element, rows, field, token):
 @kernel
 def _entry(i):
     """Row of ``SLOPE`` that stiffness i of a section without laws has."""
-    return i if i < 3 else 5 if i == 3 else 7
+    return i if i < 4 else 6 if i == 4 else 8
 
 
 @kernel
@@ -136,7 +154,7 @@ def place_stress(tables, samples, factors, element, work, token):
     if samples.present[BENDING]:
         find_slopes(tables, samples, element, work, token)
     for i in range(SIZE):
-        stiff = load(rows, SLOPE + _entry(0 if i < 2 else i - 1), token)
+        stiff = load(rows, SLOPE + _entry(i), token)
         strain = fma(force, load(rows, STRAIN + i, token), rate * load(rows, RATE + i, token))
         store(rows, STRESS + i, stiff * strain)
     if samples.present[BENDING]:
@@ -149,6 +167,9 @@ def place_stress(tables, samples, factors, element, work, token):
         for i in range(3):
             row = STRESS + 2 + i
             store(rows, row, fnma(pressure, fill(tables.blown[t + i], rows, token), load(rows, row, token)))
+    pull = load(rows, STRESS + 2, token)
+    store(rows, STRESS + 2, pull - pull)
+    put(rows, STRESS, added(load3(rows, LEAN, token), pull, load3(rows, STRESS, token)))
 
 
 @inlined
@@ -316,7 +337,8 @@ def _mixed(rows, token):
 @kernel
 def _hold_rates(rows, token):
     """Add to the stresses the resistance of cables to the strain rates of an element."""
-    stretching = combined(rows, DIRECTOR, load3(rows, RATE, token), token)
+    x, y, _ = load3(rows, RATE, token)
+    stretching = combined(rows, DIRECTOR, (x, y, load(rows, ALONG, token)), token)
     bending = combined(rows, DIRECTOR, load3(rows, RATE + 3, token), token)
     mixed = _mixed(rows, token)
     force = plus(_applied(_columns(_load_lower(rows, HELD, token)), stretching), _applied(mixed, bending))
@@ -341,24 +363,28 @@ def _levers(rows, token):
 
 
 @kernel
-def _section_force(rows, elasticity, token):
-    """Lower half of the force by stretch and shear, in space."""
-    soft, stiff = elasticity * load(rows, SLOPE, token), elasticity * load(rows, SLOPE + 1, token)
-    zero, axis = soft - soft, load3(rows, DIRECTOR + 6, token)
-    return _sum(_symmetric(axis, stiff - soft), (soft, zero, zero, soft, zero, soft))
+def _section_force(samples, element, rows, elasticity, turning, token):
+    """Lower half of the force by stretch and shear, in space; ``turning``: the axial force that turns, or zero."""
+    axis = combined(rows, DIRECTOR, load3(rows, LEAN, token), token)
+    force = _symmetric(axis, elasticity * load(rows, SLOPE + 2, token))
+    for i in range(2):
+        lean = turning * load(samples.inner, INNER * element + 1 + i, token)
+        soft = fma(elasticity, load(rows, SLOPE + i, token), lean + lean)
+        force = _sum(force, _symmetric(load3(rows, DIRECTOR + 3 * i, token), soft))
+    return force
 
 
 @kernel
 def _section_moment(rows, elasticity, bow, lawful, token):
     """Lower half of the moment by bending and twist in space, between W and W; ``bow``: added stiffness of bending."""
     x, y, z = load3(rows, TILTED, token), load3(rows, TILTED + 3, token), load3(rows, TILTED + 6, token)
-    moment = _symmetric(x, fma(elasticity, load(rows, SLOPE + 2, token), bow))
-    moment = _sum(moment, _symmetric(y, fma(elasticity, load(rows, SLOPE + 5, token), bow)))
-    moment = _sum(moment, _symmetric(z, elasticity * load(rows, SLOPE + 7, token)))
+    moment = _symmetric(x, fma(elasticity, load(rows, SLOPE + 3, token), bow))
+    moment = _sum(moment, _symmetric(y, fma(elasticity, load(rows, SLOPE + 6, token), bow)))
+    moment = _sum(moment, _symmetric(z, elasticity * load(rows, SLOPE + 8, token)))
     if lawful:
-        moment = _sum(moment, _both(x, scaled(y, elasticity * load(rows, SLOPE + 3, token))))
-        moment = _sum(moment, _both(x, scaled(z, elasticity * load(rows, SLOPE + 4, token))))
-        moment = _sum(moment, _both(y, scaled(z, elasticity * load(rows, SLOPE + 6, token))))
+        moment = _sum(moment, _both(x, scaled(y, elasticity * load(rows, SLOPE + 4, token))))
+        moment = _sum(moment, _both(x, scaled(z, elasticity * load(rows, SLOPE + 5, token))))
+        moment = _sum(moment, _both(y, scaled(z, elasticity * load(rows, SLOPE + 7, token))))
     return moment
 
 
@@ -370,14 +396,14 @@ def _less_turn(rows, matrix, token):
 
 
 @kernel
-def _turning(rows, factor, token):
+def _turning(rows, token):
     """Geometric terms of a section and its cables, in leading order: force by rotation of the middle, moment by
     rotation of the middle (lower half), and moment by the rotations of both sections.
     """
     force = plus(load3(rows, NET, token), combined(rows, DIRECTOR, load3(rows, STRESS, token), token))
     moment = plus(load3(rows, NET + 3, token), combined(rows, DIRECTOR, load3(rows, STRESS + 3, token), token))
-    force, moment = scaled(force, 0.5 * factor), scaled(moment, 0.5 * factor)
-    chord, zero = load3(rows, CHORD, token), factor - factor
+    half = fill(0.5, rows, token)
+    force, moment, chord, zero = scaled(force, half), scaled(moment, half), load3(rows, CHORD, token), half - half
     ball = -0.5 * dot(force, chord)
     swing = _sum(_both(force, scaled(chord, 0.25)), (ball, zero, zero, ball, zero, ball))
     return _skew(force), _columns(swing), _skew(moment)
@@ -391,15 +417,14 @@ def _skew(a):
 
 
 @kernel
-def add_element_tangent(tables, factors, element, work, whole, held, lawful, still, token):
+def add_element_tangent(tables, samples, factors, element, work, whole, held, lawful, still, token):
     """Add the tangent of an element to the pivot of its upper station; ``whole``: set the coupling, and start the pivot
     of the lower one; ``held`` by cables; ``lawful``: with a bending law; ``still``: of an equilibrium."""
     rows, upper, elasticity = work.element, (element + 1) * BLOCK, load(factors.elasticity, 0, token)
     lower, tile, (first, second) = upper - BLOCK, upper + PANEL, _levers(rows, token)
-    bow = elasticity - elasticity
-    if still:
-        bow = load(factors.turning, 0, token) * load(rows, STRESS + 2, token) * (tables.length[element] / 12.0)
-    force = _section_force(rows, elasticity, token)
+    axial = load(rows, STRESS + 2, token) if still else elasticity - elasticity
+    force = _section_force(samples, element, rows, elasticity, axial, token)
+    bow = axial * (tables.length[element] / 12.0)
     bent = _columns(_section_moment(rows, elasticity, bow, lawful, token))
     if held:
         force = _sum(force, _load_lower(rows, HELD, token))
@@ -415,7 +440,7 @@ def add_element_tangent(tables, factors, element, work, whole, held, lawful, sti
     turned, bent = _plus(_back_product(second, b), turned), _plus(_back_product(first, a), bent)
     across = _plus(_back_product(first, b), across)
     if still:
-        tilt, swing, roll = _turning(rows, load(factors.turning, 0, token), token)
+        tilt, swing, roll = _turning(rows, token)
         a, b, turned, bent = _minus(a, tilt), _minus(b, tilt), _plus(turned, swing), _plus(bent, swing)
         across = _plus(_plus(across, swing), roll)
     _put_lower(work.pivot, upper, force, True, token)
@@ -437,7 +462,7 @@ def add_element_tangent(tables, factors, element, work, whole, held, lawful, sti
 @kernel
 def assemble_element(tables, samples, factors, element, work, whole, predicted, still, token):
     """Force of an element and its part of the matrix; see `add_element_tangent` for ``whole``."""
-    measure_element(tables, element, work, token)
+    measure_element(tables, samples, element, work, token)
     held = _measure_held(tables, factors, element, work, token)
     place_stress(tables, samples, factors, element, work, token)
     if held and not predicted and not still:
@@ -446,7 +471,7 @@ def assemble_element(tables, samples, factors, element, work, whole, predicted, 
     if still:
         for i in range(SIZE):
             store(work.element, STRESS + i, load(work.stress, SIZE * element + i, token))
-    add_element_tangent(tables, factors, element, work, whole, held, samples.present[BENDING], still, token)
+    add_element_tangent(tables, samples, factors, element, work, whole, held, samples.present[BENDING], still, token)
 
 
 @kernel

@@ -35,14 +35,14 @@ def find_slopes(tables, samples, element, work, token):
     rows, section, law = work.element, SECTION * element, LAW * element
     left, least = _left(tables, samples, element, work, token), fill(LEAST_TANGENT, work.element, token)
     left = where_greater(left, least, left, least)
-    store(rows, SLOPE + 1, left * load(samples.section, section + 1, token))
+    store(rows, SLOPE + 2, left * load(samples.section, section + 2, token))
     for i in range(LAW):
         firm = load(samples.law, law + i, token)
         if i == 0 or i == 3 or i == 5:
-            firm = firm + load(samples.section, section + (2 if i == 0 else 3 if i == 3 else 4), token)
+            firm = firm + load(samples.section, section + (3 if i == 0 else 4 if i == 3 else 5), token)
         store(rows, FIRM + i, firm)
         planar = i == 0 or i == 1 or i == 3
-        store(rows, SLOPE + 2 + i, firm * left if planar else firm)
+        store(rows, SLOPE + 3 + i, firm * left if planar else firm)
 
 
 @kernel
@@ -64,14 +64,14 @@ def _moments(rows, first, a, token):
 def place_law_stress(tables, samples, element, force, rate, work, token):
     """Stresses of stretch, bending and twist by the laws of the section."""
     rows, half = work.element, 0.5 * load(samples.effects, FIBRE, token) * (3.0 / tables.length[element])
-    stretch, stiff = load(rows, STRAIN + 2, token), load(samples.section, SECTION * element + 1, token)
+    stretch, stiff = load(rows, STRAIN + 2, token), load(samples.section, SECTION * element + 2, token)
     bend, turning = load3(rows, STRAIN + 3, token), load3(rows, RATE + 3, token)
-    moment, slow = _moments(rows, FIRM, bend, token), _moments(rows, SLOPE + 2, turning, token)
+    moment, slow = _moments(rows, FIRM, bend, token), _moments(rows, SLOPE + 3, turning, token)
     cross = load(rows, FIRM + 2, token) * bend[2], load(rows, FIRM + 4, token) * bend[2]
     planar = moment[0] - cross[0], moment[1] - cross[1]
     pull = fma(stiff * stretch, stretch, fma(planar[0], bend[0], planar[1] * bend[1]))
     pull = force * fnma(half, pull, stiff * stretch)
-    store(rows, STRESS + 2, fma(rate * load(rows, SLOPE + 1, token), load(rows, RATE + 2, token), pull))
+    store(rows, STRESS + 2, fma(rate * load(rows, SLOPE + 2, token), load(rows, RATE + 2, token), pull))
     softer = 2.0 * half * stretch
     bent = fnma(softer, planar[0], moment[0]), fnma(softer, planar[1], moment[1]), moment[2]
     put(rows, STRESS + 3, added(bent, force, scaled(slow, rate)))
@@ -82,14 +82,14 @@ def add_branch(samples, factors, element, work, token):
     """Add the stress of an element's Prony branch."""
     rows, section, b, gain = work.element, SECTION * element, SIZE * element, load(factors.branch, 0, token)
     for i in range(3):
-        stiffness = gain * load(samples.section, section + (0 if i < 2 else 1), token)
+        stiffness = gain * load(samples.section, section + i, token)
         strain = load(rows, STRAIN + i, token) - load(work.branch, b + i, token)
         store(rows, STRESS + i, fma(stiffness, strain, load(rows, STRESS + i, token)))
     bend = minus(load3(rows, STRAIN + 3, token), load3(work.branch, b + 3, token))
     if samples.present[BENDING]:
         moment = _moments(rows, FIRM, bend, token)
     else:
-        x, y, z = load3(samples.section, section + 2, token)
+        x, y, z = load3(samples.section, section + 3, token)
         moment = x * bend[0], y * bend[1], z * bend[2]
     add_to(rows, STRESS + 3, scaled(moment, gain), token)
 

@@ -15,24 +15,27 @@ from rfdropo_bayes.fem.native.simd import aligned_zeros
 
 KINDS = 2
 """Coulomb's friction and the capstan's."""
-DIRECTOR, TILTED, CHORD, GRADIENT, BOW, STRAIN, RATE, STRESS, SLOPE, FIRM, HELD = (
+DIRECTOR, TILTED, CHORD, GRADIENT, BOW, LEAN, STRAIN, RATE, STRESS, SLOPE, FIRM, HELD = (
     0,
     9,
     18,
     21,
     24,
     27,
-    33,
-    39,
-    45,
-    53,
-    59,
+    30,
+    36,
+    43,
+    49,
+    58,
+    64,
 )
-"""First rows of an element's scratch: directors in its middle, these times W, chord, g, b, strains, their rates and the
-stresses; the section's tangent, of shear, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six
-without the law of fibres; and how taut cables hold it in space: its force by stretch and shear (lower half, by
-columns), that by bending and twist (columns), and the moment by these (lower half); and the force and moment of the
-section and of these cables in space."""
+"""First rows of an element's scratch: directors in its middle, these times W, chord, g, b, derivatives of the
+stretch by the middle section's strains, strains, their rates and the stresses; the section's tangent, of shear
+twice, stretch, and bending and twist as 00, 01, 02, 11, 12, 22; and the last six without the law of fibres; and how
+taut cables hold it in space: its force by stretch and shear (lower half, by columns), that by bending and twist
+(columns), and the moment by these (lower half); and the force and moment of the section and of these cables in
+space."""
+ALONG = RATE + 6
 NET = HELD + 21
 ELEMENT = NET + 6
 
@@ -44,7 +47,8 @@ class RodSamples(NamedTuple):
     density: Float[np.ndarray, "1 lanes"]
     scale: Float[np.ndarray, "elements lanes"]  # of the stiffness
     point_mass: Float[np.ndarray, "stations lanes"]
-    section: Float[np.ndarray, "elements5 lanes"]  # stiffness over length, see ``rod_tables.SECTION``
+    section: Float[np.ndarray, "elements6 lanes"]  # stiffness over length, see ``rod_tables.SECTION``
+    inner: Float[np.ndarray, "elements5 lanes"]  # see ``rod_tables.INNER``
     gravity: Float[np.ndarray, "3 lanes"]
     damping: Float[np.ndarray, "2 lanes"]  # Rayleigh, of mass and of stiffness
     law: Float[np.ndarray, "element_rows lanes"]
@@ -57,7 +61,6 @@ class Factors(NamedTuple):
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
     held: Float[np.ndarray, "1 lanes"]  # of the stiffness of taut cables
-    turning: Float[np.ndarray, "1 lanes"]  # of how forces turn with the sections there, for equilibria
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
     force: Float[np.ndarray, "1 lanes"]  # of weight, surroundings and gyroscopic moments in the right-hand side
     strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
@@ -105,6 +108,8 @@ class RodWork(NamedTuple):
     sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
     moving: Float[np.ndarray, "1 lanes"]  # 1 in the lanes that have not come to rest
     largest: Float[np.ndarray, "1 lanes"]  # increment of the static iteration before [m]
+    shift: Float[np.ndarray, "1 lanes"]  # share of M in the matrix of an equilibrium [1/s2]
+    least: Float[np.ndarray, "1 lanes"]  # its least value but zero
     pace: Float[np.ndarray, "1 lanes"]  # share of it that was gone; 0 if the matrix has changed its kind since
     solves: Float[np.ndarray, "1 lanes"]  # of static iterations, all together
     imbalance: Float[np.ndarray, "1 lanes"]

@@ -19,9 +19,10 @@ from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, 
 from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
 from rfdropo_bayes.fem.native.rod_statics import come_to_rest, keep_found, measure_imbalance, put_at_rest
 from rfdropo_bayes.fem.native.rod_step import predict_stations, set_factors
-from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE, RodTables
+from rfdropo_bayes.fem.native.rod_tables import FRAME, INNER, SECTION, SIZE, RodTables
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
+from rfdropo_bayes.fem.rod import SHEAR
 
 ROW_ITERATIONS = 60
 """Most iterations of a row of quasi-static motion."""
@@ -90,13 +91,13 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
     samples = rows(
-        moduli=3, density=1, scale=elements, point_mass=stations, section=SECTION * elements, gravity=3, damping=2,
-        law=LAW * elements, effects=EFFECTS,
+        moduli=3, density=1, scale=elements, point_mass=stations, section=SECTION * elements, inner=INNER * elements,
+        gravity=3, damping=2, law=LAW * elements, effects=EFFECTS,
     )  # fmt: skip
     state = dict.fromkeys(("velocity", "solution", "field", "before", "sudden", "branch", "stress"), stations * SIZE)
     once = (
-        "unsolved", "accepted", "lost", "failed", "moving", "largest", "pace", "solves", "imbalance", "softness",
-        "firmness", "loss",
+        "unsolved", "accepted", "lost", "failed", "moving", "largest", "shift", "least", "pace", "solves",
+        "imbalance", "softness", "firmness", "loss",
     )  # fmt: skip
     work = rows(
         turn=4 * stations, frame=FRAME * stations, pivot=BLOCK * stations, coupling=BLOCK * stations,
@@ -114,11 +115,23 @@ def storage(tables: RodTables, lanes: int, dtype: type) -> tuple[RodSamples, Fac
 def _prepare(tables, samples, token):
     """Stiffness of the sections of a block's rollouts."""
     young, shear, axial = load(samples.moduli, 0, token), load(samples.moduli, 1, token), load(samples.moduli, 2, token)
+    one = fill(1.0, samples.moduli, token)
     for element in range(tables.stations - 1):
         scale, e = load(samples.scale, element, token), SECTION * element
         for i in range(SECTION):
-            modulus = scale * (shear if i == 0 or i == SECTION - 1 else (axial if i == 1 else young))
+            modulus = scale * (shear if i < 2 or i == SECTION - 1 else (axial if i == 2 else young))
             store(samples.section, e + i, modulus * tables.area[e + i])
+        soft, inner = SHEAR * shear / young, INNER * element
+        curl = 1.0 - one / soft
+        store(samples.inner, inner, curl)
+        for i in range(2):
+            ratio = shear / young * tables.ratio[2 * element + i]
+            share = one / (one + ratio)
+            store(samples.section, e + i, share * load(samples.section, e + i, token))
+            share = share * share * ratio / tables.length[element]
+            steep = share * (1.0 - soft)
+            store(samples.inner, inner + 1 + i, fma(0.6 * ratio, share, steep))
+            store(samples.inner, inner + 3 + i, 0.5 * curl * steep / tables.length[element])
 
 
 @kernel
@@ -175,14 +188,14 @@ def _relax_branches(tables, samples, factors, work, token):
     """Let the dashpots of the Prony branches follow all the strain of the initial shape."""
     if samples.present[BRANCH]:
         store(factors.share, 0, fill(1.0, factors.share, token))
-        _follow_branches(tables, factors, work, token)
+        _follow_branches(tables, samples, factors, work, token)
 
 
 @kernel
-def _follow_branches(tables, factors, work, token):
+def _follow_branches(tables, samples, factors, work, token):
     """Let the dashpots of all elements follow the strain."""
     for element in range(tables.stations - 1):
-        measure_element(tables, element, work, token)
+        measure_element(tables, samples, element, work, token)
         follow_branch(factors, element, work, token)
 
 
@@ -210,7 +223,7 @@ def begin_stage(tables, batch, samples, factors, work, touch, schedule, step, nu
     share = 1.0 if number + 1 == schedule.count else stage.elapsed / schedule.time_step
     _take_commands(tables, batch, work, step, share, first, token)
     if samples.present[BRANCH]:
-        _follow_branches(tables, factors, work, token)
+        _follow_branches(tables, samples, factors, work, token)
     if stage.predicted:
         predict_stations(tables, stage.elapsed, work, token)
         if touch is not None:

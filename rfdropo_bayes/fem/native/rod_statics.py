@@ -6,15 +6,35 @@ result does not depend on other lanes.
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.equilibrium import FARTHEST, LONGEST_STEP, NEAR, SHORTEST, SLOWER, STEADY, WIDEST_TURN
+from rfdropo_bayes.fem.equilibrium import (
+    CALM,
+    EASED,
+    FARTHEST,
+    FIRMER,
+    HOPELESS,
+    LEAST,
+    LONGEST_STEP,
+    NEAR,
+    SHORTEST,
+    SLOWER,
+    STEADY,
+    WIDEST_TURN,
+)
 from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import PANEL
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.rod_assembly import STRESS, add_forces, add_station_loads, measure_element, place_stress
+from rfdropo_bayes.fem.native.rod_assembly import (
+    STRESS,
+    add_forces,
+    add_station_loads,
+    measure_element,
+    place_stress,
+    station_mass,
+)
 from rfdropo_bayes.fem.native.rod_constraints import hold
 from rfdropo_bayes.fem.native.rod_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.rod_step import condense_increment, gather_cables, move_stations, near, place_directors
-from rfdropo_bayes.fem.native.rod_tables import FRAME, SIZE
+from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, kernel, load, magnitude, store, where_greater
 from rfdropo_bayes.fem.native.slip_rows import end_row, keep_row, slide, start_row, sum_losses
 
@@ -63,11 +83,11 @@ def _pace(tables, work, token):
 
 
 @kernel
-def _choose_way(tables, factors, work, moving, token):
+def _choose_way(tables, work, moving, token):
     """Share of ``solution`` to go, limited in length, and less if increments do not shrink, or by `_pace` near the end;
     and what the increments after it may add up to.
 
-    A lane that goes its whole way takes the forces that turn into the next matrix again.
+    Far from rest the mass in the matrix gets less.
 
     All that are left are no more than a geometric series that goes on as the last two did: Newton's method converges
     faster.
@@ -86,9 +106,10 @@ def _choose_way(tables, factors, work, moving, token):
     paced = where_greater(fill(NEAR * tables.total, work.frame, token), size, load(work.pace, 0, token), zero)
     share = where_greater(paced, zero, where_greater(pace, limit, limit, pace), share)
     store(work.largest, 0, where_greater(moving, zero, size, before))
-    whole, turning = where_greater(one, share, zero, moving), load(factors.turning, 0, token)
-    store(factors.turning, 0, where_greater(whole, zero, one, turning))
-    kept = where_greater(whole - turning, zero, zero, share)
+    shift, calm = load(work.shift, 0, token), fill(CALM * tables.total, work.frame, token)
+    eased = where_greater(size, calm, moving, zero)
+    store(work.shift, 0, where_greater(eased, zero, EASED * shift, shift))
+    kept = where_greater(eased * shift, zero, zero, share)
     store(work.pace, 0, where_greater(moving, zero, kept, zero))
     alone = where_greater(before, fill(0.5 * UNBOUNDED, work.frame, token), one, grown)
     left = where_greater(alone, zero, size, size * (size / (before - size)))
@@ -106,7 +127,7 @@ def _follow_stress(tables, samples, factors, work, share, token):
     """
     zero = fill(0.0, work.stress, token)
     for element in range(tables.stations - 1):
-        measure_element(tables, element, work, token)
+        measure_element(tables, samples, element, work, token)
         place_stress(tables, samples, factors, element, work, token)
         for i in range(SIZE):
             row, there = SIZE * element + i, load(work.element, STRESS + i, token)
@@ -124,16 +145,16 @@ def _take_tensions(tables, work, moving, token):
 
 
 @kernel
-def _found(tables, factors, work, moving, token):
-    """Moving lanes whose matrix had a solution, and lanes that try again without the geometric terms, which make the
-    matrix indefinite near a loss of stability.
-    """
+def _found(tables, work, moving, token):
+    """The lanes that move whose matrix had a solution, and those that try again with more mass in the matrix."""
     zero, bound = fill(0.0, work.frame, token), fill(UNBOUNDED, work.frame, token)
-    total, turning = _product(tables, work.solution, work.solution, token), load(factors.turning, 0, token)
-    found = where_greater(bound, total, moving, zero)
-    again = where_greater(turning, zero, moving - found, zero)
-    store(factors.turning, 0, where_greater(again, zero, zero, turning))
-    return moving - again, again
+    total, least = _product(tables, work.solution, work.solution, token), load(work.least, 0, token)
+    shift = load(work.shift, 0, token)
+    found = where_greater(HOPELESS * least, shift, where_greater(bound, total, moving, zero), moving)
+    more = where_greater(FIRMER * shift, least, FIRMER * shift, least)
+    store(work.shift, 0, where_greater(moving - found, zero, more, shift))
+    store(work.pace, 0, where_greater(found, zero, load(work.pace, 0, token), zero))
+    return found, moving - found
 
 
 @kernel
@@ -141,6 +162,7 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
     """One iteration of the moving lanes; lanes with a small increment stop."""
     zero, one, moving = fill(0.0, work.frame, token), fill(1.0, work.frame, token), load(work.moving, 0, token)
     unsolved = load(work.unsolved, 0, token)
+    store(factors.inertia, 0, load(work.shift, 0, token))
     condense_increment(tables, samples, factors, work, EULER, True, token)
     if runs is not None and slips > 0:
         slide(tables, runs, friction, slips, work, token)
@@ -148,11 +170,11 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
         tables, runs, None, samples, factors, work, friction, None, rows, p, slips, 0, 1.0, schedule, token
     )  # fmt: skip
     store(work.solves, 0, load(work.solves, 0, token) + moving)
-    moving, waiting = _found(tables, factors, work, moving, token)
+    moving, waiting = _found(tables, work, moving, token)
     store(work.unsolved, 0, where_greater(moving, zero, load(work.unsolved, 0, token), unsolved))
     _take_tensions(tables, work, moving, token)
     small = fill(bound * tables.total, work.frame, token)
-    share, left = _choose_way(tables, factors, work, moving, token)
+    share, left = _choose_way(tables, work, moving, token)
     for row in range(SIZE * tables.held, SIZE * tables.stations):
         increment = load(work.solution, row, token)
         store(work.before, row, increment)
@@ -170,6 +192,17 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
 
 
 @kernel
+def _set_least(tables, samples, work, token):
+    """Least share of the mass in the matrix, about the square of the first frequency [1/s2]."""
+    one, flexible, mass = fill(1.0, work.frame, token), fill(0.0, work.frame, token), fill(TINY, work.frame, token)
+    for element in range(tables.stations - 1):
+        flexible = flexible + one / load(samples.section, SECTION * element + 3, token)
+    for station in range(tables.stations):
+        mass = mass + station_mass(tables, samples, station, token)
+    store(work.least, 0, LEAST / (flexible * mass * (tables.total * tables.total)))
+
+
+@kernel
 def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
     """Find the equilibrium from the present state in at most ``most`` iterations, to the increment ``bound`` relative
     to the body's length. A lane without an equilibrium in an earlier row is not moved, and its rollout counts as
@@ -182,6 +215,8 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
     store(work.moving, 0, one - load(work.failed, 0, token))
     store(work.largest, 0, fill(UNBOUNDED, work.frame, token))
     store(work.pace, 0, zero)
+    store(work.shift, 0, zero)
+    _set_least(tables, samples, work, token)
     if runs is not None and slips > 0:
         gather_cables(tables, work, one, False, token)
         start_row(tables, runs, samples, friction, work, token)
@@ -199,7 +234,6 @@ def _start_settling(tables, samples, factors, work, token):
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
     store(factors.elasticity, 0, load(work.firmness, 0, token))
     store(factors.held, 0, one)
-    store(factors.turning, 0, one)
     store(factors.inertia, 0, zero)
     store(factors.force, 0, one)
     store(factors.strain, 0, load(work.firmness, 0, token))
@@ -250,7 +284,7 @@ def measure_imbalance(tables, samples, factors, work, token):
         for station in range(tables.stations):
             add_surroundings(tables, samples, factors, station, False, work, token)
     for element in range(tables.stations - 1):
-        measure_element(tables, element, work, token)
+        measure_element(tables, samples, element, work, token)
         place_stress(tables, samples, factors, element, work, token)
         add_forces(element, work.element, work.field, token)
     _add_cable_forces(tables, work, token)

@@ -15,14 +15,16 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.fem.cables import ROUND
 from rfdropo_bayes.fem.dynamics import LOST
-from rfdropo_bayes.fem.rod import SHEAR, Rod, drag_areas, inertia_per_density, tributary_lengths
+from rfdropo_bayes.fem.rod import SHEAR, Rod, drag_areas, inertia_per_density, shear_ratios, tributary_lengths
 
 SIZE = 6
 """Velocities of a station."""
 FRAME = 12
 """Rows of a station's frame: position, then directors."""
-SECTION = 5
-"""Stiffnesses of an element: against shear, stretch, bending about x and about y, and twist."""
+SECTION = 6
+"""Stiffnesses of an element: against shear along x and along y, stretch, bending about x and about y, and twist."""
+INNER = 5
+"""Numbers of an element's inner bending: a, c / h and c' / h^2 of ``fem.rod_elements``, the last two along x and y."""
 
 
 class RodTables(NamedTuple):
@@ -30,7 +32,8 @@ class RodTables(NamedTuple):
     1]``, each with a station, a weight of its position and an arm in its frame."""
 
     length: Float[np.ndarray, " elements"]  # [m]
-    area: Float[np.ndarray, "elements 5"]  # stiffness over modulus and length: per G, per E, E, E and per G
+    area: Float[np.ndarray, "elements 6"]  # stiffness over modulus and length: per G, G, E, E, E and per G
+    ratio: Float[np.ndarray, "elements 2"]  # see ``rod.shear_ratios``
     volume: Float[np.ndarray, " stations"]  # [m3]
     moment: Float[np.ndarray, "stations 3"]  # rotary inertia per density [m5]
     rest: Float[np.ndarray, " stations"]  # axial coordinate [m]
@@ -74,10 +77,10 @@ def border_panels(cables: int) -> int:
     return (cables + 3) // 3
 
 
-def section_areas(body: Rod) -> Float[np.ndarray, "elements 5"]:
-    """Stiffness of every element over modulus [m] or [m3]: shear, stretch, bending about x and y, twist."""
+def section_areas(body: Rod) -> Float[np.ndarray, "elements 6"]:
+    """Stiffness of every element over modulus [m] or [m3]: shear twice, stretch, bending about x and y, twist."""
     about_y, about_x = body.bending_moment_area.T
-    area = [SHEAR * body.axial_area, body.axial_area, about_x, about_y, body.torsion_constant]
+    area = [SHEAR * body.axial_area, SHEAR * body.axial_area, body.axial_area, about_x, about_y, body.torsion_constant]
     return np.stack(area, axis=1) / np.diff(body.station)[:, None]
 
 
@@ -167,6 +170,7 @@ def rod_tables(system: Any, points: Any, dtype: type) -> RodTables:
     tables = RodTables(
         length=np.diff(body.station),
         area=section_areas(body),
+        ratio=shear_ratios(body),
         volume=volume,
         moment=moment,
         rest=body.station,
