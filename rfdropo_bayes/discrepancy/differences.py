@@ -1,7 +1,7 @@
 """Possible differences between groups of recordings, such as sessions: candidates of an audit of recordings in groups.
 
-A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
-mechanism is present or larger in one group only, or absent there. A mechanism that all groups lack is a candidate as
+A difference is added to a value that all groups share. A base parameter is higher in one group, or a mechanism is
+present, larger or absent in one group only. A mechanism that all groups lack is a candidate as
 well, under its plain name: without it, an error of the base model could be taken for a difference between groups.
 """
 

@@ -317,7 +317,7 @@ def _only_noise(answer: Answer) -> bool:
 
 
 def _pattern(answer: Answer) -> str:
-    """Result of the joint test of an extended model that fails it."""
+    """Clause about an extended model that fails the joint test."""
     rules, last = answer.problem.rules, answer.causes.test_series[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
     sure = last <= rules.base_passes and not _only_noise(answer)
